@@ -1,0 +1,112 @@
+"""The values that flow through hybridlog: schemas, channels and batches of messages.
+
+Messages never travel one by one. A `Batch` is a buffer and a table of numpy columns
+that say where each message's payload lies in it, so that copying, indexing and
+decoding are a few array operations for thousands of messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Buffer = bytes | bytearray | memoryview
+"""Contiguous bytes. A memoryview has itemsize 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message definition as it came.
+
+    Attributes:
+        name: Type name as the source spells it (`sensor_msgs/LaserScan` in ROS 1,
+            `sensor_msgs/msg/LaserScan` in ROS 2, `foxglove.Log` in protobuf).
+        encoding: MCAP schema encoding: `ros1msg`, `ros2msg`, `ros2idl`, `jsonschema`,
+            `protobuf`, ... or empty when there is no definition.
+        data: The definition; text encodings are UTF-8.
+    """
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Channel:
+    """One stream of messages of one type on one topic.
+
+    A topic may have several channels (several ROS 1 connections, a type that changes).
+
+    Attributes:
+        topic: Name as the source spells it.
+        message_encoding: MCAP message encoding: `ros1`, `cdr`, `json`, `protobuf`, ...
+        schema: The definition, None for a channel without one.
+        metadata: MCAP channel metadata of the source, as it came (ROS 1 connection
+            header fields such as `callerid`, `latching`, `md5sum`; ROS 2
+            `offered_qos_profiles`).
+        has_publish_time: False when the source knows no publish time; `publish_time`
+            then repeats `log_time`.
+    """
+
+    topic: str
+    message_encoding: str
+    schema: Schema | None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    has_publish_time: bool = True
+
+
+@dataclass(slots=True)
+class Batch:
+    """Messages whose payloads lie in one buffer. All columns have the same length n.
+
+    Rows are in arrival order. `buffer` must not change while the batch is in use.
+
+    Attributes:
+        buffer: Holds every payload.
+        offset: int64[n], byte where each payload starts in `buffer`.
+        length: int64[n], bytes of each payload.
+        channel: int32[n], index of each message's channel in the owner's channel list.
+        log_time: int64[n], nanoseconds since the epoch.
+        publish_time: int64[n], nanoseconds since the epoch.
+        sequence: uint32[n], the sender's sequence number, 0 when there is none.
+    """
+
+    buffer: Buffer
+    offset: NDArray[np.int64]
+    length: NDArray[np.int64]
+    channel: NDArray[np.int32]
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    sequence: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.offset)
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Batch:
+        """The chosen rows, over the same buffer."""
+        return Batch(
+            self.buffer,
+            self.offset[rows],
+            self.length[rows],
+            self.channel[rows],
+            self.log_time[rows],
+            self.publish_time[rows],
+            self.sequence[rows],
+        )
+
+    def payload(self, row: int) -> memoryview:
+        """The payload of one message, without a copy."""
+        start = int(self.offset[row])
+        return memoryview(self.buffer)[start : start + int(self.length[row])]
+
+    @property
+    def payload_bytes(self) -> int:
+        """Sum of all payload lengths."""
+        return int(self.length.sum())
