@@ -1,0 +1,1 @@
+"""hybridlog records what a robot says and makes it answerable."""

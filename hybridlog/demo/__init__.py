@@ -1,0 +1,1 @@
+"""A simulated robot, and the demonstration that uses it."""

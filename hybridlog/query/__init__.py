@@ -1,0 +1,1 @@
+"""Questions: times, topics, predicates, plans."""

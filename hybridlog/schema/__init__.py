@@ -1,0 +1,1 @@
+"""Message definitions and payloads: from bytes to columns, documents and objects."""

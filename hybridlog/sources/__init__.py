@@ -1,0 +1,1 @@
+"""Readers of foreign logs: ROS 1 bags, ROS 2 bags, MCAP."""

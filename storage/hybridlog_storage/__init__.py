@@ -1,0 +1,1 @@
+"""Mechanism of hybridlog: bytes, files and MongoDB. Knows no ROS."""
