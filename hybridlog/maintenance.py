@@ -1,0 +1,307 @@
+"""Keeping index and segments together: recover, catch up, reindex, verify.
+
+The segments are the truth. Everything here compares the database with them, and
+mends the database, never the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog_storage.collection_names import CATALOG_PREFIX
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.recovery import Recovered, recover_segment
+from hybridlog_storage.segment_reader import SegmentReader
+
+from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
+from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
+
+if TYPE_CHECKING:
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segment_reader import SegmentSummary
+    from hybridlog_storage.segment_writer import StoredChunk
+
+Progress = Callable[[str, int, int], None]
+"""Called with the recording's id, bytes done and bytes in all."""
+
+
+@dataclass(slots=True)
+class Tended:
+    """What the opening of a store had to mend.
+
+    Attributes:
+        recovered: Segments that a crash had left open, by recording id.
+        indexed: Recordings whose index was behind, and by how many chunks.
+        removed: Recordings in the database without a file.
+    """
+
+    recovered: dict[str, list[Recovered]] = field(default_factory=dict)
+    indexed: dict[str, int] = field(default_factory=dict)
+    removed: list[str] = field(default_factory=list)
+
+
+def recover(directory: StoreDirectory, recording_id: str) -> list[Recovered]:
+    """Seal what a crash left open in a recording; nothing while somebody writes it."""
+    if not directory.open_segments(recording_id):
+        if not directory.segments(recording_id):
+            with directory.writing(recording_id) as mine:
+                empty = mine and not directory.segments(recording_id)
+                if empty and not directory.open_segments(recording_id):
+                    directory.remove_recording(recording_id)
+        return []
+    with directory.writing(recording_id) as mine:
+        if not mine:
+            return []
+        results = [recover_segment(path) for _, path in directory.open_segments(recording_id)]
+        if not directory.segments(recording_id):
+            directory.remove_recording(recording_id)
+    return results
+
+
+def tend(
+    directory: StoreDirectory, database: Database, progress: Progress | None = None
+) -> Tended:
+    """Bring index and segments together after a crash, or after the database was lost."""
+    tended = Tended()
+    catalog = Catalog(database)
+    known = {r.id: r for r in catalog.recordings()}
+    for recording_id in directory.recording_ids():
+        recovered = recover(directory, recording_id)
+        if recovered:
+            tended.recovered[recording_id] = recovered
+        if not directory.segments(recording_id):
+            continue
+        entry = known.get(recording_id)
+        if entry is None or entry.status == "open" or recovered:
+            with directory.writing(recording_id) as mine:
+                if mine:
+                    chunks = catch_up(directory, database, recording_id, progress)
+                    tended.indexed[recording_id] = chunks
+    present = set(directory.recording_ids())
+    for recording_id, entry in known.items():
+        if recording_id not in present:
+            catalog.remove_recording(recording_id, _topic_collections(database))
+            tended.removed.append(recording_id)
+    return tended
+
+
+def catch_up(
+    directory: StoreDirectory,
+    database: Database,
+    recording_id: str,
+    progress: Progress | None = None,
+) -> int:
+    """Index the chunks of a sealed recording that have no catalog entry; returns how many.
+
+    Raises:
+        DatabaseError: the database does not take them.
+        SegmentError: a segment cannot be read.
+    """
+    catalog = Catalog(database)
+    summaries = read_summaries(directory, recording_id)
+    entry = entry_of(summaries[min(summaries)].recording)
+    indexer = ChunkIndexer(recording_id, entry.key)
+    entries = catalog.chunks(recording_id)
+    done = {(c.segment, c.offset) for c in entries}
+    index = IndexWriter(indexer, database)
+    added = 0
+    for chunk, channels in _chunks(directory, recording_id, summaries, done, progress):
+        index.submit(chunk, channels)
+        added += 1
+    index.close()
+    if index.failure is not None:
+        raise index.failure
+    whole = build_entry(directory, indexer, recording_id, [*entries, *index.entries], summaries)
+    for channel in channels_of(summaries.values()).values():
+        if channel.schema is not None:
+            catalog.put_schema(channel.schema)
+    catalog.put_losses(recording_id, whole.end.get("losses", []))
+    catalog.put_recording(whole)
+    return added
+
+
+def reindex(
+    directory: StoreDirectory, database: Database, progress: Progress | None = None
+) -> list[RecordingEntry]:
+    """Drop the index and make it again from the segments."""
+    for collection in database.list_collections():
+        if collection != STORE_MARK:
+            database.drop(collection)
+    catalog = Catalog(database)
+    catalog.prepare()
+    for recording_id in directory.recording_ids():
+        recover(directory, recording_id)
+        if directory.segments(recording_id):
+            with directory.writing(recording_id) as mine:
+                if mine:
+                    catch_up(directory, database, recording_id, progress)
+    return catalog.recordings()
+
+
+STORE_MARK = f"{CATALOG_PREFIX}store"
+"""Collection that says which store a database belongs to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that `verify` found to be off."""
+
+    recording: str
+    place: str
+    problem: str
+
+
+@dataclass(slots=True)
+class Verification:
+    """What `verify` has read, and found."""
+
+    recordings: int = 0
+    chunks: int = 0
+    messages: int = 0
+    bytes_read: int = 0
+    findings: list[Finding] = field(default_factory=list)
+
+
+def verify(
+    directory: StoreDirectory,
+    database: Database,
+    recording_ids: list[str],
+    progress: Progress | None = None,
+) -> Verification:
+    """Read every chunk, check its checksum, and compare the index with it byte for byte.
+
+    The documents of a chunk are made anew and compared with those in the database, so
+    that each reference is seen to name the message it was made for.
+    """
+    result = Verification()
+    for recording_id in recording_ids:
+        result.recordings += 1
+        try:
+            _verify_recording(directory, database, recording_id, result, progress)
+        except SegmentError as error:
+            result.findings.append(Finding(recording_id, "segments", str(error)))
+    return result
+
+
+def _verify_recording(
+    directory: StoreDirectory,
+    database: Database,
+    recording_id: str,
+    result: Verification,
+    progress: Progress | None,
+) -> None:
+    def found(place: str, problem: str) -> None:
+        result.findings.append(Finding(recording_id, place, problem))
+
+    catalog = Catalog(database)
+    entries = {(c.segment, c.offset): c for c in catalog.chunks(recording_id)}
+    expected: dict[str, int] = {}
+    known = {r.id: r for r in catalog.recordings()}
+    if recording_id not in known:
+        found("catalog", "the recording is missing from the catalog; run `hybridlog reindex`")
+    for number, path in directory.segments(recording_id):
+        with SegmentReader(path, number) as reader:
+            try:
+                summary = reader.summary()
+            except SegmentError as error:
+                found(path.name, str(error))
+                continue
+            base = entry_of(summary.recording)
+            indexer = ChunkIndexer(recording_id, base.key)
+            messages = 0
+            for place in summary.chunks:
+                where = f"{path.name} byte {place.offset}"
+                try:
+                    chunk = reader.read_chunk(place)
+                except SegmentError as error:
+                    found(where, str(error))
+                    continue
+                result.chunks += 1
+                messages += len(chunk.batch)
+                if progress is not None:
+                    progress(recording_id, place.offset + place.length, reader.size)
+                documents, entry = indexer.documents_of(chunk, summary.channels)
+                for part in documents:
+                    expected[part.collection] = expected.get(part.collection, 0) + len(part.lengths)
+                    problem = _compare(database, base.key, chunk, part)
+                    if problem:
+                        found(f"{where}, collection {part.collection}", problem)
+                if entries.pop((number, place.offset), None) != entry:
+                    found(where, "its catalog entry is missing or differs")
+            result.messages += messages
+            result.bytes_read += reader.bytes_read
+            if messages != sum(summary.counts.values()):
+                found(path.name, f"{messages} messages; its statistics say otherwise")
+    for segment, offset in entries:
+        found(f"segment {segment} byte {offset}", "the catalog names a chunk that is not there")
+    for collection in _topic_collections(database):
+        have = database.count(collection, {"_meta.rec": recording_id})
+        if have != expected.get(collection, 0):
+            found(
+                f"collection {collection}",
+                f"{have} index documents, {expected.get(collection, 0)} messages in the segments",
+            )
+
+
+def _compare(
+    database: Database, key: int, chunk: StoredChunk, part: Documents
+) -> str | None:
+    """What is wrong with the documents of a chunk in one collection."""
+    batch = chunk.batch
+    low = key_bound(int(batch.log_time.min()))
+    high = key_bound(int(batch.log_time.max()) + 1)
+    want = sorted(_split(part.data))
+    have: list[bytes] = []
+    query = {
+        "_id": {"$gte": low, "$lt": high},
+        "_meta.ref.chunk": chunk.offset,
+        "_meta.ref.seg": chunk.segment,
+    }
+    for raw in database.find_raw(part.collection, query):
+        have.extend(d for d in _split(raw) if d[22:26] == key.to_bytes(4, "big"))
+    have.sort()
+    if have == want:
+        return None
+    missing = len(set(want) - set(have))
+    extra = len(set(have) - set(want))
+    return f"{missing} index documents are missing or differ, {extra} are not of this chunk"
+
+
+def _split(data: bytes) -> Iterator[bytes]:
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        yield data[at : at + size]
+        at += size
+
+
+def _chunks(
+    directory: StoreDirectory,
+    recording_id: str,
+    summaries: Mapping[int, SegmentSummary],
+    done: set[tuple[int, int]],
+    progress: Progress | None,
+) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
+    """The chunks of a recording that are not done yet."""
+    total = sum(p.stat().st_size for _, p in directory.segments(recording_id))
+    before = 0
+    for number, path in directory.segments(recording_id):
+        summary = summaries[number]
+        with SegmentReader(path, number) as reader:
+            for place in summary.chunks:
+                if (number, place.offset) in done:
+                    continue
+                yield reader.read_chunk(place), summary.channels
+                if progress is not None:
+                    progress(recording_id, before + place.offset + place.length, total)
+        before += path.stat().st_size
+
+
+def _topic_collections(database: Database) -> list[str]:
+    return [c for c in database.list_collections() if not c.startswith(CATALOG_PREFIX)]

@@ -1,0 +1,354 @@
+"""Predicates as MongoDB filters.
+
+The values of index documents follow a fixed table (arrays are lists up to a limit and
+summaries past it), so one condition of the language may need two forms in the filter.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hybridlog.query.tokens import error_at
+from hybridlog.query.where import (
+    And,
+    Compare,
+    Condition,
+    Exists,
+    Expression,
+    Field,
+    Match,
+    Member,
+    Node,
+    Not,
+    Or,
+    Value,
+)
+from hybridlog_storage.errors import WhereError
+
+Filter = dict[str, object]
+Stat = Literal["n", "min", "max", "mean"]
+_Kind = Literal["number", "string", "bool", "time", "date", "other"]
+
+_OPERATORS = {"==": "$eq", "!=": "$ne", "<": "$lt", "<=": "$lte", ">": "$gt", ">=": "$gte"}
+_STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
+_SHOWN = 10
+_INF = float("inf")
+_ANY_ELEMENT = re.compile(r"\[\*?\]")
+
+_KINDS: dict[str, _Kind] = {
+    "bool": "bool",
+    "boolean": "bool",
+    "string": "string",
+    "time": "time",
+    "duration": "time",
+    "date": "date",
+    **dict.fromkeys(
+        ("byte", "char", "octet", "int", "uint", "float", "double", "number", "integer"), "number"
+    ),
+    **dict.fromkeys(
+        (f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)), "number"
+    ),
+    **dict.fromkeys(("float32", "float64"), "number"),
+}
+_META = {
+    "_meta.inserted_at": "date",
+    "_meta.t": "time",
+    "_meta.pub": "time",
+    "_meta.rec": "string",
+    "_meta.topic": "string",
+    "_meta.seq": "int64",
+    "_meta.ref.seg": "int32",
+    "_meta.ref.chunk": "int64",
+    "_meta.ref.off": "int64",
+    "_meta.ref.len": "int64",
+    "_meta.error": "string",
+}
+
+
+def to_filter(expression: Expression, field_types: Mapping[str, str] | None) -> Filter:
+    """The MongoDB filter of a predicate.
+
+    Args:
+        expression: The parsed predicate.
+        field_types: See `hybridlog.query.where.compile_filter`.
+
+    Raises:
+        WhereError: A field that does not exist, or a value that does not fit its type.
+    """
+    return _Compiler(expression.text, _Types.of(field_types)).node(expression.root)
+
+
+@dataclass(frozen=True, slots=True)
+class _Types:
+    """What is known of the fields.
+
+    Attributes:
+        known: False when only `_meta.*` is known.
+        types: Type of each path, without marks of arrays in the path.
+        arrays: Paths that are arrays.
+        inner: Paths that have fields below them.
+    """
+
+    known: bool
+    types: dict[str, str]
+    arrays: set[str] = field(default_factory=set)
+    inner: set[str] = field(default_factory=set)
+
+    @staticmethod
+    def of(field_types: Mapping[str, str] | None) -> _Types:
+        found = _Types(field_types is not None, dict(_META))
+        for written, kind in {**(field_types or {}), **_META}.items():
+            parts = written.split(".")
+            for count in range(1, len(parts) + 1):
+                path = _ANY_ELEMENT.sub("", ".".join(parts[:count]))
+                if _ANY_ELEMENT.search(parts[count - 1]):
+                    found.arrays.add(path)
+                if count < len(parts):
+                    found.inner.add(path)
+            path = _ANY_ELEMENT.sub("", written)
+            found.types[path] = kind
+            if kind.endswith("]"):
+                found.arrays.add(path)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """What a path leads to.
+
+    Attributes:
+        kind: Kind of the values there.
+        stat: Set when the path asks for the summary of an array.
+        base: Type of that array's elements.
+    """
+
+    kind: _Kind
+    stat: Stat | None = None
+    base: str = ""
+
+
+class _Compiler:
+    def __init__(self, text: str, types: _Types) -> None:
+        self._text = text
+        self._types = types
+
+    def node(self, node: Node) -> Filter:
+        match node:
+            case And(items):
+                return {"$and": [self.node(item) for item in items]}
+            case Or(items):
+                return {"$or": [self.node(item) for item in items]}
+            case Not(item):
+                return {"$nor": [self.node(item)]}
+            case Compare() | Member() | Exists() | Match():
+                return self._condition(node)
+
+    def _condition(self, node: Condition) -> Filter:
+        target = self._target(node.field)
+        self._check(node, target)
+        if target.stat is not None:
+            return self._of_summary(node, target.stat, target.base)
+        path = node.field.path
+        match node:
+            case Compare(order=order, value=value):
+                return {path: _comparison(_OPERATORS[order], value)}
+            case Member(values=values, negated=negated):
+                return {path: {"$nin" if negated else "$in": list(values), "$exists": True}}
+            case Exists(present=present):
+                return {path: {"$exists": present}}
+            case Match(pattern=pattern, negated=False):
+                return {path: {"$regex": pattern}}
+            case Match(pattern=pattern):
+                return {path: {"$not": {"$regex": pattern}, "$exists": True}}
+
+    def _target(self, asked: Field) -> _Target:
+        types = self._types
+        names = [part for part in asked.parts if isinstance(part, str)]
+        path = ".".join(names)
+        if names[0] == "_id":
+            raise self._fail(asked, "_id cannot be asked for; use _meta.t, _meta.rec and _meta.seq")
+        if not types.known and names[0] != "_meta":
+            return _Target("other")
+        if path in types.types:
+            return _Target(_KINDS.get(types.types[path].split("[", 1)[0], "other"))
+        parent, last = ".".join(names[:-1]), names[-1]
+        if path not in types.inner and parent in types.arrays and isinstance(asked.parts[-1], str):
+            base = types.types.get(parent, "").split("[", 1)[0]
+            numeric = _KINDS.get(base) in {"number", "bool", "time"}
+            if last in _STATS and (numeric or last == "n"):
+                return _Target("number", _STATS[last], base)
+        if path in types.inner or path in types.arrays:
+            return _Target("other")
+        raise self._unknown(asked, path)
+
+    def _check(self, node: Condition, target: _Target) -> None:
+        match node:
+            case Compare(value=value, position=position):
+                self._check_value(target, value, position)
+            case Member(values=values, position=position):
+                for value in values:
+                    self._check_value(target, value, position)
+            case Match(position=position) if target.kind not in {"string", "other"}:
+                raise error_at(self._text, position, f"the field is a {target.kind}, not a string")
+            case _:
+                pass
+
+    def _check_value(self, target: _Target, value: Value, position: int) -> None:
+        kind = target.kind
+        if kind == "date":
+            raise error_at(
+                self._text, position, "_meta.inserted_at has milliseconds only; ask for _meta.t"
+            )
+        if kind == "other" or value is None:
+            return
+        if isinstance(value, bool):
+            given = "bool"
+        elif isinstance(value, str):
+            given = "string"
+        else:
+            given = "number"
+        if given == kind or (given == "number" and kind == "time"):
+            return
+        hints = {
+            "bool": "; write true or false",
+            "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
+            "string": "; write it in quotes",
+        }
+        raise error_at(
+            self._text,
+            position,
+            f"the field is a {kind}, the value is a {given}{hints.get(kind, '')}",
+        )
+
+    def _of_summary(self, node: Condition, stat: Stat, base: str) -> Filter:
+        """A condition on an array's summary, or on what it would be for a short array."""
+        array = Field(node.field.parts[:-1])
+        there: Filter = {
+            "$or": [{node.field.path: {"$exists": True}}, {array.path: {"$type": "array"}}]
+        }
+        match node:
+            case Exists(present=present):
+                return there if present else {"$nor": [there]}
+            case Compare(order="!=", value=value):
+                same = self._either(node.field, stat, base, "$eq", value)
+                return {"$and": [there, {"$nor": [same]}]}
+            case Compare(order=order, value=value):
+                return self._either(node.field, stat, base, _OPERATORS[order], value)
+            case Member(values=values, negated=negated):
+                one: Filter = {
+                    "$or": [self._either(node.field, stat, base, "$eq", value) for value in values]
+                }
+                return {"$and": [there, {"$nor": [one]}]} if negated else one
+            case Match(position=position):  # `_check` has refused it; numbers have no pattern
+                raise error_at(self._text, position, "the field is a number, not a string")
+
+    def _either(self, asked: Field, stat: Stat, base: str, operator: str, value: Value) -> Filter:
+        summary: Filter = {asked.path: _comparison(operator, value)}
+        if _is_nan(value):
+            return summary  # summaries are over finite numbers, lists need not be read
+        test = _Test(stat, base, operator, value)
+        return {"$or": [summary, {"$expr": self._reach(asked.parts[:-1], test)}]}
+
+    def _reach(self, parts: tuple[str | int, ...], test: _Test) -> object:
+        """An aggregation expression: whether the test holds of any value at the path."""
+        return self._step("", parts, (), test)
+
+    def _step(
+        self, here: str, parts: tuple[str | int, ...], seen: tuple[str, ...], test: _Test
+    ) -> object:
+        # `here` is "", "$a.b" or "$$v.b"; `seen` are the names passed so far.
+        for index, part in enumerate(parts):
+            rest = parts[index + 1 :]
+            if isinstance(part, int):
+                variable = f"e{len(seen)}x{index}"
+                element = {"$cond": [{"$isArray": [here]}, {"$arrayElemAt": [here, part]}, None]}
+                inner = self._step(f"$${variable}", rest, seen, test)
+                return {"$let": {"vars": {variable: element}, "in": inner}}
+            here = f"{here}.{part}" if here else f"${part}"
+            seen = (*seen, part)
+            is_array = ".".join(seen) in self._types.arrays
+            if rest and is_array and not isinstance(rest[0], int):
+                variable = f"m{len(seen)}"
+                mapped = {
+                    "$map": {
+                        "input": {"$cond": [{"$isArray": [here]}, here, []]},
+                        "as": variable,
+                        "in": self._step(f"$${variable}", rest, seen, test),
+                    }
+                }
+                return {"$anyElementTrue": [mapped]}
+        return test.on(here)
+
+    def _unknown(self, asked: Field, path: str) -> WhereError:
+        known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
+        lowered = {name.lower(): name for name in known}
+        near = [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
+        near += [
+            lowered[key]
+            for key in difflib.get_close_matches(path.lower(), lowered, n=_SHOWN, cutoff=0.5)
+        ]
+        shown = list(dict.fromkeys(near or known))
+        names = ", ".join(shown[:_SHOWN]) + (" …" if len(shown) > _SHOWN else "")
+        hint = f"; did you mean {names}?" if near else f"; there are {names}" if names else ""
+        return self._fail(asked, f"there is no field {path}{hint}")
+
+    def _fail(self, asked: Field, message: str) -> WhereError:
+        return error_at(self._text, asked.position, message)
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """A comparison of a statistic of a short array.
+
+    Attributes:
+        stat: The statistic.
+        base: Type of the elements.
+        operator: Aggregation operator.
+        value: What to compare with.
+    """
+
+    stat: Stat
+    base: str
+    operator: str
+    value: Value
+
+    def on(self, here: str) -> object:
+        """The aggregation expression for the value at `here`; false when it is no list."""
+        compared: object = {self.operator: ["$$s", {"$literal": self.value}]}
+        if self.operator != "$eq":
+            # In aggregation null is less than every number.
+            compared = {"$and": [{"$ne": ["$$s", None]}, compared]}
+        statistic = {"$let": {"vars": {"s": self._statistic(here)}, "in": compared}}
+        return {"$cond": [{"$isArray": [here]}, statistic, False]}
+
+    def _statistic(self, here: str) -> object:
+        if self.stat == "n":
+            return {"$size": here}
+        numbers: object = here
+        if _KINDS.get(self.base) == "bool":
+            numbers = {"$map": {"input": here, "as": "b", "in": {"$cond": ["$$b", 1, 0]}}}
+        finite = {
+            "$filter": {
+                "input": numbers,
+                "as": "v",
+                # NaN sorts before -inf, everything that is no number after inf.
+                "cond": {"$and": [{"$gt": ["$$v", -_INF]}, {"$lt": ["$$v", _INF]}]},
+            }
+        }
+        operator = {"min": "$min", "max": "$max", "mean": "$avg"}[self.stat]
+        return {operator: finite}
+
+
+def _comparison(operator: str, value: Value) -> Filter:
+    if operator == "$ne" or value is None:
+        # Without this, documents that lack the field would match.
+        return {operator: value, "$exists": True}
+    return {operator: value}
+
+
+def _is_nan(value: Value) -> bool:
+    return isinstance(value, float) and value != value  # noqa: PLR0124

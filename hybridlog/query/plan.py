@@ -1,0 +1,349 @@
+"""From a question to chunks, and from chunks to messages in order.
+
+A plan is a list of chunks sorted by the log time at which they begin. The sweep loads
+them in that order, each once, and gives out every message as soon as no chunk still to
+come can hold an earlier one: the order (log time, recording, arrival) is total, and
+memory is bounded by the chunks that overlap in time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from hybridlog_storage.copying import interleave
+from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segment_writer import StoredChunk
+
+from hybridlog.indexing import STAMP, header_stamps
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.messages import Batch, Channel
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.codec import Codec
+
+Clock = Literal["log", "publish", "header"]
+_LOOK_AHEAD = 4
+
+
+@dataclass(slots=True)
+class Counters:
+    """What answering a question has cost.
+
+    Attributes:
+        messages: Messages given out.
+        payload_bytes: Bytes of their payloads.
+        bytes_read: Bytes read from segments.
+        chunks_read: Chunks read and decompressed.
+        documents_read: Index documents that came from MongoDB.
+        elapsed_s: Wall time, seconds.
+    """
+
+    messages: int = 0
+    payload_bytes: int = 0
+    bytes_read: int = 0
+    chunks_read: int = 0
+    documents_read: int = 0
+    elapsed_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One channel of one recording that a question is about.
+
+    Attributes:
+        recording: Its recording.
+        channel_id: Its id there.
+        channel: Topic, type and so on.
+        codec: Reads its payloads.
+    """
+
+    recording: RecordingEntry
+    channel_id: int
+    channel: Channel
+    codec: Codec
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What is wanted of one recording.
+
+    Attributes:
+        recording: The recording.
+        lanes: Index of each wanted channel in the plan's lanes, by channel id.
+        bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
+        chunks: The chunks that may hold it.
+    """
+
+    recording: RecordingEntry
+    lanes: Mapping[int, int]
+    bounds: tuple[int, int] | None
+    chunks: Sequence[ChunkEntry]
+
+
+ChunkKey = tuple[str, int, int]
+"""Recording id, segment number, chunk offset."""
+
+Chosen = Mapping[ChunkKey, "NDArray[np.int64]"]
+"""Payload offsets (`_meta.ref.off`) of the chosen messages of each chunk, sorted."""
+
+Chooser = Callable[[Sequence["Task"]], Chosen]
+"""Asks the index which messages of some chunks satisfy the predicate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A chunk to be read, and what is wanted from it."""
+
+    target: Target
+    chunk: ChunkEntry
+    first: int
+    last: int
+    messages: int
+
+    @property
+    def key(self) -> ChunkKey:
+        """Where the chunk lies."""
+        return self.target.recording.id, self.chunk.segment, self.chunk.offset
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Messages in order.
+
+    Attributes:
+        batch: The messages; `channel` is the index of each message's lane.
+        seq: int64[n], arrival numbers in their recordings.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Plan:
+    """A question, resolved.
+
+    Attributes:
+        lanes: Every channel it is about.
+        targets: What is wanted of each recording.
+        clock: Which time the bounds are about.
+        chooser: The predicate, None without.
+        reverse: Latest first.
+    """
+
+    lanes: list[Lane]
+    targets: list[Target]
+    clock: Clock = "log"
+    chooser: Chooser | None = None
+    reverse: bool = False
+    counters: Counters = field(default_factory=Counters)
+
+    def tasks(self) -> list[Task]:
+        """The chunks to read, in the order in which the sweep takes them."""
+        found = []
+        for target in self.targets:
+            for chunk in target.chunks:
+                stats = [s for c, s in chunk.stats.items() if c in target.lanes]
+                firsts = [s.first for s in stats if s.first is not None]
+                lasts = [s.last for s in stats if s.last is not None]
+                if firsts:
+                    count = sum(s.messages for s in stats)
+                    found.append(Task(target, chunk, min(firsts), max(lasts), count))
+        if self.reverse:
+            return sorted(found, key=lambda t: (-t.last, t.key))
+        return sorted(found, key=lambda t: (t.first, t.key))
+
+
+class Sweep:
+    """Carries out a plan.
+
+    Args:
+        plan: What to read.
+        reader_of: Gives the reader of a segment, by recording id and number.
+    """
+
+    def __init__(self, plan: Plan, reader_of: Callable[[str, int], SegmentReader]) -> None:
+        self._plan = plan
+        self._reader_of = reader_of
+
+    def pieces(self) -> Iterator[Piece]:
+        """All messages, in order."""
+        started = time.monotonic()
+        plan = self._plan
+        waiting: list[Piece] = []
+        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
+            try:
+                for piece, following in self._loaded(pool):
+                    if len(piece.batch):
+                        waiting.append(piece)
+                    ready, waiting = self._split(waiting, following)
+                    if ready:
+                        whole = _in_order(ready, plan)
+                        plan.counters.messages += len(whole.batch)
+                        plan.counters.payload_bytes += whole.batch.payload_bytes
+                        plan.counters.elapsed_s = time.monotonic() - started
+                        yield whole
+            finally:
+                pool.shutdown(cancel_futures=True)
+                plan.counters.elapsed_s = time.monotonic() - started
+
+    def unordered(self) -> Iterator[Piece]:
+        """All messages, chunk by chunk: what tables are built from."""
+        plan = self._plan
+        started = time.monotonic()
+        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
+            for piece, _ in self._loaded(pool):
+                plan.counters.messages += len(piece.batch)
+                plan.counters.payload_bytes += piece.batch.payload_bytes
+                if len(piece.batch):
+                    yield piece
+        plan.counters.elapsed_s = time.monotonic() - started
+
+    def _chosen(self, tasks: list[Task]) -> Iterator[tuple[Task, NDArray[np.int64] | None]]:
+        """Leave out the chunks in which nothing satisfies the predicate."""
+        chooser = self._plan.chooser
+        if chooser is None:
+            yield from ((task, None) for task in tasks)
+            return
+        for group in _groups(tasks):
+            chosen = chooser(group)
+            for task in group:
+                offsets = chosen.get(task.key)
+                if offsets is not None and len(offsets):
+                    yield task, offsets
+
+    def _loaded(self, pool: ThreadPoolExecutor) -> Iterator[tuple[Piece, Task | None]]:
+        """The wanted messages of each chunk, read a little ahead, and the chunk after it."""
+        counters = self._plan.counters
+        loading: deque[tuple[Task, Future[tuple[Piece, int]]]] = deque()
+        upcoming = self._chosen(self._plan.tasks())
+        while True:
+            while len(loading) < _LOOK_AHEAD:
+                item = next(upcoming, None)
+                if item is None:
+                    break
+                loading.append((item[0], pool.submit(self._load, *item)))
+            if not loading:
+                return
+            piece, size = loading.popleft()[1].result()
+            counters.chunks_read += 1
+            counters.bytes_read += size
+            yield piece, loading[0][0] if loading else None
+
+    def _load(self, task: Task, offsets: NDArray[np.int64] | None) -> tuple[Piece, int]:
+        entry = task.chunk
+        reader = self._reader_of(task.target.recording.id, entry.segment)
+        place = ChunkPlace(
+            entry.offset,
+            entry.length,
+            entry.trailer,
+            entry.first,
+            entry.last,
+            tuple(entry.stats),
+        )
+        chunk = reader.read_chunk(place)
+        return self._wanted(task, chunk, offsets), chunk.length + chunk.trailer
+
+    def _wanted(self, task: Task, chunk: StoredChunk, offsets: NDArray[np.int64] | None) -> Piece:
+        batch, seq = chunk.batch, chunk.seq
+        lanes = task.target.lanes
+        table = np.full(int(batch.channel.max()) + 1, -1, np.int32)
+        for channel_id, lane in lanes.items():
+            if channel_id < len(table):
+                table[channel_id] = lane
+        lane_of = table[batch.channel]
+        mask = lane_of >= 0
+        if offsets is not None:
+            at = np.minimum(np.searchsorted(offsets, batch.offset), len(offsets) - 1)
+            mask &= offsets[at] == batch.offset
+        bounds = task.target.bounds
+        if bounds is not None:
+            mask &= self._inside(batch, lane_of, mask, bounds)
+        rows = np.flatnonzero(mask)
+        own = batch.take(rows)
+        own.channel = lane_of[rows]
+        return Piece(own, seq[rows])
+
+    def _inside(
+        self,
+        batch: Batch,
+        lane_of: NDArray[np.int32],
+        mask: NDArray[np.bool_],
+        bounds: tuple[int, int],
+    ) -> NDArray[np.bool_]:
+        begin, end = bounds
+        if self._plan.clock == "log":
+            times = batch.log_time
+        elif self._plan.clock == "publish":
+            times = batch.publish_time
+        else:
+            times = np.full(len(batch), -1, np.int64)
+            for lane in np.unique(lane_of[mask]).tolist():
+                rows = np.flatnonzero(mask & (lane_of == lane))
+                part = batch.take(rows)
+                decoded = self._plan.lanes[lane].codec.columns(
+                    part.buffer, part.offset, part.length, {STAMP}
+                )
+                stamps = header_stamps(decoded.records)
+                if stamps is not None:
+                    times[rows[decoded.rows]] = stamps
+        return (times >= begin) & (times < end)
+
+    def _split(
+        self, waiting: list[Piece], following: Task | None
+    ) -> tuple[list[Piece], list[Piece]]:
+        """What no chunk still to come can precede, and the rest."""
+        if following is None:
+            return waiting, []
+        ready, rest = [], []
+        for piece in waiting:
+            times = piece.batch.log_time
+            now = times > following.last if self._plan.reverse else times < following.first
+            if now.all():
+                ready.append(piece)
+            elif now.any():
+                ready.append(_rows(piece, now))
+                rest.append(_rows(piece, ~now))
+            else:
+                rest.append(piece)
+        return ready, rest
+
+
+def _rows(piece: Piece, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Piece:
+    return Piece(piece.batch.take(rows), piece.seq[rows])
+
+
+def _in_order(pieces: list[Piece], plan: Plan) -> Piece:
+    """Put pieces into one, sorted by log time, recording and arrival."""
+    keys = np.array([lane.recording.key for lane in plan.lanes], np.int64)
+    times = np.concatenate([p.batch.log_time for p in pieces])
+    lanes = np.concatenate([p.batch.channel for p in pieces])
+    seq = np.concatenate([p.seq for p in pieces])
+    order = np.lexsort((seq, keys[lanes], times))
+    if plan.reverse:
+        order = order[::-1]
+    if len(pieces) == 1:
+        return _rows(pieces[0], order)
+    return Piece(interleave([p.batch for p in pieces], order), seq[order])
+
+
+def _groups(tasks: list[Task], most: int = 50_000) -> Iterator[list[Task]]:
+    """Runs of chunks that are asked about in one query."""
+    group: list[Task] = []
+    messages = 0
+    for task in tasks:
+        group.append(task)
+        messages += task.messages
+        if messages >= most:
+            yield group
+            group, messages = [], 0
+    if group:
+        yield group

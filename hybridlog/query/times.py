@@ -1,0 +1,430 @@
+"""Times as people write them, turned into integer nanoseconds, exactly.
+
+A time is nanoseconds since the Unix epoch, `0 <= t < 2**63`. No text goes through a
+float: `1425407313.123456789` keeps its last digit.
+
+What `parse_time` takes:
+
+| written | means |
+|---|---|
+| `2015-03-03T18:28:33.123456789Z`, `…+01:00` | ISO 8601, to nine digits |
+| `2015-03-03T18:28:33`, `2015-03-03` | the same in UTC |
+| `1425407313`, `1425407313.123456789` | seconds since the epoch, below 10**14 |
+| `1425407313123456789` | nanoseconds since the epoch, from 10**14 |
+| `5000000000ns` | nanoseconds since the epoch, whatever the size (simulated clocks start at 0) |
+| `+5s`, `+1m30s`, `+500ms`, `+5`, `1m30s` | from the start of the recording (`+5` is seconds) |
+| `-10s`, `-10` | before the end of the recording |
+| `start`, `end`, `now` | as they say |
+
+Without a zone a date is UTC on every machine, because logs travel between zones. A blank
+may stand for the `T`.
+
+A bare number without a unit is always counted from the epoch, a number with a unit from
+the start of the recording.
+"""
+
+from __future__ import annotations
+
+import calendar
+import math
+import re
+import time
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
+from decimal import ROUND_HALF_EVEN, Decimal
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, TypeAlias
+
+from hybridlog_storage.errors import TimeError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    TimeLike: TypeAlias = (
+        "str | int | float | date | np.datetime64 | np.integer[np.typing.NBitBase]"
+        " | np.floating[np.typing.NBitBase]"
+    )
+
+TIME_LIMIT = 2**63
+"""Times lie below this many nanoseconds (the year 2262)."""
+
+ACCEPTED = (
+    "write a time as ISO 8601 (2015-03-03T18:28:33.5Z, UTC when no zone is given; "
+    "2015-03-03), as seconds since the epoch (1425407313.123), as nanoseconds "
+    "(1425407313123456789 or 5000ns), counted from the start (+5s, +1m30s, 500ms) or from "
+    "the end (-10s), or as start, end or now"
+)
+"""The forms `parse_time` accepts, for messages and help texts."""
+
+DURATIONS = "write a duration as 5s, 1m30s, 2h, 500ms, 250us, 100ns, or a number of seconds"
+"""The forms `parse_duration` accepts."""
+
+_NANOSECONDS_FROM = 10**14
+_SECOND = 10**9
+_LONGEST_TEXT = 200
+
+_NUMBER = re.compile(r"([0-9]+)(?:\.([0-9]*))?")
+_NS = re.compile(r"([0-9]+)\s*ns", re.IGNORECASE)
+_ISO = re.compile(
+    r"(?P<year>[0-9]{4})(?:-(?P<month>[0-9]{2})-(?P<day>[0-9]{2})"
+    r"|(?P<month2>[0-9]{2})(?P<day2>[0-9]{2})(?=[Tt]))"
+    r"(?:(?:[Tt]|\s+)(?P<hour>[0-9]{2})"
+    r"(?::?(?P<minute>[0-9]{2})(?::?(?P<second>[0-9]{2})(?:[.,](?P<fraction>[0-9]+))?)?)?"
+    r"\s*(?P<zone>[Zz]|UTC|utc|[+-][0-9]{2}(?::?[0-9]{2})?)?)?"
+)
+_PART = r"(?:([0-9]+)(?:\.([0-9]+))?\s*{}\s*)?"
+_UNITS: tuple[tuple[str, int], ...] = (
+    ("d", 86_400 * _SECOND),
+    ("h", 3_600 * _SECOND),
+    ("m(?:in)?", 60 * _SECOND),
+    ("s(?:ec)?", _SECOND),
+    ("ms", 10**6),
+    ("(?:us|µs|μs)", 10**3),
+    ("ns", 1),
+)
+_DURATION = re.compile("".join(_PART.format(unit) for unit, _ in _UNITS), re.IGNORECASE)
+_DATETIME64_UNITS = {
+    "D": 86_400 * _SECOND,
+    "h": 3_600 * _SECOND,
+    "m": 60 * _SECOND,
+    "s": _SECOND,
+    "ms": 10**6,
+    "us": 10**3,
+    "ns": 1,
+}
+
+
+def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
+    """One time, in nanoseconds since the epoch.
+
+    Args:
+        text: A time in one of the forms of this module's table, a number by the same
+            rule (a float is taken by its shortest decimal form), a `datetime` or
+            `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
+        start: Where `+5s` counts from, nanoseconds; None when there is no recording.
+        end: Where `-10s` counts from, nanoseconds: one past the last message, so that
+            `[start, end)` is everything. A time before the epoch becomes 0.
+
+    Raises:
+        TimeError: Not a time, outside of `[0, 2**63)`, or relative to nothing.
+    """
+    if isinstance(text, str):
+        return _checked(_parse_text(text, start, end), text)
+    if isinstance(text, bool):
+        raise TimeError(f"{text} is not a time: {ACCEPTED}")
+    if isinstance(text, Integral):
+        return _checked(_scaled(int(text), ""), text)
+    if isinstance(text, Real):
+        return _checked(_from_float(float(text)), text)
+    if isinstance(text, date):
+        return _checked(_from_date(text), text)
+    return _checked(_from_datetime64(text), text)
+
+
+def parse_range(
+    begin: TimeLike | None, stop: TimeLike | None, *, start: int | None, end: int | None
+) -> tuple[int, int]:
+    """A half-open range `[begin, stop)` in nanoseconds.
+
+    Args:
+        begin: First time of the range; None for `start`, or 0 when that is unknown.
+        stop: First time after the range; None for `end`, or 2**63 - 1.
+        start: First log time there is, for relative times.
+        end: One past the last log time there is, for relative times.
+
+    Raises:
+        TimeError: One of both is no time, or the range is empty.
+    """
+    low = (start or 0) if begin is None else parse_time(begin, start=start, end=end)
+    if stop is not None:
+        high = parse_time(stop, start=start, end=end)
+    else:
+        high = TIME_LIMIT - 1 if end is None else end
+    if high <= low:
+        raise TimeError(
+            f"the range is empty: it begins at {_spelled(begin, 'the start', low)} and ends "
+            f"at {_spelled(stop, 'the end', high)}, which is not later (ranges are half-open, "
+            "the end is not part of them)"
+        )
+    return low, high
+
+
+def parse_between(
+    between: str | Sequence[TimeLike], *, start: int | None, end: int | None
+) -> tuple[int, int]:
+    """A range written as `t0..t1` or given as two times.
+
+    Either side of `..` may be left out: `..+5s`, `-10s..`.
+
+    Args:
+        between: `"t0..t1"` or a sequence of two times.
+        start: First log time there is, for relative times.
+        end: One past the last log time there is, for relative times.
+
+    Raises:
+        TimeError: Not two times, or an empty range.
+    """
+    parts: Sequence[TimeLike]
+    if isinstance(between, str):
+        parts = between.split("..")
+        if len(parts) != 2:
+            raise TimeError(f"{_shown(between)} is not a time range: write t0..t1; {ACCEPTED}")
+    else:
+        parts = between
+        if len(parts) != 2:
+            raise TimeError(f"a time range needs two times, got {len(parts)}")
+    low, high = (None if _is_blank(part) else part for part in parts)
+    return parse_range(low, high, start=start, end=end)
+
+
+def parse_duration(text: str | float | timedelta) -> int:
+    """A length of time in nanoseconds, not negative.
+
+    Args:
+        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`; parts stand in
+            falling order, each may have a fraction; a number without unit is seconds.
+
+    Raises:
+        TimeError: Not a duration, negative, finer than a nanosecond, or 2**63 and more.
+    """
+    if isinstance(text, str):
+        ns = _duration(text.strip()) if len(text) <= _LONGEST_TEXT else None
+        if ns is None:
+            raise TimeError(f"{_shown(text)} is not a duration: {DURATIONS}")
+    elif isinstance(text, timedelta):
+        ns = _timedelta(text)
+    elif isinstance(text, bool) or not isinstance(text, Real) or not math.isfinite(text):
+        raise TimeError(f"{text!r} is not a duration: {DURATIONS}")
+    elif isinstance(text, Integral):
+        ns = int(text) * _SECOND
+    else:
+        ns = _rounded(Decimal(repr(float(text))) * _SECOND)
+    if not 0 <= ns < TIME_LIMIT:
+        raise TimeError(f"{_shown(text)} is out of range for a duration: {DURATIONS}")
+    return ns
+
+
+def format_time(ns: int) -> str:
+    """A time as ISO 8601 in UTC, the fraction without trailing zeros.
+
+    `format_time(1425407313_500000000)` is `2015-03-03T18:28:33.5Z`; `parse_time` reads
+    it back exactly.
+    """
+    seconds, rest = divmod(int(ns), _SECOND)
+    base = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=seconds)
+    return f"{base:%Y-%m-%dT%H:%M:%S}{_fraction(rest, 9)}Z"
+
+
+def format_duration(ns: int) -> str:
+    """A length of time as `parse_duration` reads it: `1h2m3.5s`, `12.5ms`, `250ns`, `0s`.
+
+    A negative one, which only differences are, gets a leading minus.
+    """
+    ns = int(ns)
+    if ns < 0:
+        return "-" + format_duration(-ns)
+    if ns == 0:
+        return "0s"
+    if ns < _SECOND:
+        for unit, size, digits in (("ms", 10**6, 6), ("us", 10**3, 3)):
+            if ns >= size:
+                whole, rest = divmod(ns, size)
+                return f"{whole}{_fraction(rest, digits)}{unit}"
+        return f"{ns}ns"
+    seconds, rest = divmod(ns, _SECOND)
+    text = ""
+    for unit, size in (("d", 86_400), ("h", 3_600), ("m", 60)):
+        count, seconds = divmod(seconds, size)
+        if count:
+            text += f"{count}{unit}"
+    if seconds or rest:
+        text += f"{seconds}{_fraction(rest, 9)}s"
+    return text
+
+
+def _parse_text(text: str, start: int | None, end: int | None) -> int:
+    word = text.strip()
+    if not word or len(word) > _LONGEST_TEXT:
+        raise TimeError(f"{_shown(text)} is not a time: {ACCEPTED}")
+    if word[0] in "+-":
+        return _relative(word, start, end)
+    named = {"start": start, "end": end}
+    if word.lower() in named:
+        return _base(named[word.lower()], word)
+    if word.lower() == "now":
+        return time.time_ns()
+    absolute = _absolute(word)
+    if absolute is not None:
+        return absolute
+    offset = _duration(word)
+    if offset is None:
+        raise TimeError(f"{_shown(text)} is not a time: {ACCEPTED}")
+    return _base(start, word) + offset
+
+
+def _absolute(word: str) -> int | None:
+    """A date or a number since the epoch; None when it is neither."""
+    if number := _NUMBER.fullmatch(word):
+        return _scaled(int(number[1]), number[2] or "", word)
+    if nanoseconds := _NS.fullmatch(word):
+        return int(nanoseconds[1])
+    if iso := _ISO.fullmatch(word):
+        return _from_iso(iso, word)
+    return None
+
+
+def _relative(word: str, start: int | None, end: int | None) -> int:
+    offset = _duration(word[1:].strip())
+    if offset is None:
+        raise TimeError(f"{_shown(word)} is not a time: {ACCEPTED}")
+    if word[0] == "+":
+        return _base(start, word) + offset
+    # The last ten seconds of a log of five that starts at 0 are the whole log.
+    return max(0, _base(end, word) - offset)
+
+
+def _base(base: int | None, word: str) -> int:
+    if base is None:
+        raise TimeError(
+            f"{_shown(word)} counts from a recording, and there is none with messages: "
+            "write a date or a number since the epoch"
+        )
+    return base
+
+
+def _scaled(whole: int, fraction: str, word: str = "") -> int:
+    """A number since the epoch: seconds when small, nanoseconds when large."""
+    if whole >= _NANOSECONDS_FROM:
+        if fraction.strip("0"):
+            raise TimeError(
+                f"{_shown(word)} has a fraction of a nanosecond (numbers from 10**14 are "
+                f"nanoseconds): {ACCEPTED}"
+            )
+        return whole
+    return whole * _SECOND + _nanoseconds(fraction, word)
+
+
+def _nanoseconds(digits: str | None, word: str) -> int:
+    digits = (digits or "").rstrip("0")
+    if len(digits) > 9:
+        raise TimeError(
+            f"{_shown(word)} is finer than a nanosecond: at most nine digits of a second"
+        )
+    return int(digits.ljust(9, "0")) if digits else 0
+
+
+def _from_iso(iso: re.Match[str], word: str) -> int:
+    try:
+        moment = datetime(
+            int(iso["year"]),
+            int(iso["month"] or iso["month2"]),
+            int(iso["day"] or iso["day2"]),
+            int(iso["hour"] or 0),
+            int(iso["minute"] or 0),
+            int(iso["second"] or 0),
+            tzinfo=UTC,
+        )
+    except ValueError as error:
+        raise TimeError(f"{_shown(word)} is no date there is: {error}") from None
+    seconds = calendar.timegm(moment.timetuple())
+    zone = iso["zone"]
+    if zone and zone[0] in "+-":
+        digits = zone[1:].replace(":", "").ljust(4, "0")
+        hours, minutes = int(digits[:2]), int(digits[2:])
+        if hours > 23 or minutes > 59:
+            raise TimeError(f"{_shown(word)} has no zone there is: {zone}")
+        shift = hours * 3_600 + minutes * 60
+        seconds -= shift if zone[0] == "+" else -shift
+    return seconds * _SECOND + _nanoseconds(iso["fraction"], word)
+
+
+def _duration(word: str) -> int | None:
+    """Nanoseconds of an unsigned duration; None when it is none."""
+    if number := _NUMBER.fullmatch(word):
+        return int(number[1]) * _SECOND + _nanoseconds(number[2], word)
+    match = _DURATION.fullmatch(word)
+    if not word or match is None:
+        return None
+    total = 0
+    for index, (_, size) in enumerate(_UNITS):
+        whole, fraction = match[2 * index + 1], match[2 * index + 2]
+        if whole is None:
+            continue
+        total += int(whole) * size
+        if fraction:
+            part, rest = divmod(int(fraction) * size, 10 ** len(fraction))
+            if rest:
+                raise TimeError(f"{_shown(word)} is finer than a nanosecond")
+            total += part
+    return total
+
+
+def _from_float(number: float) -> int:
+    if not math.isfinite(number) or not 0 <= number < TIME_LIMIT:
+        raise TimeError(f"{number!r} is not a time: {ACCEPTED}")
+    # The shortest decimal that names this float is what was typed.
+    exact = Decimal(repr(number))
+    return _rounded(exact if exact >= _NANOSECONDS_FROM else exact * _SECOND)
+
+
+def _rounded(number: Decimal) -> int:
+    return int(number.to_integral_value(rounding=ROUND_HALF_EVEN))
+
+
+def _timedelta(delta: timedelta) -> int:
+    whole = (delta.days * 86_400 + delta.seconds) * _SECOND + delta.microseconds * 1_000
+    return whole + int(getattr(delta, "nanoseconds", 0))
+
+
+def _from_date(moment: date) -> int:
+    if not isinstance(moment.year, int):  # pandas.NaT is a datetime whose year is nan
+        raise TimeError(f"{moment} is not a time: {ACCEPTED}")
+    seconds = calendar.timegm(moment.timetuple())
+    if not isinstance(moment, datetime):
+        return seconds * _SECOND
+    offset = moment.utcoffset() or timedelta(0)
+    # pandas.Timestamp has one attribute more than datetime.
+    below = moment.microsecond * 1_000 + int(getattr(moment, "nanosecond", 0))
+    return seconds * _SECOND + below - _timedelta(offset)
+
+
+def _from_datetime64(moment: object) -> int:
+    import numpy as np  # noqa: PLC0415 - whoever has a datetime64 has numpy loaded
+
+    if not isinstance(moment, np.datetime64) or np.isnat(moment):
+        raise TimeError(f"{_shown(moment)} is not a time: {ACCEPTED}")
+    value = np.asarray(moment)
+    unit, count = np.datetime_data(value.dtype)
+    if unit in {"Y", "M", "W"}:
+        value, unit, count = value.astype("datetime64[D]"), "D", 1
+    number = int(value.astype(np.int64)) * count
+    if unit in _DATETIME64_UNITS:
+        return number * _DATETIME64_UNITS[unit]
+    return number // {"ps": 10**3, "fs": 10**6, "as": 10**9}[unit]
+
+
+def _checked(ns: int, source: object) -> int:
+    if not 0 <= ns < TIME_LIMIT:
+        raise TimeError(
+            f"{_shown(source)} is out of range: times lie from 1970-01-01 to 2262-04-11 "
+            "(0 to 2**63 nanoseconds)"
+        )
+    return ns
+
+
+def _is_blank(part: object) -> bool:
+    return part is None or (isinstance(part, str) and not part.strip())
+
+
+def _spelled(source: object, default: str, ns: int) -> str:
+    name = default if source is None else _shown(source)
+    return f"{name} ({format_time(ns)}, {ns} ns)"
+
+
+def _shown(source: object) -> str:
+    text = repr(source) if isinstance(source, str) else str(source)
+    return text if len(text) <= 80 else text[:76] + "…" + text[-1]
+
+
+def _fraction(rest: int, digits: int) -> str:
+    return f".{rest:0{digits}d}".rstrip("0") if rest else ""

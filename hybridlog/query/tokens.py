@@ -1,0 +1,240 @@
+"""The words of a predicate: field paths, numbers, strings, times, operators.
+
+Whatever cannot be a word raises `WhereError` with a caret under the place. Text is
+bounded before anything is done with it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from hybridlog.query.times import parse_duration, parse_time
+from hybridlog_storage.errors import TimeError, WhereError
+
+MAX_TEXT = 10_000
+"""Longest predicate, characters."""
+MAX_TOKENS = 2_000
+_INT64 = range(-(2**63), 2**63)
+_WINDOW = 100
+
+_PART = r"[^\W\d]\w*|`[^`]*`"
+_FIRST = re.compile(_PART)
+_NEXT = re.compile(rf"\.(?P<name>{_PART}|[0-9]+)|\[\s*(?P<index>[0-9]+|\*)?\s*\]")
+_NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
+_HEX = re.compile(r"0[xX][0-9a-fA-F]+")
+_INTEGER = re.compile(r"[0-9]+")
+_FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_OPERATOR = re.compile(r"==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-]")
+_STRING = re.compile(
+    r"""(?P<quote>["'])(?P<body>(?:\\.|(?!(?P=quote))[^\\])*)(?P=quote)""", re.DOTALL
+)
+_ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))", re.DOTALL)
+_ESCAPES = {
+    '"': '"',
+    "'": "'",
+    "\\": "\\",
+    "/": "/",
+    "n": "\n",
+    "t": "\t",
+    "r": "\r",
+    "b": "\b",
+    "f": "\f",
+    "0": "\0",
+}
+
+Kind = Literal["path", "number", "time", "string", "operator", "end"]
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """One word.
+
+    Attributes:
+        kind: What it is; `time` is a number of nanoseconds, a time or a duration.
+        text: As written; of a string only what is between the quotes.
+        position: Index of its first character.
+        number: Value of a `number` or `time`.
+        path: Parts of a `path`: names, and ints for array elements (`[]` and `[*]`,
+            any element, leave no part).
+        keyword: A path of one plain name, in lower case; else empty.
+    """
+
+    kind: Kind
+    text: str
+    position: int
+    number: int | float = 0
+    path: tuple[str | int, ...] = ()
+    keyword: str = ""
+
+
+def error_at(text: str, position: int, message: str) -> WhereError:
+    """The error: the message, the line of the text, a caret under the place."""
+    begin = text.rfind("\n", 0, position) + 1
+    finish = text.find("\n", position)
+    line = text[begin : len(text) if finish < 0 else finish]
+    column = position - begin
+    if len(line) > _WINDOW:
+        cut = max(0, column - _WINDOW // 2)
+        line, column = line[cut : cut + _WINDOW], column - cut
+    # One column a character, and nothing that steers a terminal.
+    line = "".join(char if char.isprintable() else "?" for char in line)
+    return WhereError(f"{message}\n  {line}\n  {' ' * column}^")
+
+
+def tokenize(text: str) -> list[Token]:
+    """The words of a predicate, with an `end` behind the last.
+
+    Raises:
+        WhereError: Too long, or a place where no word begins.
+    """
+    if len(text) > MAX_TEXT:
+        raise WhereError(
+            f"the predicate has {len(text)} characters, at most {MAX_TEXT} are allowed"
+        )
+    tokens: list[Token] = []
+    at = 0
+    while True:
+        while at < len(text) and text[at].isspace():
+            at += 1
+        if at >= len(text):
+            tokens.append(Token("end", "", len(text.rstrip())))
+            return tokens
+        token, at = _next(text, at)
+        tokens.append(token)
+        if len(tokens) > MAX_TOKENS:
+            raise error_at(text, token.position, f"the predicate has more than {MAX_TOKENS} words")
+
+
+def unescape(text: str, token: Token) -> str:
+    """The value of a string token.
+
+    Raises:
+        WhereError: An escape that does not exist, or half a surrogate pair.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        if match[1]:
+            return chr(int(match[1], 16))
+        if match[2] in _ESCAPES:
+            return _ESCAPES[match[2]]
+        place = token.position + 1 + match.start()
+        raise error_at(text, place, f"there is no escape \\{match[2]}; write \\\\ for a backslash")
+
+    value = _ESCAPE.sub(replace, token.text)
+    try:
+        # Pairs of surrogates become the one character they stand for.
+        return value.encode("utf-16", "surrogatepass").decode("utf-16")
+    except UnicodeDecodeError:
+        raise error_at(text, token.position, "the string has half a surrogate pair") from None
+
+
+def regex_text(token: Token) -> str:
+    r"""The pattern of a string token: backslashes stay, so that `"\d+"` means digits."""
+    return token.text.replace('\\"', '"').replace("\\'", "'")
+
+
+def _next(text: str, at: int) -> tuple[Token, int]:
+    char = text[at]
+    if char in "\"'":
+        return _string(text, at)
+    if char in "tT" and text[at + 1 : at + 2] in {'"', "'"}:
+        return _time(text, at)
+    if word := _NUMBER_WORD.match(text, at):
+        return _number(text, word)
+    if first := _FIRST.match(text, at):
+        return _path(text, first)
+    if operator := _OPERATOR.match(text, at):
+        return Token("operator", operator[0], at), operator.end()
+    raise error_at(text, at, f"{char!r} has no meaning here")
+
+
+def _string(text: str, at: int) -> tuple[Token, int]:
+    match = _STRING.match(text, at)
+    if match is None:
+        raise error_at(text, at, "the string is not closed")
+    if any(0xD800 <= ord(char) <= 0xDFFF for char in match["body"]):
+        raise error_at(text, at, "the string is not valid Unicode")
+    return Token("string", match["body"], at), match.end()
+
+
+def _time(text: str, at: int) -> tuple[Token, int]:
+    inner, end = _string(text, at + 1)
+    try:
+        ns = parse_time(inner.text, start=None, end=None)
+    except TimeError as error:
+        raise error_at(text, at, str(error)) from None
+    return Token("time", text[at:end], at, number=ns), end
+
+
+def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
+    written, at = word[0], word.start()
+    kind: Kind = "number"
+    value: int | float
+    if len(written) > 400:
+        raise error_at(text, at, "the number has more than 400 characters")
+    if _HEX.fullmatch(written) or _INTEGER.fullmatch(written):
+        value = int(written, 16 if written[:2] in {"0x", "0X"} else 10)
+        # 2**63 itself: a minus may follow before it.
+        if value not in _INT64 and value != 2**63:
+            value = _too_large(text, at, value)
+    elif _FLOAT.fullmatch(written):
+        value = _too_large(text, at, float(written))
+    else:
+        kind = "time"
+        try:
+            value = parse_duration(written)
+        except TimeError:
+            raise error_at(
+                text, at, f"{written!r} is neither a number nor a duration such as 500ms"
+            ) from None
+    return Token(kind, written, at, number=value), word.end()
+
+
+def _too_large(text: str, at: int, value: float) -> float:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = float("inf")
+    if number == float("inf"):
+        raise error_at(text, at, "the number is too large for a double; write inf if that is meant")
+    return number
+
+
+def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
+    at = first.start()
+    parts: list[str | int] = [_name(text, at, first[0])]
+    end = first.end()
+    # `in[1, 2]` is the operator and a list, not an element of a field.
+    is_in = first[0].lower() == "in"
+    while (match := _NEXT.match(text, end)) and not (is_in and text[end] == "["):
+        if match["name"] is not None:
+            name = match["name"]
+            parts.append(
+                _index(text, end, name) if name[0] in "0123456789" else _name(text, end + 1, name)
+            )
+        elif match["index"] not in {None, "*"}:
+            parts.append(_index(text, end, match["index"]))
+        end = match.end()
+    if text[end : end + 1] == ".":
+        raise error_at(text, end, "the field's name does not end")
+    plain = end == first.end() and not first[0].startswith("`")
+    keyword = first[0].lower() if plain else ""
+    return Token("path", text[at:end], at, path=tuple(parts), keyword=keyword), end
+
+
+def _name(text: str, at: int, name: str) -> str:
+    """A part of a path, without its backquotes."""
+    plain = name.strip("`")
+    if not plain or "." in plain or "\0" in plain or plain.startswith("$"):
+        raise error_at(text, at, "a name must not be empty, hold '.' or NUL, or begin with '$'")
+    if any(0xD800 <= ord(char) <= 0xDFFF for char in plain):
+        raise error_at(text, at, "the name is not valid Unicode")
+    return plain
+
+
+def _index(text: str, at: int, digits: str) -> int:
+    if len(digits) > 9:
+        raise error_at(text, at, "the index is too large")
+    return int(digits)

@@ -1,0 +1,286 @@
+"""Topic names as people write them.
+
+A pattern is one of:
+
+* the full name: `/base/scan`;
+* a short name: whole parts at the end of a name, `scan` or `camera/image_raw`;
+* a glob: `*` and `?` stay within a part, `**` crosses parts, `[ab]`, `[!ab]` and `[a-z]`
+  are one character. With a leading slash it is compared with the whole name; without,
+  with every run of whole parts at the end, so `*_scan` finds `/base/left_scan` and
+  `camera/*` finds `/front/camera/image_raw`;
+* `re:` and a regular expression of Python, which must match the whole name. At most 200
+  characters and 4 unbounded repetitions, no repeated group that itself repeats or
+  branches, no back references: such expressions can run forever.
+
+A name that exists is always that topic, whatever characters it has.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
+
+from hybridlog.query.regex import UnsafeRegexError, check_regex
+from hybridlog_storage.errors import TopicError
+
+_SHOWN = 10
+_LONGEST_PATTERN = 1_000
+_LONGEST_REGEX = 200
+_MOST_UNBOUNDED = 4
+
+
+def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
+    """The topics that the patterns name, in the order of the patterns, each once.
+
+    A short name is tried as it is written, then without regard to case, and must name
+    one topic. A glob or `re:` gives all its topics in alphabetical order.
+
+    Args:
+        patterns: What the user wrote; none gives no topics.
+        topics: The topics there are.
+
+    Raises:
+        TopicError: A pattern that names nothing or, as a short name, several topics;
+            the message lists candidates.
+    """
+    known = sorted(set(topics))
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        found.update(dict.fromkeys(_resolve_one(pattern, known)))
+    return list(found)
+
+
+class TopicMatcher:
+    """Says of each topic whether it is wanted, when the topics are not known before.
+
+    A short name matches every topic that ends with it, case counts.
+
+    Args:
+        include: Patterns; none means all topics.
+        exclude: Patterns of topics that are not wanted although included.
+
+    Raises:
+        TopicError: A pattern that is malformed.
+    """
+
+    def __init__(self, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
+        self._include = {pattern: _matches(pattern) for pattern in include}
+        self._exclude = {pattern: _matches(pattern) for pattern in exclude}
+        self._used: set[str] = set()
+
+    def __call__(self, topic: str) -> bool:
+        """Whether the topic is wanted."""
+        included = self._any(self._include, topic) or not self._include
+        excluded = self._any(self._exclude, topic)
+        return included and not excluded
+
+    def unused(self) -> list[str]:
+        """The patterns that have matched no topic so far, as they were given."""
+        patterns = dict.fromkeys((*self._include, *self._exclude))
+        return [pattern for pattern in patterns if pattern not in self._used]
+
+    def _any(self, table: dict[str, Callable[[str], bool]], topic: str) -> bool:
+        # Every pattern is tried, so that `unused` tells of each.
+        hits = [pattern for pattern, matches in table.items() if matches(topic)]
+        self._used.update(hits)
+        return bool(hits)
+
+
+def matcher(include: Sequence[str] = (), exclude: Sequence[str] = ()) -> TopicMatcher:
+    """A `TopicMatcher` for these patterns."""
+    return TopicMatcher(include, exclude)
+
+
+def _resolve_one(pattern: str, known: list[str]) -> list[str]:
+    if pattern in known:
+        return [pattern]
+    if not _is_plain(pattern):
+        matches = _matches(pattern)
+        hits = [topic for topic in known if matches(topic)]
+        if not hits:
+            raise TopicError(f"no topic matches {_shown(pattern)}; {_there_are(known)}")
+        return hits
+    _check_length(pattern)
+    if not pattern.strip("/"):
+        raise TopicError(f"{_shown(pattern)} is not a topic; {_there_are(known)}")
+    for fold in (str, str.casefold):
+        wanted = fold(pattern)
+        whole = [topic for topic in known if fold(topic) in {wanted, "/" + wanted}]
+        hits = whole or [topic for topic in known if fold(topic).endswith("/" + wanted)]
+        # A leading slash says that the name is meant to be whole.
+        if pattern.startswith("/"):
+            hits = whole
+        if len(hits) == 1:
+            return hits
+        if hits:
+            raise TopicError(
+                f"{_shown(pattern)} is ambiguous, it may be {_listed(hits)}; write more of "
+                f"the name, or a glob to take all of them"
+            )
+    raise TopicError(_unknown(pattern, known))
+
+
+def _matches(pattern: str) -> Callable[[str], bool]:
+    """A test of one full topic name."""
+    _check_length(pattern)
+    if pattern.startswith("re:"):
+        compiled = _regex(pattern)
+        return lambda topic: topic == pattern or compiled.fullmatch(topic) is not None
+    if _is_plain(pattern):
+        tail = pattern if pattern.startswith("/") else "/" + pattern
+        if pattern.startswith("/"):
+            return lambda topic: topic == pattern
+        return lambda topic: topic == pattern or topic.endswith(tail)
+    tokens = _glob_tokens(pattern)
+    anchored = pattern.startswith("/")
+    return lambda topic: topic == pattern or _glob_match(tokens, topic, anchored=anchored)
+
+
+def _is_plain(pattern: str) -> bool:
+    return not pattern.startswith("re:") and not any(char in pattern for char in "*?[")
+
+
+def _check_length(pattern: str) -> None:
+    if not pattern or len(pattern) > _LONGEST_PATTERN:
+        raise TopicError(
+            f"{_shown(pattern)} is not a topic pattern: it must have 1 to {_LONGEST_PATTERN} "
+            "characters"
+        )
+
+
+def _regex(pattern: str) -> re.Pattern[str]:
+    text = pattern.removeprefix("re:")
+    try:
+        check_regex(text, max_length=_LONGEST_REGEX, max_unbounded=_MOST_UNBOUNDED)
+    except UnsafeRegexError as error:
+        raise TopicError(
+            f"the expression {_shown(text)} is refused at character {error.position + 1}: {error}"
+        ) from None
+    return re.compile(text)
+
+
+# A glob is a list of tokens: a test of one character, and whether it may repeat.
+_Token = tuple[Callable[[str], bool], bool]
+
+
+def _glob_tokens(pattern: str) -> list[_Token]:
+    tokens: list[_Token] = []
+    at = 0
+    while at < len(pattern):
+        char = pattern[at]
+        if pattern.startswith("**", at):
+            tokens.append((lambda _char: True, True))
+            at += 2
+        elif char == "*":
+            tokens.append((_in_part, True))
+            at += 1
+        elif char == "?":
+            tokens.append((_in_part, False))
+            at += 1
+        elif char == "[":
+            test, at = _glob_class(pattern, at)
+            tokens.append((test, False))
+        else:
+            tokens.append((char.__eq__, False))
+            at += 1
+    return tokens
+
+
+def _in_part(char: str) -> bool:
+    return char != "/"
+
+
+def _glob_class(pattern: str, at: int) -> tuple[Callable[[str], bool], int]:
+    """The test of a `[...]` that opens at `at`, and the index after it."""
+    close = pattern.find("]", at + (3 if pattern[at + 1 : at + 2] in {"!", "^"} else 2))
+    if close < 0:
+        raise TopicError(f"the glob {_shown(pattern)} has a '[' that is not closed")
+    body = pattern[at + 1 : close]
+    negated = body[:1] in {"!", "^"}
+    if negated:
+        body = body[1:]
+    singles: set[str] = set()
+    ranges: list[tuple[str, str]] = []
+    index = 0
+    while index < len(body):
+        if index + 2 < len(body) and body[index + 1] == "-":
+            ranges.append((body[index], body[index + 2]))
+            index += 3
+        else:
+            singles.add(body[index])
+            index += 1
+
+    def test(char: str) -> bool:
+        inside = char in singles or any(low <= char <= high for low, high in ranges)
+        return char != "/" and inside != negated
+
+    return test, close + 1
+
+
+def _glob_match(tokens: list[_Token], name: str, *, anchored: bool) -> bool:
+    """Whether the tokens cover the name or, unless anchored, whole parts at its end.
+
+    All ways through the glob are followed at once, so the time is at most the length of
+    the name times the length of the glob.
+    """
+    states = _skip_repeats(tokens, {0})
+    for index, char in enumerate(name):
+        after: set[int] = set()
+        for state in states:
+            if state < len(tokens) and tokens[state][0](char):
+                after.add(state if tokens[state][1] else state + 1)
+        if not anchored and char == "/" and index + 1 < len(name):
+            after.add(0)
+        states = _skip_repeats(tokens, after)
+    return len(tokens) in states
+
+
+def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
+    """Add the states that are reached because a repetition may be empty."""
+    reached = set(states)
+    for state in states:
+        following = state
+        while following < len(tokens) and tokens[following][1]:
+            following += 1
+            reached.add(following)
+    return reached
+
+
+def _unknown(pattern: str, known: list[str]) -> str:
+    # Compared by last part and in lower case too: `/scna` is near `/base/scan`.
+    nearest: dict[str, None] = {}
+    wanted = pattern.casefold().strip("/")
+    last = wanted.rsplit("/", 1)[-1]
+    nearest.update(dict.fromkeys(topic for topic in known if last and last in topic.casefold()))
+    by_key: dict[str, list[str]] = {}
+    for topic in known:
+        whole = topic.casefold().strip("/")
+        for key in {whole, whole.rsplit("/", 1)[-1]}:
+            by_key.setdefault(key, []).append(topic)
+    for word in (wanted, last):
+        for key in difflib.get_close_matches(word, by_key, n=_SHOWN, cutoff=0.6):
+            nearest.update(dict.fromkeys(by_key[key]))
+    if nearest:
+        return f"there is no topic {_shown(pattern)}; did you mean {_listed(nearest)}?"
+    return f"there is no topic {_shown(pattern)}; {_there_are(known)}"
+
+
+def _there_are(known: list[str]) -> str:
+    if not known:
+        return "there are no topics"
+    return f"there {'is' if len(known) == 1 else 'are'} {_listed(known)}"
+
+
+def _listed(topics: Iterable[str]) -> str:
+    names = list(topics)
+    shown = ", ".join(_shown(name, quote=False) for name in names[:_SHOWN])
+    more = len(names) - _SHOWN
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _shown(text: str, *, quote: bool = True) -> str:
+    if len(text) > 100:
+        text = text[:99] + "…"
+    # Names come from files: control characters must not reach a terminal.
+    return repr(text) if quote or not text.isprintable() else text

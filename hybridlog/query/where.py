@@ -1,0 +1,422 @@
+r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "laser"`.
+
+    expression  = term { ("or" | "||") term }
+    term        = factor { ("and" | "&&") factor }
+    factor      = ("not" | "!") factor | "(" expression ")" | condition
+    condition   = field ("==" | "=" | "!=" | "<" | "<=" | ">" | ">=") value
+                | value order field [ order value ]             0 < x < 5
+                | field [ "not" ] "in" "[" value { "," value } "]"
+                | field ("~" | "=~" | "!~") string              a regular expression
+                | field "between" value "and" value             half-open
+                | field ("exists" | "missing")
+    field       = name { "." name | "[" index "]" | "[]" | "[*]" }
+    value       = integer | 0xff | 1e-3 | inf | nan | "string" | true | false | null
+                | t"2015-03-03T18:28:33.5Z" | 5ms | 1m30s
+
+Words of the language may be written in any case, names not. A name that is no
+identifier, or is a word of the language at the beginning of a condition, stands in
+backquotes: `` `a-b` ``. A path through an array (`status[].level`, `status.level`) asks
+for *any* element; several conditions on one array may be met by different elements, and
+`0 < x < 5` is no more than `0 < x and x < 5`. Times and durations are integer nanoseconds,
+as they are stored.
+
+`!=`, `not in` and `!~` hold only where the field exists, and say of an array that no
+element is (or matches) that. `not (...)` is plain negation: it also holds where the field
+is missing. Numbers are compared by value whatever their type; a comparison of things of
+different kinds (a number and a string) is false. NaN equals NaN and is neither less nor
+greater than anything. `== null` finds a stored null, not a missing field.
+
+The pattern of `~` is found anywhere in the string unless anchored; its backslashes stand
+for themselves. Patterns that could run for very long are refused.
+
+`x.min`, `x.max`, `x.mean` and `x.n` of an array ask for its summary; when the types of
+the fields are known, short arrays, which are stored element by element, answer too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from hybridlog.query.regex import UnsafeRegexError, check_regex
+from hybridlog.query.tokens import Token, error_at, regex_text, tokenize, unescape
+from hybridlog_storage.errors import WhereError
+
+MAX_DEPTH = 50
+"""Deepest nesting of brackets and negations."""
+MAX_REGEX = 1_000
+MAX_UNBOUNDED = 6
+
+Value: TypeAlias = bool | int | float | str | None
+Order = Literal["==", "!=", "<", "<=", ">", ">="]
+
+_ORDERS: dict[str, Order] = {
+    "==": "==",
+    "=": "==",
+    "!=": "!=",
+    "<": "<",
+    "<=": "<=",
+    ">": ">",
+    ">=": ">=",
+}
+_TURNED: dict[Order, Order] = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
+_VALUE_WORDS: dict[str, Value] = {
+    "true": True,
+    "false": False,
+    "null": None,
+    "none": None,
+    "inf": math.inf,
+    "infinity": math.inf,
+    "nan": math.nan,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field path.
+
+    Attributes:
+        parts: Names, and ints for elements of arrays.
+        position: Where it stands in the text.
+    """
+
+    parts: tuple[str | int, ...]
+    position: int = 0
+
+    @property
+    def path(self) -> str:
+        """The path as MongoDB writes it: `position.0`."""
+        return ".".join(map(str, self.parts))
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """`field order value`; times and durations are ints."""
+
+    field: Field
+    order: Order
+    value: Value
+    position: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """`field in [...]`, or `not in` when negated."""
+
+    field: Field
+    values: tuple[Value, ...]
+    negated: bool
+    position: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Exists:
+    """`field exists`, or `missing` when not present."""
+
+    field: Field
+    present: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """`field ~ pattern`, or `!~` when negated."""
+
+    field: Field
+    pattern: str
+    negated: bool
+    position: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class And:
+    """All of the items hold."""
+
+    items: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Or:
+    """One of the items holds."""
+
+    items: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Not:
+    """The item does not hold."""
+
+    item: Node
+
+
+Condition: TypeAlias = Compare | Member | Exists | Match
+Node: TypeAlias = Condition | And | Or | Not
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """A parsed predicate.
+
+    Attributes:
+        text: As it was written; messages show it.
+        root: The tree.
+    """
+
+    text: str
+    root: Node
+
+    def conditions(self) -> Iterator[Condition]:
+        """Every single condition, from left to right."""
+        return _conditions(self.root)
+
+    def fields(self) -> list[str]:
+        """The paths asked for, as MongoDB writes them, each once."""
+        return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
+
+    def to_filter(self, field_types: Mapping[str, str] | None = None) -> dict[str, object]:
+        """The MongoDB filter; see `compile_filter`."""
+        from hybridlog.query.mongo_filter import to_filter  # noqa: PLC0415 - it needs Node
+
+        return to_filter(self, field_types)
+
+
+def parse(text: str) -> Expression:
+    """Read a predicate.
+
+    Raises:
+        WhereError: Not of the grammar; too long, too deep; a pattern that is refused.
+    """
+    if not isinstance(text, str):
+        raise WhereError(f"a predicate is text, not {type(text).__name__}")
+    return _Parser(text).parse()
+
+
+def compile_filter(text: str, *, field_types: Mapping[str, str] | None = None) -> dict[str, object]:
+    """Read a predicate and make a MongoDB filter of it.
+
+    Args:
+        text: The predicate.
+        field_types: Types of the fields that can be asked for, if known: path (dotted,
+            with or without `[]` after arrays) to type as definitions write it
+            (`float64`, `string`, `time`, `float32[]`, `uint8[9]`, `pkg/Type[]`). Then
+            fields that do not exist and values of the wrong kind are errors, and the
+            summaries of short arrays can be asked for. `_meta.*` is always known.
+
+    Raises:
+        WhereError: The predicate cannot be read, or does not fit the types.
+    """
+    return parse(text).to_filter(field_types)
+
+
+def _conditions(node: Node) -> Iterator[Condition]:
+    match node:
+        case And(items) | Or(items):
+            for item in items:
+                yield from _conditions(item)
+        case Not(item):
+            yield from _conditions(item)
+        case _:
+            yield node
+
+
+class _Parser:
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._tokens = tokenize(text)
+        self._at = 0
+        self._depth = 0
+
+    def parse(self) -> Expression:
+        if self._peek().kind == "end":
+            raise WhereError("the predicate is empty; write for example: ranges.min < 0.5")
+        root = self._or()
+        if self._peek().kind != "end":
+            raise self._fail(self._peek(), "expected 'and', 'or' or the end here")
+        return Expression(self._text, root)
+
+    def _or(self) -> Node:
+        items = [self._and()]
+        while self._take("or", "||"):
+            items.append(self._and())
+        return items[0] if len(items) == 1 else Or(tuple(items))
+
+    def _and(self) -> Node:
+        items = [self._factor()]
+        while self._take("and", "&&"):
+            items.append(self._factor())
+        return items[0] if len(items) == 1 else And(tuple(items))
+
+    def _factor(self) -> Node:
+        token = self._peek()
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise self._fail(token, f"nested deeper than {MAX_DEPTH}")
+        node: Node
+        if self._take("not", "!"):
+            node = Not(self._factor())
+        elif self._take("("):
+            node = self._or()
+            if not self._take(")"):
+                raise self._fail(self._peek(), "expected ')' here")
+        else:
+            node = self._condition()
+        self._depth -= 1
+        return node
+
+    def _condition(self) -> Node:
+        token = self._peek()
+        if token.kind == "path" and token.keyword not in _VALUE_WORDS:
+            return self._of_field(self._field())
+        if not self._is_value(token):
+            raise self._fail(token, "expected a condition here, such as: x < 5")
+        # `0 < x`, `0 < x < 5`
+        value = self._value()
+        order = self._order()
+        if order is None:
+            raise self._fail(self._peek(), "expected a comparison here")
+        field = self._field()
+        turned = _TURNED.get(order, order)
+        first = _compare(self._text, field, turned, value, token.position)
+        second_order = self._order() if order in _TURNED else None
+        if second_order is None:
+            return first
+        if second_order not in _TURNED:
+            raise self._fail(self._peek(), "only <, <=, > and >= can follow here")
+        return And((first, self._compare(field, second_order)))
+
+    def _of_field(self, field: Field) -> Node:
+        token = self._peek()
+        if (order := self._order()) is not None:
+            return self._compare(field, order)
+        if self._take("~", "=~", "!~"):
+            return self._match(field, negated=token.text == "!~")
+        if self._take("exists", "missing"):
+            return Exists(field, present=token.keyword == "exists")
+        if self._take("in", "not"):
+            if token.keyword == "not" and not self._take("in"):
+                raise self._fail(self._peek(), "expected 'in' after 'not' here")
+            return self._member(field, token, negated=token.keyword == "not")
+        if self._take("between"):
+            return self._between(field)
+        raise self._fail(
+            token,
+            "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, between, "
+            "exists or missing (of a bool: field == true)",
+        )
+
+    def _compare(self, field: Field, order: Order) -> Compare:
+        position = self._peek().position
+        value = self._value()
+        return _compare(self._text, field, order, value, position)
+
+    def _between(self, field: Field) -> Node:
+        position = self._peek().position
+        low = self._compare(field, ">=")
+        if not self._take("and"):
+            raise self._fail(self._peek(), "expected 'and' here: between a and b")
+        high = self._compare(field, "<")
+        a, b = low.value, high.value
+        if isinstance(a, int | float) and isinstance(b, int | float) and not a < b:
+            raise error_at(self._text, position, "the range is empty (its end is not part of it)")
+        return And((low, high))
+
+    def _member(self, field: Field, token: Token, *, negated: bool) -> Node:
+        closing = {"[": "]", "(": ")"}.get(self._peek().text if self._is_operator() else "")
+        if closing is None:
+            raise self._fail(self._peek(), "expected a list here: [1, 2]")
+        self._at += 1
+        values: list[Value] = []
+        while not self._take(closing):
+            if values and not self._take(","):
+                raise self._fail(self._peek(), f"expected ',' or '{closing}' here")
+            if values and self._take(closing):
+                break
+            values.append(self._value())
+        if not values:
+            raise self._fail(token, "the list is empty")
+        return Member(field, tuple(values), negated, token.position)
+
+    def _match(self, field: Field, *, negated: bool) -> Node:
+        token = self._peek()
+        if token.kind != "string":
+            raise self._fail(token, 'expected a pattern in quotes here: ~ "^base_"')
+        self._at += 1
+        pattern = regex_text(token)
+        try:
+            check_regex(pattern, max_length=MAX_REGEX, max_unbounded=MAX_UNBOUNDED)
+        except UnsafeRegexError as error:
+            # The pattern begins after the quote.
+            place = token.position + 1 + min(error.position, len(token.text))
+            raise error_at(self._text, place, f"the pattern is refused: {error}") from None
+        return Match(field, pattern, negated, token.position)
+
+    def _field(self) -> Field:
+        token = self._peek()
+        if token.kind != "path":
+            raise self._fail(token, "expected the name of a field here")
+        self._at += 1
+        return Field(token.path, token.position)
+
+    def _value(self) -> Value:
+        sign = 0
+        if self._is_operator() and self._peek().text in {"-", "+"}:
+            sign = -1 if self._peek().text == "-" else 1
+            self._at += 1
+        token = self._peek()
+        self._at += 1
+        if token.kind in {"number", "time"}:
+            number = -token.number if sign < 0 else token.number
+            # The lexer lets 2**63 through for the sake of -2**63.
+            return float(number) if number == 2**63 else number
+        if token.keyword in {"inf", "infinity"}:
+            return -math.inf if sign < 0 else math.inf
+        if sign:
+            raise self._fail(token, "expected a number here")
+        if token.kind == "string":
+            return unescape(self._text, token)
+        if token.keyword in _VALUE_WORDS:
+            return _VALUE_WORDS[token.keyword]
+        if token.kind == "path":
+            raise self._fail(
+                token,
+                "expected a value here (strings need quotes; two fields cannot be compared)",
+            )
+        raise self._fail(token, "expected a value here")
+
+    def _order(self) -> Order | None:
+        if self._is_operator() and self._peek().text in _ORDERS:
+            self._at += 1
+            return _ORDERS[self._tokens[self._at - 1].text]
+        return None
+
+    def _is_value(self, token: Token) -> bool:
+        return token.kind in {"number", "time", "string"} or (
+            token.keyword in _VALUE_WORDS or (token.kind == "operator" and token.text in {"+", "-"})
+        )
+
+    def _is_operator(self) -> bool:
+        return self._peek().kind == "operator"
+
+    def _peek(self) -> Token:
+        return self._tokens[self._at]
+
+    def _take(self, *words: str) -> bool:
+        """Go past the next token if it is one of these words or operators."""
+        token = self._peek()
+        if (token.text if token.kind == "operator" else token.keyword or None) in words:
+            self._at += 1
+            return True
+        return False
+
+    def _fail(self, token: Token, message: str) -> WhereError:
+        return error_at(self._text, token.position, message)
+
+
+def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Compare:
+    if order not in {"==", "!="}:
+        if value is None or isinstance(value, bool):
+            raise error_at(text, position, "only numbers, times and strings have an order")
+        if isinstance(value, float) and math.isnan(value):
+            raise error_at(text, position, "nothing is less or greater than nan; write == nan")
+    return Compare(field, order, value, position)

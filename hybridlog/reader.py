@@ -1,0 +1,553 @@
+"""Asking a store: a `Query` is built step by step, and answered when it is looked at.
+
+```python
+scans = store.topic("scan").between("+10s", "+11s").where("ranges.min < 0.5")
+for message in scans: ...
+frame = scans.to_pandas()
+```
+
+Each step gives a new query; nothing is read before the answer is asked for. What an
+answer has cost stands in `counters` afterwards.
+"""
+
+from __future__ import annotations
+
+import difflib
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.index_documents import key_bound
+
+from hybridlog.indexing import STAMP
+from hybridlog.query.plan import Chosen, Clock, Counters, Lane, Piece, Plan, Sweep, Target, Task
+from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.messages import Batch
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.codec import Codec
+    from hybridlog.store import Store
+
+_REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
+
+
+class Message:
+    """One message of an answer. Its payload is decoded only when it is looked at.
+
+    Attributes:
+        topic: Its topic.
+        type: Its type, as the source spells it.
+        log_time_ns: When the recorder received it, nanoseconds since the epoch.
+        publish_time_ns: When it was sent, by the sender's clock; None when unknown.
+        sequence: The sender's sequence number, 0 when there is none.
+        seq: Arrival number in its recording.
+        recording: Id of its recording.
+    """
+
+    __slots__ = (
+        "_codec",
+        "_view",
+        "log_time_ns",
+        "publish_time_ns",
+        "recording",
+        "seq",
+        "sequence",
+        "topic",
+        "type",
+    )
+
+    def __init__(self, lane: Lane, batch: Batch, seq: NDArray[np.int64], row: int) -> None:
+        channel = lane.channel
+        self.topic = channel.topic
+        self.type = channel.schema.name if channel.schema is not None else ""
+        self.log_time_ns = int(batch.log_time[row])
+        self.publish_time_ns = (
+            int(batch.publish_time[row]) if channel.has_publish_time else None
+        )
+        self.sequence = int(batch.sequence[row])
+        self.seq = int(seq[row])
+        self.recording = lane.recording.id
+        self._view = batch.payload(row)
+        self._codec = lane.codec
+
+    def __repr__(self) -> str:
+        return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
+
+    @property
+    def raw(self) -> bytes:
+        """The serialized message, byte for byte as it came."""
+        return bytes(self._view)
+
+    @property
+    def payload(self) -> memoryview:
+        """The same without a copy."""
+        return self._view
+
+    @property
+    def fields(self) -> dict[str, object]:
+        """Its fields as the index holds them: long arrays are summaries."""
+        return self._codec.fields(self._view)
+
+    @property
+    def header_stamp_ns(self) -> int | None:
+        """The header stamp, nanoseconds; None without a header."""
+        header = self.fields.get("header")
+        stamp = header.get("stamp") if isinstance(header, dict) else None
+        return stamp if isinstance(stamp, int) else None
+
+    def decode(self) -> Any:  # noqa: ANN401 - its class is made from the definition
+        """The whole message as an object, its attributes named as its fields.
+
+        Raises:
+            PayloadError: the payload does not fit its definition.
+            DefinitionError: there is no usable definition.
+        """
+        return self._codec.decode(self._view)
+
+    def to_numpy(self) -> NDArray[Any]:
+        """Image, CompressedImage, LaserScan or PointCloud2 as an array.
+
+        Raises:
+            PayloadError: it is none of these, or its sizes lie.
+        """
+        from hybridlog.arrays import to_numpy
+
+        return to_numpy(self.type, self.decode())
+
+
+@dataclass(frozen=True)
+class Query:
+    """A question about some topics of a store. Immutable: each step gives a new one."""
+
+    store: Store
+    topics: tuple[str, ...]
+    recording_ids: tuple[str, ...]
+    _bounds: tuple[TimeLike | None, TimeLike | None] | None = None
+    _clock: Clock = "log"
+    _filters: tuple[Mapping[str, object], ...] = ()
+    _limit: int | None = None
+    _every: int = 1
+    _reverse: bool = False
+    _fields: tuple[str, ...] | None = None
+    counters: Counters = field(default_factory=Counters, compare=False)
+    """What the last answer has cost."""
+
+    # Steps.
+
+    def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
+        """Only messages with `begin <= time < end`.
+
+        Args:
+            begin: ISO 8601, seconds or nanoseconds since the epoch, or relative to each
+                recording (`+5s`, `-10s`); None for its start.
+            end: The same; None for its end.
+        """
+        return self._with(_bounds=(begin, end))
+
+    def clock(self, clock: str) -> Query:
+        """Which time `between` is about: `log` (default), `publish` or `header`.
+
+        Raises:
+            UsageError: another word.
+        """
+        if clock not in {"log", "publish", "header"}:
+            raise UsageError(f"There is no clock {clock!r}: log, publish and header there are.")
+        return self._with(_clock=cast(Clock, clock))
+
+    def where(self, predicate: str | Mapping[str, object]) -> Query:
+        """Only messages that satisfy a predicate; several are joined by *and*.
+
+        Args:
+            predicate: `"ranges.min < 0.5 and header.frame_id == 'laser'"`, or a MongoDB
+                filter.
+
+        Raises:
+            WhereError: it cannot be understood, or is not allowed.
+        """
+        from hybridlog.query.filters import check_filter
+        from hybridlog.query.where import compile_filter
+
+        if isinstance(predicate, str):
+            compiled = compile_filter(predicate, field_types=self.field_types())
+        else:
+            compiled = check_filter(predicate)
+        return self._with(_filters=(*self._filters, compiled))
+
+    def limit(self, count: int) -> Query:
+        """At most so many messages.
+
+        Raises:
+            UsageError: a negative number.
+        """
+        if count < 0:
+            raise UsageError("A limit cannot be negative.")
+        return self._with(_limit=count)
+
+    def every(self, step: int) -> Query:
+        """Only every n-th message, beginning with the first.
+
+        Raises:
+            UsageError: less than one.
+        """
+        if step < 1:
+            raise UsageError("every(n) needs n of at least 1.")
+        return self._with(_every=step)
+
+    def reverse(self) -> Query:
+        """Latest first."""
+        return self._with(_reverse=not self._reverse)
+
+    def fields(self, *paths: str) -> Query:
+        """Only these fields in tables (`header.stamp`, `pose.position`).
+
+        Raises:
+            TopicError: no topic of the query has such a field.
+        """
+        known = self.field_types()
+        for path in paths:
+            if known and not any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known):
+                raise TopicError(_no_field(path, known, self.topics))
+        return self._with(_fields=tuple(paths))
+
+    def in_recording(self, *names: str) -> Query:
+        """Only these recordings, by id or name.
+
+        Raises:
+            TopicError: there is no such recording, or it lacks the topic.
+        """
+        chosen = tuple(r.id for r in self.store.select(names))
+        return self.store.query(self.topics, chosen)._like(self)
+
+    def at(self, moment: TimeLike) -> Message:
+        """The message that was current at a time: the last one not after it.
+
+        Raises:
+            TopicError: there is none.
+        """
+        for recording in reversed(self._recordings()):
+            start, end = _span(recording)
+            now = parse_time(moment, start=start, end=end)
+            if now < start:
+                continue
+            one = replace(self, recording_ids=(recording.id,), counters=Counters())
+            query = one._with(_bounds=(start, now + 1), _clock="log", _reverse=True, _limit=1)
+            for message in query:
+                return message
+        raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+
+    # Answers.
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages, ordered by log time, recording and arrival."""
+        plan = self.plan()
+        for piece in self.pieces(plan):
+            for row, lane in enumerate(piece.batch.channel.tolist()):
+                yield Message(plan.lanes[lane], piece.batch, piece.seq, row)
+
+    def first(self) -> Message | None:
+        """The first message, None when there is none."""
+        return next(iter(self.limit(1)), None)
+
+    def batches(self) -> Iterator[tuple[Batch, Sequence[Lane]]]:
+        """The messages in order, many at once; `batch.channel` indexes the lanes."""
+        plan = self.plan()
+        for piece in self.pieces(plan):
+            yield piece.batch, plan.lanes
+
+    def count(self) -> int:
+        """Number of messages, without reading a payload."""
+        started = time.monotonic()
+        total = self._count()
+        self.counters.elapsed_s = time.monotonic() - started
+        whole = -(-total // self._every)
+        return whole if self._limit is None else min(whole, self._limit)
+
+    def documents(self) -> Iterator[dict[str, Any]]:
+        """The index documents, in order of topic, then log time and arrival.
+
+        Raises:
+            DatabaseError: MongoDB is away.
+        """
+        import bson
+
+        taken = 0
+        for topic in self.topics:
+            for raw in self.raw_documents(topic, None):
+                for document in bson.decode_all(raw):
+                    if taken % self._every == 0:
+                        if self._limit is not None and taken // self._every >= self._limit:
+                            return
+                        yield document
+                    taken += 1
+
+    def to_arrow(self) -> pa.Table:
+        """A table: scalars and strings as columns, arrays as lists, first column log time."""
+        from hybridlog.tables import collect
+
+        table = collect(self).to_arrow()
+        if self._reverse:
+            table = table.take(np.arange(table.num_rows - 1, -1, -1))
+        return table
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A frame: scalars as columns, arrays as numpy cells, indexed by log time (UTC, ns)."""
+        from hybridlog.tables import collect
+
+        frame = collect(self).to_pandas()
+        if self._reverse:
+            frame = frame.iloc[::-1]
+        frame.attrs["hybridlog"] = _as_dict(self.counters)
+        return frame
+
+    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
+        """Every message as an array (`Message.to_numpy`): stacked when all are alike."""
+        arrays = [message.to_numpy() for message in self]
+        alike = {(a.shape, a.dtype) for a in arrays}
+        return np.stack(arrays) if len(alike) == 1 else arrays
+
+    # How.
+
+    def _with(self, **changes: Any) -> Query:  # noqa: ANN401
+        return replace(self, counters=Counters(), **changes)
+
+    def _like(self, other: Query) -> Query:
+        """The other query's conditions on this one's topics and recordings."""
+        return replace(
+            other, topics=self.topics, recording_ids=self.recording_ids, counters=Counters()
+        )
+
+    def _recordings(self) -> list[RecordingEntry]:
+        return [r for r in self.store.recordings() if r.id in self.recording_ids]
+
+    def _codecs(self) -> dict[str, list[Codec]]:
+        return {
+            topic: [
+                lane.codec
+                for r in self._recordings()
+                for lane in self.store.lanes(r)
+                if lane.channel.topic == topic
+            ]
+            for topic in self.topics
+        }
+
+    def field_types(self) -> dict[str, str] | None:
+        """Paths that can be queried and their types; None when a topic has no fixed fields."""
+        types: dict[str, str] = {}
+        for codecs in self._codecs().values():
+            for codec in codecs:
+                paths = codec.paths()
+                if not paths:
+                    return None
+                types.update({path.path: path.type for path in paths})
+        return types or None
+
+    def _bounds_in(self, recording: RecordingEntry) -> tuple[int, int] | None:
+        """The time range in one recording, ns; None for all of it."""
+        if self._bounds is None:
+            return None
+        start, end = _span(recording)
+        begin, stop = self._bounds
+        return parse_range(
+            0 if begin is None else begin,
+            (1 << 63) - 1 if stop is None else stop,
+            start=start,
+            end=end,
+        )
+
+    def _targets(self, lanes: list[Lane]) -> list[Target]:
+        targets = []
+        wanted = set(self.topics)
+        outside: list[str] = []
+        for recording in self._recordings():
+            mine: dict[int, int] = {}
+            for lane in self.store.lanes(recording):
+                if lane.channel.topic in wanted:
+                    self._check_clock(lane)
+                    mine[lane.channel_id] = len(lanes)
+                    lanes.append(lane)
+            if not mine:
+                continue
+            bounds = self._bounds_in(recording)
+            if bounds is not None and self._clock == "log":
+                start, end = _span(recording)
+                if bounds[0] >= end or bounds[1] <= start:
+                    outside.append(
+                        f"{recording.id} spans {format_time(start)} to {format_time(end)}"
+                    )
+                    continue
+            chunks = self.store.chunks(recording.id, list(mine), bounds, self._clock)
+            targets.append(Target(recording, mine, bounds, chunks))
+        if outside and not targets:
+            assert self._bounds is not None
+            raise TimeError(
+                f"Nothing was recorded between {self._bounds[0]} and {self._bounds[1]}: "
+                f"{'; '.join(outside[:5])}."
+            )
+        return targets
+
+    def _check_clock(self, lane: Lane) -> None:
+        if self._bounds is None:
+            return
+        topic = lane.channel.topic
+        if self._clock == "header" and not any(p.path == STAMP for p in lane.codec.paths()):
+            raise TopicError(
+                f"{topic} has no {STAMP}: use the log clock, or another topic."
+            )
+        if self._clock == "publish" and not lane.channel.has_publish_time:
+            raise TopicError(
+                f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
+            )
+
+    def plan(self) -> Plan:
+        lanes: list[Lane] = []
+        self._reset()
+        targets = self._targets(lanes)
+        chooser = self._choose if self._filters else None
+        return Plan(lanes, targets, self._clock, chooser, self._reverse, self.counters)
+
+    def _reset(self) -> None:
+        fresh = Counters()
+        for name in fresh.__dataclass_fields__:
+            setattr(self.counters, name, getattr(fresh, name))
+
+    def pieces(self, plan: Plan) -> Iterator[Piece]:
+        """The plan's messages, thinned out and limited."""
+        taken = given = 0
+        for piece in Sweep(plan, self.store.segment).pieces():
+            count = len(piece.batch)
+            rows = np.arange((-taken) % self._every, count, self._every)
+            taken += count
+            if self._limit is not None:
+                rows = rows[: self._limit - given]
+            given += len(rows)
+            if len(rows) == count:
+                yield piece
+            elif len(rows):
+                yield Piece(piece.batch.take(rows), piece.seq[rows])
+            if self._limit is not None and given >= self._limit:
+                break
+        if self._every > 1 or self._limit is not None:
+            plan.counters.messages = given
+
+    def _filter(self, extra: Mapping[str, object]) -> dict[str, object]:
+        parts = [dict(f) for f in (extra, *self._filters) if f]
+        if not parts:
+            return {}
+        return parts[0] if len(parts) == 1 else {"$and": parts}
+
+    def _choose(self, tasks: Sequence[Task]) -> Chosen:
+        """Ask the index which messages of some chunks satisfy the predicate."""
+        from hybridlog.frames.bson import reference_columns
+
+        database = self.store.database_for("A predicate")
+        low, high = min(t.first for t in tasks), max(t.last for t in tasks)
+        wanted = {t.key for t in tasks}
+        found: dict[tuple[str, int, int], list[NDArray[np.int64]]] = {}
+        recordings = sorted({t.key[0] for t in tasks})
+        bounds = {
+            "_id": {"$gte": key_bound(low), "$lt": key_bound(high + 1)},
+        }
+        for topic in self.topics:
+            for recording in recordings:
+                query = self._filter({**bounds, "_meta.rec": recording})
+                for raw in database.find_raw(collection_of(topic), query, _REFERENCE):
+                    reference = reference_columns(raw)
+                    self.counters.documents_read += len(reference.off)
+                    places = np.stack([reference.seg, reference.chunk], axis=1)
+                    groups, inverse = np.unique(places, axis=0, return_inverse=True)
+                    for number, (segment, chunk) in enumerate(groups.tolist()):
+                        key = (recording, segment, chunk)
+                        if key in wanted:
+                            rows = inverse.reshape(-1) == number
+                            found.setdefault(key, []).append(reference.off[rows])
+        return {key: np.sort(np.concatenate(parts)) for key, parts in found.items()}
+
+    def _conditions(self, recording: RecordingEntry) -> dict[str, object]:
+        """The query's time range in one recording as a MongoDB filter."""
+        bounds = self._bounds_in(recording)
+        conditions: dict[str, object] = {"_meta.rec": recording.id}
+        if bounds is None:
+            return conditions
+        begin, end = bounds
+        if self._clock == "log":
+            conditions["_id"] = {"$gte": key_bound(begin), "$lt": key_bound(end)}
+        else:
+            name = STAMP if self._clock == "header" else "_meta.pub"
+            conditions[name] = {"$gte": begin, "$lt": end}
+        return conditions
+
+    def _count(self) -> int:
+        lanes: list[Lane] = []
+        self._reset()
+        targets = self._targets(lanes)
+        if self._bounds is None and not self._filters:
+            return sum(
+                channel.stats.messages
+                for target in targets
+                for channel in target.recording.channels
+                if channel.id in target.lanes
+            )
+        if self.store.database is None:
+            if self._filters:
+                self.store.database_for("A predicate")
+            plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
+            return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
+        return sum(
+            self.store.database.count(
+                collection_of(topic), self._filter(self._conditions(target.recording))
+            )
+            for target in targets
+            for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()})
+        )
+
+    def raw_documents(
+        self, topic: str, projection: Mapping[str, object] | None
+    ) -> Iterator[bytes]:
+        """The index documents of one topic, in key order, as raw batches."""
+        database = self.store.database_for("Reading index documents")
+        lanes: list[Lane] = []
+        targets = [t for t in self._targets(lanes) if self._has(t, lanes, topic)]
+        conditions = [self._conditions(t.recording) for t in targets]
+        if not conditions:
+            return
+        own = conditions[0] if len(conditions) == 1 else {"$or": conditions}
+        for raw in database.find_raw(
+            collection_of(topic),
+            self._filter(own),
+            projection,
+            sort=[("_id", -1)] if self._reverse else None,
+            limit=(self._limit or 0) if self._every == 1 else 0,
+            batch_size=10_000,
+        ):
+            yield raw
+
+    @staticmethod
+    def _has(target: Target, lanes: list[Lane], topic: str) -> bool:
+        return any(lanes[i].channel.topic == topic for i in target.lanes.values())
+
+
+def _span(recording: RecordingEntry) -> tuple[int, int]:
+    """Log time `[start, end)` of a recording, ns; empty at 0 without messages."""
+    span = recording.span
+    return (span[0], span[1] + 1) if span is not None else (0, 0)
+
+
+def _as_dict(counters: Counters) -> dict[str, float]:
+    return {name: getattr(counters, name) for name in counters.__dataclass_fields__}
+
+
+def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
+    near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
+    return (
+        f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
+        "`hybridlog schema TOPIC` lists them all."
+    )

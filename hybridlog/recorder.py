@@ -1,0 +1,284 @@
+"""Recording a log into the store: source to segments to index.
+
+The recorder gets its parts as arguments. A recording either comes to its end, with
+everything that could be read in it and everything that could not in its loss ledger,
+or it leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import (
+    AlreadyRecordedError,
+    DatabaseError,
+    SourceError,
+    StoreError,
+    TopicError,
+)
+from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_format import END_METADATA, json_metadata
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+
+from hybridlog.entries import build_entry, new_key, recording_metadata
+from hybridlog.indexing import ChunkIndexer, IndexWriter
+
+if TYPE_CHECKING:
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+    from numpy.typing import NDArray
+
+    from hybridlog.query.topics import TopicMatcher
+    from hybridlog.sources.base import Damage, Source
+
+OUR_NAMES = "hybridlog."
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """What to record and how.
+
+    Attributes:
+        name: Name of the recording; the file's own without.
+        tags: Kept with the recording.
+        matcher: Which topics; None for all.
+        between: Log time `[begin, end)`, ns; None for all.
+        again: Record although the same content is in the store.
+        settings: How segments are cut and packed.
+    """
+
+    name: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
+    matcher: TopicMatcher | None = None
+    between: tuple[int, int] | None = None
+    again: bool = False
+    settings: SegmentSettings = field(default_factory=SegmentSettings)
+
+
+@dataclass(slots=True)
+class RecordReport:
+    """How a recording went.
+
+    Attributes:
+        entry: The recording, as it stands in the catalog.
+        damage: What of the source could not be read.
+        indexed: Messages in the index.
+        missed: Messages stored whose index documents are still missing.
+        failure: Why they are missing.
+        skipped: Messages left out by topic or time.
+        elapsed_s: Wall time, seconds.
+    """
+
+    entry: RecordingEntry
+    damage: list[Damage]
+    indexed: int
+    missed: int
+    failure: DatabaseError | None
+    skipped: int
+    elapsed_s: float
+
+
+def record(
+    source: Source,
+    directory: StoreDirectory,
+    database: Database,
+    fingerprint: str,
+    options: RecordOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> RecordReport:
+    """Record a whole source.
+
+    Args:
+        source: Open, not yet read.
+        directory: The store.
+        database: The index.
+        fingerprint: Of the source's content.
+        options: What and how.
+        progress: Called now and then with bytes read and messages stored.
+
+    Raises:
+        AlreadyRecordedError: the same content is in the store.
+        SourceError: nothing at all could be read.
+        DiskFullError: no space; nothing is kept.
+    """
+    started = time.monotonic()
+    catalog = Catalog(database)
+    if not options.again:
+        _refuse_known(catalog, source, fingerprint)
+    name = options.name or _name_of(source.path)
+    recording_id = directory.new_recording(name)
+    entry = RecordingEntry(
+        id=recording_id,
+        key=new_key(r.key for r in catalog.recordings()),
+        name=name,
+        tags=dict(options.tags),
+        source={
+            "path": str(source.path),
+            "kind": source.kind,
+            "profile": source.profile,
+            "bytes": source.size_bytes,
+            "fingerprint": fingerprint,
+        },
+        created=time.time_ns(),
+        status="open",
+    )
+    indexer = ChunkIndexer(entry.id, entry.key)
+    index = IndexWriter(indexer, database)
+    with directory.writing(recording_id) as mine:
+        if not mine:
+            raise StoreError(f"Another process is writing {directory.recording(recording_id)}.")
+        writer = RecordingWriter(
+            directory.recording(recording_id),
+            recording_metadata(entry),
+            index.submit,
+            options.settings,
+        )
+        try:
+            catalog.put_recording(entry)
+            skipped = _copy(source, writer, options, progress)
+            _check_result(source, writer, options)
+            end = _end_of(source)
+            writer.close(json_metadata(END_METADATA, end))
+            index.close()
+        except BaseException:
+            # Nothing half-made: the source is still there, the command can be run again.
+            writer.abort()
+            _forget(index, catalog, directory, entry, writer.channels)
+            raise
+        entry = build_entry(directory, indexer, recording_id, index.entries)
+        failure = index.failure
+        if failure is None:
+            try:
+                catalog.put_losses(entry.id, end["losses"])
+                for channel in writer.channels.values():
+                    if channel.schema is not None:
+                        catalog.put_schema(channel.schema)
+                catalog.put_recording(entry)
+            except DatabaseError as error:
+                failure = error
+    return RecordReport(
+        entry,
+        list(source.damage),
+        index.indexed,
+        index.missed,
+        failure,
+        skipped,
+        time.monotonic() - started,
+    )
+
+
+def _copy(
+    source: Source,
+    writer: RecordingWriter,
+    options: RecordOptions,
+    progress: Callable[[int, int], None] | None,
+) -> int:
+    """Move every wanted message from the source to the writer; returns those left out."""
+    choice = _Choice(options)
+    skipped = 0
+    for batch in source.batches():
+        for extra in source.extras:
+            if not extra.name.startswith(OUR_NAMES):
+                writer.add_extra(extra)
+        source.extras.clear()
+        kept = choice.of(batch, source.channels)
+        skipped += len(batch) - len(kept)
+        writer.append(kept, source.channels)
+        if progress is not None:
+            progress(source.bytes_read, writer.totals.messages)
+    for extra in source.extras:
+        if not extra.name.startswith(OUR_NAMES):
+            writer.add_extra(extra)
+    source.extras.clear()
+    return skipped
+
+
+class _Choice:
+    """Which messages are wanted."""
+
+    def __init__(self, options: RecordOptions) -> None:
+        self._matcher = options.matcher
+        self._between = options.between
+        self._wanted: list[bool] = []
+
+    def of(self, batch: Batch, channels: list[Channel]) -> Batch:
+        mask: NDArray[np.bool_] | None = None
+        if self._matcher is not None:
+            for channel in channels[len(self._wanted) :]:
+                self._wanted.append(self._matcher(channel.topic))
+            mask = np.array(self._wanted, np.bool_)[batch.channel]
+        if self._between is not None:
+            begin, end = self._between
+            inside = (batch.log_time >= begin) & (batch.log_time < end)
+            mask = inside if mask is None else mask & inside
+        return batch if mask is None or bool(mask.all()) else batch.take(mask)
+
+
+def _check_result(source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
+    if not writer.totals.messages and source.damage:
+        first = source.damage[0]
+        raise SourceError(f"{source.path}: no message could be read: {first.reason}")
+    if options.matcher is not None and not writer.totals.messages:
+        topics = ", ".join(sorted({c.topic for c in source.channels})[:20]) or "none"
+        raise TopicError(
+            f"{source.path}: no message is on the topics asked for; the log has: {topics}"
+        )
+
+
+def _end_of(source: Source) -> dict[str, Any]:
+    losses = [
+        {
+            "cause": "source damaged",
+            "file": damage.file.name,
+            "offset": damage.offset,
+            "length": damage.length,
+            "reason": damage.reason,
+            "count": damage.messages_lost,
+            "topic": None,
+            "from": None,
+            "to": None,
+        }
+        for damage in source.damage
+    ]
+    return {"status": "damaged" if losses else "complete", "losses": losses}
+
+
+def _forget(
+    index: IndexWriter,
+    catalog: Catalog,
+    directory: StoreDirectory,
+    entry: RecordingEntry,
+    channels: Mapping[int, Channel],
+) -> None:
+    index.abandon()
+    # If the database is away too, the next opening finds an entry without files.
+    with suppress(DatabaseError):
+        catalog.remove_recording(entry.id, {collection_of(c.topic) for c in channels.values()})
+    directory.remove_recording(entry.id)
+
+
+def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:
+    for known in catalog.recordings():
+        if known.source.get("fingerprint") == fingerprint:
+            incomplete = ""
+            if known.status == "recovered":
+                incomplete = " (cut short by a crash)"
+            raise AlreadyRecordedError(
+                f"{source.path} is in the store already, as {known.id!r}{incomplete}. "
+                "Use --again to record it once more."
+            )
+
+
+def _name_of(path: Path) -> str:
+    name = path.resolve().name
+    for suffix in (".active", ".zstd", ".bag", ".mcap", ".db3"):
+        name = name.removesuffix(suffix)
+    return name or "recording"

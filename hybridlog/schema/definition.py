@@ -1,0 +1,447 @@
+"""What a message consists of, made from the definition that came with it.
+
+A definition is untrusted text. Its size, its nesting and the number of fields it
+unfolds to are bounded before anything is made of it, and nothing in it is executed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias, cast
+
+import numpy as np
+
+from hybridlog.schema.definition_idl import IdlTypes, parse_idl
+from hybridlog.schema.definition_text import (
+    MAX_NAME,
+    NAME,
+    RawField,
+    Section,
+    canonical,
+    has_parts,
+    parse_msg,
+    parse_parts,
+    split_sections,
+)
+from hybridlog_storage.errors import DefinitionError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Schema
+
+MAX_DEFINITION = 1 << 20
+"""Largest definition that is read, in bytes."""
+MAX_DEPTH = 64
+"""Deepest nesting of messages."""
+MAX_FIELDS = 100_000
+"""Most fields that a type may unfold to, nested ones counted wherever they occur."""
+MAX_PATH_CHARACTERS = 1 << 24
+"""Most characters that the paths of all these fields may have together."""
+MAX_WIDTH = 1 << 28
+"""Most elements of a fixed array."""
+MAX_FIXED_BYTES = 1 << 40
+"""Most bytes that a message takes at the least; a nest of fixed arrays can multiply."""
+
+PrimitiveName: TypeAlias = Literal[
+    "bool",
+    "byte",
+    "char",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float32",
+    "float64",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Primitive:
+    """A number or a boolean.
+
+    Attributes:
+        name: As the definition spells it.
+        dtype: Native numpy type; `byte` and `char` differ between ROS 1 and ROS 2.
+    """
+
+    name: PrimitiveName
+    dtype: np.dtype[np.generic]
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A string.
+
+    Attributes:
+        bound: Largest number of characters, None when there is no bound.
+    """
+
+    bound: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A time or a duration: 32 bits of seconds, then 32 bits of nanoseconds.
+
+    Attributes:
+        kind: What it means.
+        signed_seconds: True but for the time of ROS 1.
+        signed_nanoseconds: True only for the duration of ROS 1.
+    """
+
+    kind: Literal["time", "duration"]
+    signed_seconds: bool
+    signed_nanoseconds: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayOf:
+    """An array or a sequence.
+
+    Attributes:
+        element: Type of each element.
+        width: Number of elements when the definition fixes it, and it is not on the wire.
+        bound: Largest number of elements of a bounded sequence. Not enforced on reading.
+    """
+
+    element: FieldType
+    width: int | None = None
+    bound: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message: its name as the definition spells it, and its fields in wire order."""
+
+    name: str
+    fields: tuple[tuple[str, FieldType], ...]
+
+
+FieldType: TypeAlias = Primitive | Text | Instant | ArrayOf | MessageType
+
+
+@dataclass(frozen=True, slots=True)
+class FieldPath:
+    """A field that can be asked for.
+
+    Attributes:
+        path: Names joined by dots; `[]` after the name of an array of messages that
+            the path passes through: `transforms[].header.stamp`.
+        type: As it would be written in a definition, `float64[9]`.
+        array: True when a message holds several values at this path.
+    """
+
+    path: str
+    type: str
+    array: bool
+
+
+_DTYPES: dict[str, str] = {
+    "bool": "?",
+    "char": "u1",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
+_NOT_PORTABLE = frozenset({"wstring", "wchar", "float128"})
+_DUMMY = "structure_needs_at_least_one_member"
+_TIME_FIELDS = (("sec", "int32"), ("nanosec", "uint32"))
+_TIME_TYPES: dict[str, Literal["time", "duration"]] = {
+    "builtin_interfaces/Time": "time",
+    "builtin_interfaces/Duration": "duration",
+}
+_ROS1_TIMES = {"time": Instant("time", False, False), "duration": Instant("duration", True, True)}
+_WORDS = frozenset({*_DTYPES, "byte", "string", *_NOT_PORTABLE})
+
+
+def parse_definition(schema: Schema) -> MessageType:
+    """Read a definition of encoding `ros1msg`, `ros2msg` or `ros2idl`.
+
+    Standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) that the definition
+    refers to and leaves out are completed; a definition that is there always counts.
+
+    Args:
+        schema: Name, encoding and text as they came.
+
+    Raises:
+        DefinitionError: There is no definition, it is malformed, it refers to unknown
+            types or to itself, it unfolds to too much, or it uses a type that has no
+            portable wire form.
+    """
+    if not schema.encoding:
+        raise DefinitionError(f"{schema.name}: no definition in the source")
+    if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl"}:
+        raise DefinitionError(f"{schema.name}: {schema.encoding!r} is no ROS definition")
+    if len(schema.data) > MAX_DEFINITION:
+        raise DefinitionError(
+            f"{schema.name}: the definition has {len(schema.data)} bytes; "
+            f"more than {MAX_DEFINITION} are not read"
+        )
+    ros = 1 if schema.encoding == "ros1msg" else 2
+    types, first = _parse_sections(schema, ros)
+    top = canonical(schema.name)
+    if top not in types:
+        top = first
+    resolver = _Resolver(schema.name, types, ros)
+    return MessageType(schema.name, resolver.message(top).fields)
+
+
+def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
+    """The type of that name as the distributions of ROS define it, None when unknown.
+
+    For sources that carry type names only.
+
+    Args:
+        name: Type name in either spelling, `sensor_msgs/Imu` or `sensor_msgs/msg/Imu`.
+        ros: ROS 1 or ROS 2; headers and times differ.
+    """
+    key = canonical(name)
+    if _standard_fields(key, ros) is None:
+        return None
+    return MessageType(name, _Resolver(name, {}, ros).message(key).fields)
+
+
+def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]], str]:
+    """Fields by canonical type name, and the name of the first type of the text."""
+    text = schema.data.decode("utf-8", errors="replace")
+    types: dict[str, list[RawField]] = {}
+    idl = IdlTypes()
+    first = ""
+    for section in split_sections(text):
+        name = canonical(section.name or schema.name)
+        first = first or name
+        kind = section.kind or ("IDL" if schema.encoding == "ros2idl" else "MSG")
+        if kind == "IDL" and ros == 2:
+            parse_idl(name, section.text, idl)
+            continue
+        for key, fields in _parse_text(name, section, ros).items():
+            if types.setdefault(key, fields) != fields:
+                raise DefinitionError(f"{schema.name}: {key} is defined twice, differently")
+    for key, fields in idl.resolved().items():
+        types.setdefault(key, fields)
+    return types, first
+
+
+def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawField]]:
+    if ros == 2 and has_parts(section.text):
+        return parse_parts(name, section.text)
+    return {name: parse_msg(name, section.text, defaults=ros == 2)}
+
+
+def _standard_fields(name: str, ros: int) -> list[RawField] | None:
+    """Fields of a standard type from the tables that rosbags ships."""
+    # Slow to import, and most definitions are complete.
+    from rosbags.interfaces import Nodetype  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    package, _, leaf = name.rpartition("/")
+    key = name if "/" in package else f"{package}/msg/{leaf}"
+    store = Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_KILTED
+    definition = get_typestore(store).fielddefs.get(key)
+    if definition is None:
+        return None
+
+    def raw(field_name: str, desc: object) -> RawField:
+        node, detail = cast("tuple[Nodetype, tuple[object, int] | str]", desc)
+        if node == Nodetype.NAME:
+            return RawField(field_name, canonical(cast("str", detail)))
+        inner, size = cast("tuple[object, int]", detail)
+        if node == Nodetype.BASE:
+            return RawField(field_name, cast("str", inner), text_bound=size or None)
+        element = raw(field_name, inner)
+        fixed = node == Nodetype.ARRAY
+        return RawField(
+            field_name,
+            element.type,
+            array=True,
+            width=size if fixed else None,
+            bound=None if fixed else size or None,
+            text_bound=element.text_bound,
+        )
+
+    return [raw(field_name, desc) for field_name, desc in definition[1]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Extent:
+    """What a type unfolds to: levels, fields, characters of their paths, least bytes."""
+
+    depth: int
+    fields: int
+    characters: int
+    size: int
+
+
+class _Resolver:
+    """Turns names of types into types, each type once."""
+
+    def __init__(self, owner: str, types: dict[str, list[RawField]], ros: int) -> None:
+        self._owner = owner
+        self._types = types
+        self._ros = ros
+        self._done: dict[str, tuple[MessageType, _Extent]] = {}
+        self._open: set[str] = set()
+        self._by_leaf: dict[str, list[str]] = {}
+        for name in types:
+            self._by_leaf.setdefault(name.rpartition("/")[2], []).append(name)
+
+    def _fail(self, what: str) -> DefinitionError:
+        return DefinitionError(f"{self._owner}: {what}")
+
+    def message(self, name: str) -> MessageType:
+        return self._message(name)[0]
+
+    def _message(self, name: str) -> tuple[MessageType, _Extent]:
+        if name in self._done:
+            return self._done[name]
+        if name in self._open:
+            raise self._fail(f"{name} contains itself")
+        if len(self._open) >= MAX_DEPTH:
+            raise self._fail(f"messages are nested deeper than {MAX_DEPTH}")
+        raw_fields = self._types.get(name)
+        if raw_fields is None:
+            raw_fields = _standard_fields(name, self._ros)
+        if raw_fields is None:
+            raise self._fail(f"the definition does not say what {name} is")
+        if [raw.name for raw in raw_fields] == [_DUMMY]:
+            raw_fields = []
+        self._open.add(name)
+        fields: dict[str, FieldType] = {}
+        depth, count, characters, size = 0, 0, 0, 0
+        for raw in raw_fields:
+            if not NAME.match(raw.name) or len(raw.name) > MAX_NAME:
+                raise self._fail(f"{name} has a field that cannot be named {raw.name[:80]!r}")
+            if raw.name in fields:
+                raise self._fail(f"{name} has two fields named {raw.name}")
+            fields[raw.name], inner = self._field(name, raw)
+            depth = max(depth, inner.depth)
+            count += 1 + inner.fields
+            characters += (len(raw.name) + 3) * (1 + inner.fields) + inner.characters
+            size += inner.size
+        self._open.discard(name)
+        extent = _Extent(depth + 1, count, characters, size)
+        self._check(name, extent)
+        self._done[name] = MessageType(name, tuple(fields.items())), extent
+        return self._done[name]
+
+    def _check(self, name: str, extent: _Extent) -> None:
+        if extent.depth > MAX_DEPTH:
+            raise self._fail(f"messages are nested deeper than {MAX_DEPTH}")
+        if extent.fields > MAX_FIELDS:
+            raise self._fail(
+                f"{name} unfolds to {extent.fields} fields; at most {MAX_FIELDS} are indexed"
+            )
+        if extent.characters > MAX_PATH_CHARACTERS:
+            raise self._fail(f"the paths of the fields of {name} are too long")
+        if extent.size > MAX_FIXED_BYTES:
+            raise self._fail(f"{name} takes {extent.size} bytes at the least: no message can")
+
+    def _field(self, owner: str, raw: RawField) -> tuple[FieldType, _Extent]:
+        element, extent = self._element(owner, raw)
+        if not raw.array:
+            return element, extent
+        width = raw.width
+        if width is None:
+            return ArrayOf(element, None, raw.bound), _Extent(
+                extent.depth, extent.fields, extent.characters, 4
+            )
+        if width > MAX_WIDTH:
+            raise self._fail(f"{owner}.{raw.name} has {width} elements; at most {MAX_WIDTH}")
+        extent = _Extent(extent.depth, extent.fields, extent.characters, extent.size * width)
+        return ArrayOf(element, width), extent
+
+    def _element(self, owner: str, raw: RawField) -> tuple[FieldType, _Extent]:
+        kind = raw.type
+        if raw.text_bound is not None and kind not in {"string", "wstring"}:
+            raise self._fail(f"{owner}.{raw.name}: only strings have a length bound")
+        if kind in _NOT_PORTABLE:
+            raise self._fail(f"not indexed: {kind} has no portable wire form")
+        if kind == "string":
+            return Text(raw.text_bound), _Extent(0, 0, 0, 4)
+        if kind in _WORDS:
+            code = ("i1" if self._ros == 1 else "u1") if kind == "byte" else _DTYPES[kind]
+            dtype: np.dtype[np.generic] = np.dtype(code)
+            return Primitive(cast("PrimitiveName", kind), dtype), _Extent(0, 0, 0, dtype.itemsize)
+        name = self._name(owner, kind)
+        if (instant := self._instant(name)) is not None:
+            return instant, _Extent(0, 0, 0, 8)
+        return self._message(name)
+
+    def _name(self, owner: str, kind: str) -> str:
+        """The canonical name that a type spelled `kind` within `owner` has."""
+        name = canonical(kind)
+        if "/" in name:
+            return name
+        if name in {"time", "duration"}:
+            return name if self._ros == 1 else f"builtin_interfaces/{name.capitalize()}"
+        package = owner.split("/", maxsplit=1)[0] if "/" in owner else ""
+        here = [f"{owner.rpartition('/')[0]}/{name}", f"{package}/{name}"] if package else [name]
+        for candidate in here:
+            if candidate in self._types:
+                return candidate
+        if name == "Header":
+            return "std_msgs/Header"
+        named = self._by_leaf.get(name, [])
+        return named[0] if len(named) == 1 else here[-1]
+
+    def _instant(self, name: str) -> Instant | None:
+        """A type that is a time, however it is spelled, else None."""
+        if self._ros == 1:
+            if name in _TIME_TYPES and name not in self._types:
+                return _ROS1_TIMES[_TIME_TYPES[name]]
+            return _ROS1_TIMES.get(name)
+        kind = _TIME_TYPES.get(name)
+        if kind is None:
+            return None
+        given = self._types.get(name)
+        if given is not None and [(raw.name, raw.type) for raw in given] != list(_TIME_FIELDS):
+            return None
+        if given is not None and any(raw.array for raw in given):
+            return None
+        return Instant(kind, True, False)
+
+
+def type_text(field_type: FieldType) -> str:
+    """A type as a definition would spell it: `float64[9]`, `string<=10`, `time`."""
+    if isinstance(field_type, Text):
+        return "string" if field_type.bound is None else f"string<={field_type.bound}"
+    if isinstance(field_type, Instant):
+        return field_type.kind
+    if isinstance(field_type, ArrayOf):
+        size = "" if field_type.width is None else str(field_type.width)
+        if field_type.bound is not None:
+            size = f"<={field_type.bound}"
+        return f"{type_text(field_type.element)}[{size}]"
+    return field_type.name
+
+
+def paths(message_type: MessageType) -> list[FieldPath]:
+    """Every field that can be asked for, in the order of the definition.
+
+    Messages are listed before what is in them; so are arrays of messages.
+    """
+    found: list[FieldPath] = []
+
+    def visit(message: MessageType, prefix: str, *, within_array: bool) -> None:
+        for name, field_type in message.fields:
+            path = prefix + name
+            array = within_array or isinstance(field_type, ArrayOf)
+            found.append(FieldPath(path, type_text(field_type), array))
+            inner = field_type
+            while isinstance(inner, ArrayOf):
+                inner, path = inner.element, f"{path}[]"
+            if isinstance(inner, MessageType):
+                visit(inner, f"{path}.", within_array=array)
+
+    visit(message_type, "", within_array=False)
+    return found

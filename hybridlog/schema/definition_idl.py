@@ -1,0 +1,306 @@
+"""Reading OMG IDL as ROS 2 uses it: modules, structs, typedefs, constants, enums.
+
+A tokenizer and a descent over the few constructs that have a ROS wire form. Every
+construct outside of them is refused by name. Constants matter only as array sizes,
+so their expressions are not evaluated: a size is a number or the name of a constant
+that is one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+
+from hybridlog.schema.definition_text import RawField, canonical
+from hybridlog_storage.errors import DefinitionError
+
+# What is not closed reaches to the end of the text: a failed match would be tried again
+# at the next character, and the time would grow with the square of the length.
+_TOKEN = re.compile(
+    r"""(?P<skip>\s+|//[^\n]*|/\*(?s:.*?)(?:\*/|\Z)|\#[^\n]*)
+      |(?P<name>(?:::)?[A-Za-z_][A-Za-z0-9_]*(?:::[A-Za-z_][A-Za-z0-9_]*)*)
+      |(?P<number>[0-9][0-9A-Za-z_.]*)
+      |(?P<text>"(?s:[^"\\]|\\.)*\\?(?:"|\Z)|'(?s:[^'\\]|\\.)*\\?(?:'|\Z))
+      |(?P<sign>.)""",
+    re.VERBOSE,
+)
+_MAX_DEPTH = 16
+_MAX_DIGITS = 20
+
+_WORDS = {
+    "boolean": "bool",
+    "octet": "byte",
+    "char": "char",
+    "wchar": "wchar",
+    "short": "int16",
+    "long": "int32",
+    "long long": "int64",
+    "long double": "float128",
+    "unsigned short": "uint16",
+    "unsigned long": "uint32",
+    "unsigned long long": "uint64",
+    "float": "float32",
+    "double": "float64",
+    "string": "string",
+    "wstring": "wstring",
+    **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
+_PRIMITIVES = frozenset(_WORDS.values())
+_ENUM = "uint32"
+
+
+@dataclass(slots=True)
+class IdlTypes:
+    """What all IDL texts of one definition declare, by scoped name with slashes."""
+
+    structs: dict[str, list[RawField]] = field(default_factory=dict)
+    typedefs: dict[str, RawField] = field(default_factory=dict)
+    constants: dict[str, int] = field(default_factory=dict)
+    enums: set[str] = field(default_factory=set)
+
+    def resolved(self) -> dict[str, list[RawField]]:
+        """Structs by canonical name, their typedefs replaced.
+
+        Raises:
+            DefinitionError: Typedefs in a circle, or arrays of arrays.
+        """
+        return {
+            canonical(name): [self._resolve(name, raw) for raw in fields]
+            for name, fields in self.structs.items()
+        }
+
+    def _resolve(self, scope: str, raw: RawField) -> RawField:
+        for _ in range(_MAX_DEPTH):
+            if raw.type in _PRIMITIVES:
+                return raw
+            target = self._lookup(scope, raw.type)
+            if target is None:
+                return replace(raw, type=canonical(raw.type))
+            if target in self.enums:
+                return replace(raw, type=_ENUM)
+            if target in self.structs:
+                return replace(raw, type=canonical(target))
+            alias = self.typedefs[target]
+            if raw.array and alias.array:
+                raise DefinitionError(
+                    f"{canonical(scope)}: field {raw.name} is an array of arrays: not indexed"
+                )
+            shape = raw if raw.array else alias
+            raw = replace(shape, name=raw.name, type=alias.type, text_bound=alias.text_bound)
+            scope = target
+        raise DefinitionError(f"{canonical(scope)}: typedefs refer to each other in a circle")
+
+    def _lookup(self, scope: str, name: str) -> str | None:
+        known = (self.typedefs, self.structs, self.enums)
+        for candidate in _candidates(scope, name):
+            if any(candidate in table for table in known):
+                return candidate
+        return None
+
+
+def _candidates(scope: str, name: str) -> list[str]:
+    """Where a name may be declared, innermost scope first."""
+    path = name.replace("::", "/")
+    if path.startswith("/"):
+        return [path[1:]]
+    parts = scope.split("/")[:-1]
+    return ["/".join([*parts[:depth], path]) for depth in range(len(parts), -1, -1)]
+
+
+class _Parser:
+    def __init__(self, owner: str, text: str, types: IdlTypes) -> None:
+        self._owner = owner
+        self._types = types
+        self._tokens = [
+            match.group() for match in _TOKEN.finditer(text) if match.lastgroup != "skip"
+        ]
+        self._at = 0
+
+    def parse(self) -> None:
+        while self._peek():
+            self._definition([])
+
+    def _fail(self, what: str) -> DefinitionError:
+        return DefinitionError(f"{self._owner}: {what}")
+
+    def _peek(self) -> str:
+        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+
+    def _next(self) -> str:
+        token = self._peek()
+        if not token:
+            raise self._fail("the IDL text ends too early")
+        self._at += 1
+        return token
+
+    def _expect(self, sign: str) -> None:
+        token = self._next()
+        if token != sign:
+            raise self._fail(f"expected {sign!r}, found {token[:40]!r}")
+
+    def _name(self) -> str:
+        token = self._next()
+        if not (token[0].isalpha() or token[0] == "_") or ":" in token:
+            raise self._fail(f"expected a name, found {token[:40]!r}")
+        return token
+
+    def _annotations(self) -> set[str]:
+        """Skip annotations; the names of those found."""
+        found = set()
+        while self._peek() == "@":
+            self._at += 1
+            found.add(self._next())
+            if self._peek() == "(":
+                depth = 0
+                while True:
+                    sign = self._next()
+                    depth += {"(": 1, ")": -1}.get(sign, 0)
+                    if depth == 0:
+                        break
+        return found
+
+    def _definition(self, scope: list[str]) -> None:
+        if len(scope) > _MAX_DEPTH:
+            raise self._fail("modules are nested too deep")
+        annotations = self._annotations()
+        word = self._next()
+        if word == "module":
+            inner = [*scope, self._name()]
+            self._expect("{")
+            while self._peek() != "}":
+                self._definition(inner)
+            self._expect("}")
+        elif word == "struct":
+            self._struct(scope)
+        elif word == "typedef":
+            self._typedef(scope)
+        elif word == "const":
+            self._constant(scope)
+        elif word == "enum":
+            if "bit_bound" in annotations:
+                raise self._fail("not indexed: an enum with a bit bound")
+            self._enum(scope)
+        elif word != ";":
+            raise self._fail(f"not indexed: IDL {word[:40]!r} has no ROS wire form")
+        if self._peek() == ";":
+            self._at += 1
+
+    def _struct(self, scope: list[str]) -> None:
+        name = "/".join([*scope, self._name()])
+        if self._peek() == ":":
+            raise self._fail("not indexed: a struct that inherits")
+        self._expect("{")
+        fields: list[RawField] = []
+        while self._peek() != "}":
+            if "optional" in self._annotations():
+                raise self._fail("not indexed: optional members")
+            fields += self._declared(name)
+        self._expect("}")
+        if name in self._types.structs:
+            raise self._fail(f"{canonical(name)} is defined twice")
+        self._types.structs[name] = fields
+
+    def _typedef(self, scope: list[str]) -> None:
+        for raw in self._declared("/".join([*scope, ""])):
+            self._types.typedefs["/".join([*scope, raw.name])] = raw
+
+    def _declared(self, scope: str) -> list[RawField]:
+        """A type and its declarators, through the semicolon."""
+        kind = self._type(scope)
+        fields: list[RawField] = []
+        while True:
+            name = self._name()
+            raw = replace(kind, name=name)
+            if self._peek() == "[":
+                self._at += 1
+                width = self._size(scope)
+                self._expect("]")
+                if raw.array or self._peek() == "[":
+                    raise self._fail(f"field {name[:80]} is an array of arrays: not indexed")
+                raw = replace(raw, array=True, width=width)
+            fields.append(raw)
+            if (sign := self._next()) == ";":
+                return fields
+            if sign != ",":
+                raise self._fail(f"expected ';', found {sign[:40]!r}")
+
+    def _type(self, scope: str) -> RawField:
+        word = self._next()
+        if word == "sequence":
+            self._expect("<")
+            element = self._type(scope) if self._peek() != "sequence" else None
+            if element is None:
+                raise self._fail("a sequence of sequences: not indexed")
+            bound = None
+            if self._peek() == ",":
+                self._at += 1
+                bound = self._size(scope)
+            self._expect(">")
+            return replace(element, array=True, bound=bound)
+        if word in {"unsigned", "long"}:
+            while self._peek() in {"long", "short", "double"}:
+                word += " " + self._next()
+        if word in {"string", "wstring"} and self._peek() == "<":
+            self._at += 1
+            bound = self._size(scope)
+            self._expect(">")
+            return RawField("", word, text_bound=bound)
+        if word in _WORDS:
+            return RawField("", _WORDS[word])
+        if word in {"map", "any", "fixed", "union", "struct", "enum", "bitset", "bitmask"}:
+            raise self._fail(f"not indexed: IDL {word!r} has no ROS wire form")
+        if not (word[0].isalpha() or word[0] in "_:") or " " in word:
+            raise self._fail(f"expected a type, found {word[:40]!r}")
+        return RawField("", word)
+
+    def _size(self, scope: str) -> int:
+        token = self._next()
+        number = _integer(token)
+        if number is not None:
+            return number
+        for candidate in _candidates(scope, token):
+            if candidate in self._types.constants:
+                return self._types.constants[candidate]
+        raise self._fail(f"an array size must be a number or a constant, found {token[:40]!r}")
+
+    def _constant(self, scope: list[str]) -> None:
+        self._type("/".join([*scope, ""]))
+        name = self._name()
+        self._expect("=")
+        value: list[str] = []
+        while (token := self._next()) != ";":
+            value.append(token)
+        number = _integer(value[0]) if len(value) == 1 else None
+        if number is not None:
+            self._types.constants["/".join([*scope, name])] = number
+
+    def _enum(self, scope: list[str]) -> None:
+        self._types.enums.add("/".join([*scope, self._name()]))
+        self._expect("{")
+        while self._next() != "}":
+            pass
+
+
+def _integer(token: str) -> int | None:
+    """An unsigned integer literal: decimal, `0x` hexadecimal or octal."""
+    if not token[0].isdigit() or len(token) > _MAX_DIGITS:
+        return None
+    octal = len(token) > 1 and token.isdigit() and token[0] == "0"
+    try:
+        return int(token, 8) if octal else int(token, 0)
+    except ValueError:
+        return None
+
+
+def parse_idl(owner: str, text: str, types: IdlTypes) -> None:
+    """Add the declarations of one IDL text to `types`.
+
+    Args:
+        owner: Type name, for messages.
+        text: One IDL file.
+        types: Collects; later texts see the constants of earlier ones.
+
+    Raises:
+        DefinitionError: The text is malformed, or uses what has no ROS wire form.
+    """
+    _Parser(owner, text, types).parse()

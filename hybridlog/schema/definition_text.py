@@ -1,0 +1,210 @@
+"""Reading the text of `.msg`, `.srv` and `.action` definitions into unresolved fields.
+
+The grammar is a line a field, so lines are matched one by one; the result still names
+its types and is resolved in `definition.py`. What may stand in the text and means
+nothing on the wire (comments, constants, defaults, annotations) is dropped here.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from hybridlog_storage.errors import DefinitionError
+
+MAX_NAME = 255
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+
+_SEPARATOR = re.compile(r"={20,}\s*\Z")
+_HEADER = re.compile(r"(MSG|IDL|SRV|ACTION):\s*(\S+)\s*\Z")
+_FIELD = re.compile(
+    r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
+    r"(?:<=(?P<text_bound>[0-9]{1,10}))?"
+    r"(?P<array>\[(?P<at_most><=)?(?P<count>[0-9]{0,10})\])?"
+    r"[ \t]+(?P<name>[A-Za-z0-9_]+)"
+    r"[ \t]*(?P<rest>.*)\Z"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RawField:
+    """A field as it is written: its type is a name.
+
+    Attributes:
+        name: Field name, not yet checked.
+        type: A primitive by its ROS name, or a message by its canonical or bare name.
+        array: True for arrays and sequences.
+        width: Number of elements of a fixed array.
+        bound: Largest number of elements of a bounded sequence.
+        text_bound: Largest length of a bounded string.
+    """
+
+    name: str
+    type: str
+    array: bool = False
+    width: int | None = None
+    bound: int | None = None
+    text_bound: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One definition in a concatenation of definitions.
+
+    Attributes:
+        name: Type name from the header line; empty for a first section without one.
+        kind: `MSG`, `IDL`, `SRV` or `ACTION`; empty when there was no header line.
+        text: The definition.
+    """
+
+    name: str
+    kind: str
+    text: str
+
+
+def canonical(name: str) -> str:
+    """The spelling under which types are kept: `pkg/Name`, `pkg/srv/Name`.
+
+    The part `msg` says nothing and is spelled in ROS 2 only.
+    """
+    parts = name.replace("::", "/").strip("/").split("/")
+    if len(parts) > 2 and parts[-2] == "msg":
+        del parts[-2]
+    return "/".join(parts)
+
+
+def split_sections(text: str) -> list[Section]:
+    """Cut a concatenation at its lines of `=`, each followed by a header line."""
+    sections: list[Section] = []
+    name = kind = ""
+    lines: list[str] = []
+    expect_header = True
+    started = False
+    for line in text.removeprefix("\ufeff").splitlines():
+        if _SEPARATOR.match(line):
+            if started:
+                sections.append(Section(name, kind, "\n".join(lines)))
+            name, kind, lines, expect_header, started = "", "", [], True, False
+            continue
+        if expect_header and (header := _HEADER.match(line.strip())):
+            kind, name = header[1], header[2]
+            expect_header, started = False, True
+            continue
+        if line.strip():
+            expect_header = False
+        lines.append(line)
+        started = True
+    if started or not sections:
+        sections.append(Section(name, kind, "\n".join(lines)))
+    return sections
+
+
+def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
+    """Fields of one `.msg` text, in order.
+
+    Args:
+        name: Type name, for messages.
+        text: The definition of this type alone.
+        defaults: True where default values may follow the name (ROS 2).
+
+    Raises:
+        DefinitionError: A line is neither field, constant nor comment.
+    """
+    fields: list[RawField] = []
+    for number, raw_line in enumerate(text.splitlines(), 1):
+        line = raw_line.strip()
+        if not line or line[0] in "#@":
+            continue
+        match = _FIELD.match(line)
+        if match is None:
+            raise DefinitionError(f"{name}: line {number} is no field: {line[:80]!r}")
+        rest = match["rest"]
+        if rest.startswith("="):
+            continue
+        if rest and not rest.startswith("#") and not defaults:
+            raise DefinitionError(f"{name}: line {number} is no field: {line[:80]!r}")
+        count = int(match["count"]) if match["count"] else None
+        at_most = match["at_most"] is not None
+        if at_most and count is None:
+            raise DefinitionError(f"{name}: line {number} has a bound without a number")
+        fields.append(
+            RawField(
+                name=match["name"],
+                type=match["type"],
+                array=match["array"] is not None,
+                width=None if at_most else count,
+                bound=count if at_most else None,
+                text_bound=int(match["text_bound"]) if match["text_bound"] else None,
+            )
+        )
+    return fields
+
+
+def _event(kind: str, base: str) -> list[RawField]:
+    return [
+        RawField("info", "service_msgs/ServiceEventInfo"),
+        RawField("request", f"{kind}{base}_Request", array=True, bound=1),
+        RawField("response", f"{kind}{base}_Response", array=True, bound=1),
+    ]
+
+
+_PART_SUFFIX = re.compile(
+    r"(?:_(?:SendGoal|GetResult))?_(?:Event|Request|Response)\Z|_(?:Goal|Result|Feedback|FeedbackMessage)\Z"
+)
+
+
+def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
+    """Types that a `.srv` (two parts) or `.action` (three parts) text stands for.
+
+    ROS 2 records services and actions as messages of derived types such as
+    `pkg/srv/Name_Event`, and stores with them the text they are derived from.
+
+    Args:
+        name: Canonical name of any of the derived types, or of the interface itself.
+        text: The definition, parts separated by lines of `---`.
+
+    Returns:
+        Fields by canonical type name.
+
+    Raises:
+        DefinitionError: Not two or three parts, or a line that is no field.
+    """
+    parts = re.split(r"(?m)^\s*---\s*$", text)
+    folder, _, leaf = name.rpartition("/")
+    base = _PART_SUFFIX.sub("", leaf)
+    if folder:
+        folder += "/"
+    parsed = [parse_msg(name, part, defaults=True) for part in parts]
+    stem = f"{folder}{base}"
+    if len(parsed) == 2:
+        return {
+            f"{stem}_Request": parsed[0],
+            f"{stem}_Response": parsed[1],
+            f"{stem}_Event": _event(folder, base),
+        }
+    if len(parsed) != 3:
+        raise DefinitionError(f"{name}: {len(parsed)} parts; a service has 2 and an action 3")
+    goal_id = RawField("goal_id", "unique_identifier_msgs/UUID")
+    return {
+        f"{stem}_Goal": parsed[0],
+        f"{stem}_Result": parsed[1],
+        f"{stem}_Feedback": parsed[2],
+        f"{stem}_FeedbackMessage": [goal_id, RawField("feedback", f"{stem}_Feedback")],
+        f"{stem}_SendGoal_Request": [goal_id, RawField("goal", f"{stem}_Goal")],
+        f"{stem}_SendGoal_Response": [
+            RawField("accepted", "bool"),
+            RawField("stamp", "builtin_interfaces/Time"),
+        ],
+        f"{stem}_SendGoal_Event": _event(folder, f"{base}_SendGoal"),
+        f"{stem}_GetResult_Request": [goal_id],
+        f"{stem}_GetResult_Response": [
+            RawField("status", "int8"),
+            RawField("result", f"{stem}_Result"),
+        ],
+        f"{stem}_GetResult_Event": _event(folder, f"{base}_GetResult"),
+    }
+
+
+def has_parts(text: str) -> bool:
+    """True for the text of a service or an action."""
+    return re.search(r"(?m)^\s*---\s*$", text) is not None

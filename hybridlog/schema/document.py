@@ -1,0 +1,637 @@
+"""Columns to BSON: the bodies of index documents for many messages at once.
+
+Columns are first turned into a tree of nodes that says what is written for each row:
+its element type and its width are known before a byte is written. Whatever has the
+same layout in all rows (in most topics the whole message) is a template that is
+tiled, into which each value column is assigned with one strided copy. What differs in
+length from row to row (strings, lists) is scattered, still with a few array operations
+for all rows. Lists of messages need nothing special: their elements are rows, too.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+
+from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog.schema.summary import summarise
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.column import Column
+
+_DOUBLE, _STRING, _DOCUMENT, _ARRAY, _BOOL, _NULL, _INT32, _INT64 = 1, 2, 3, 4, 8, 10, 16, 18
+
+_SLAB = 32 << 20
+"""Bytes of bodies made at once."""
+
+_LONG = 64
+"""Mean elements a row from which rows are copied one by one."""
+
+_UNROLL = 16
+"""Rows for each element of a list that is written with operations of its own."""
+
+
+_RESERVED = ("_id", "_meta")
+
+_T = TypeVar("_T", bound=np.generic)
+
+
+class Bodies(NamedTuple):
+    """Bodies of equal width.
+
+    Attributes:
+        rows: intp[k], rows of the input.
+        body: uint8[k, width], the BSON elements of the top level, without the
+            document's length in front and its final NUL.
+    """
+
+    rows: NDArray[np.intp]
+    body: NDArray[np.uint8]
+
+
+class TooLarge(NamedTuple):
+    """Rows whose bodies would be larger than is allowed."""
+
+    rows: NDArray[np.intp]
+
+
+def bodies(
+    records: Records, *, array_limit: int = 32, max_bytes: int = 8 << 20
+) -> Iterator[Bodies | TooLarge]:
+    """Makes the body of each row; every row is in exactly one of the results.
+
+    The bytes are those that `bson.encode` gives for the dictionary of the row, and
+    depend on that row alone. Memory is bounded whatever the number of rows.
+
+    Args:
+        records: The top level.
+        array_limit: Longer arrays are summarised.
+        max_bytes: Largest body.
+    """
+    yield from _bodies(records, np.arange(len(records), dtype=np.intp), array_limit, max_bytes)
+
+
+def _bodies(
+    records: Records, rows: NDArray[np.intp], limit: int, max_bytes: int
+) -> Iterator[Bodies | TooLarge]:
+    if len(rows) == 0:
+        return
+    top = _record(records, limit, top=True)
+    width = _spread(top.width, len(rows)) - 5
+    large = width > max_bytes
+    if large.any():
+        yield TooLarge(rows[large])
+        keep = np.flatnonzero(~large)
+        yield from _bodies(take(records, keep), rows[keep], limit, max_bytes)
+        return
+    total = int(width.sum())
+    if total > _SLAB and len(rows) > 1:
+        slab = (np.cumsum(width) - width) // _SLAB
+        for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(slab)) + 1):
+            yield from _bodies(take(records, part), rows[part], limit, max_bytes)
+        return
+    template = _Piece()
+    if all(_append(template, name, node, slice(None), len(rows)) for name, node in top.fields):
+        yield Bodies(rows, template.tile(len(rows)))
+        return
+    # Sorted by width, so that the bodies of equal width are one block of the output.
+    order = np.argsort(width, kind="stable")
+    at = np.empty(len(rows), np.int64)
+    at[order] = np.cumsum(width[order]) - width[order]
+    out = np.zeros(total, np.uint8)
+    _put_fields(top, out, at)
+    edges = np.flatnonzero(np.diff(width[order])) + 1
+    begin = 0
+    for part in np.split(order, edges):
+        size = len(part) * int(width[part[0]])
+        yield Bodies(rows[part], out[begin : begin + size].reshape(len(part), -1))
+        begin += size
+
+
+def top_level_names(names: Iterable[str]) -> list[str]:
+    """Names of the fields in the index document: `_id` and `_meta` are taken there.
+
+    A field of that name gets trailing underscores, as many as make it unique.
+    """
+    given = list(names)
+    spelled = []
+    for name in given:
+        if name in _RESERVED:
+            while name in given:
+                name += "_"  # noqa: PLW2901
+        spelled.append(name)
+    return spelled
+
+
+# --- rows of columns ------------------------------------------------------------------
+
+
+def take(column: Records, rows: NDArray[np.intp]) -> Records:
+    """The chosen rows of a record column, in that order."""
+    return Records({name: _take(c, rows) for name, c in column.fields.items()}, len(rows))
+
+
+def _take(column: Column, rows: NDArray[np.intp]) -> Column:
+    if isinstance(column, Scalars):
+        return Scalars(column.values[rows], column.kind)
+    if isinstance(column, Records):
+        return take(column, rows)
+    counts = np.diff(column.offset)[rows]
+    start, offset = column.offset[:-1][rows], _offsets(counts)
+    if isinstance(column, Strings):
+        return Strings(_pick(column.data, start, counts), offset)
+    values = column.values
+    if isinstance(values, Scalars):
+        picked = Scalars(_pick(values.values, start, counts), values.kind)
+        return Arrays(picked, offset, column.width)
+    return Arrays(_take(values, _ranges(start, counts)), offset, column.width)
+
+
+def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
+    """`data[start[i]:start[i] + count[i]]` of all i, one after the other."""
+    if int(count.sum()) <= _LONG * len(count):
+        return data[_ranges(start, count)]
+    # An index of eight bytes an element would be larger than what it picks.
+    ends = (start + count).tolist()
+    return np.concatenate([data[a:b] for a, b in zip(start.tolist(), ends, strict=True)])
+
+
+def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.intp]:
+    """All of `start[i]`, `start[i] + 1`, ... `start[i] + count[i] - 1`, one after the other."""
+    done = np.cumsum(count) - count
+    total = int(count.sum())
+    return (np.repeat(start - done, count) + np.arange(total)).astype(np.intp, copy=False)
+
+
+def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    offset = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=offset[1:])
+    return offset
+
+
+def _spread(value: _Each, rows: int) -> NDArray[np.int64]:
+    """One number a row, whether it is the same for all or not."""
+    if isinstance(value, int):
+        return np.full(rows, value, np.int64)
+    return value
+
+
+# --- nodes: what is written for each row ----------------------------------------------
+
+_Each: TypeAlias = "int | NDArray[np.int64]"
+"""The same number for all rows, or one each."""
+
+
+@dataclass(slots=True)
+class _Number:
+    """A value of fixed width, or null.
+
+    Attributes:
+        tag: BSON type, or one a row (uint8[n]).
+        values: shape (n,); assigned with a cast to `stored`.
+        stored: Little-endian dtype in the document.
+        has: bool[n], False for null; None when no row is null.
+    """
+
+    tag: int | NDArray[np.uint8]
+    values: NDArray[Any]
+    stored: np.dtype[Any]
+    has: NDArray[np.bool_] | None = None
+    width: _Each = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.width = self.stored.itemsize
+        if self.has is not None:
+            self.width = np.where(self.has, self.stored.itemsize, 0)
+
+
+@dataclass(slots=True)
+class _Text:
+    """Strings, valid UTF-8."""
+
+    data: NDArray[np.uint8]
+    start: NDArray[np.int64]
+    length: NDArray[np.int64]
+    tag: int = _STRING
+    width: _Each = field(init=False)
+
+    def __post_init__(self) -> None:
+        same = _same(self.length)
+        self.width = self.length + 5 if same is None else same + 5
+
+
+@dataclass(slots=True)
+class _Record:
+    """Documents; `rows` counts them, for there may be no field."""
+
+    fields: list[tuple[bytes, _Node]]
+    rows: int
+    tag: int = _DOCUMENT
+    width: _Each = field(init=False)
+
+    def __post_init__(self) -> None:
+        width: _Each = 5
+        for name, node in self.fields:
+            width = width + (2 + len(name)) + node.width
+        self.width = width
+
+
+@dataclass(slots=True)
+class _List:
+    """Arrays that are written out: row i has the next `counts[i]` rows of `child`."""
+
+    child: _Node
+    counts: NDArray[np.int64]
+    tag: int = _ARRAY
+    width: _Each = field(init=False)
+    count: int | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.count = _same(self.counts)
+        if self.count is not None and isinstance(self.child.width, int):
+            self.width = 5 + self.count * (2 + self.child.width) + _digits_before(self.count)
+        else:
+            self.width = 5 + np.diff(_offsets(self.element_widths())[_offsets(self.counts)])
+
+    def index(self) -> NDArray[np.int64]:
+        """Position of each element in its row."""
+        return _ranges(np.zeros_like(self.counts), self.counts)
+
+    def element_widths(self) -> NDArray[np.int64]:
+        """Bytes of each element with its type, key and NUL."""
+        index = self.index()
+        return 2 + _digits(index) + _spread(self.child.width, len(index))
+
+
+@dataclass(slots=True)
+class _Either:
+    """Rows that are written as `yes`, one after the other, and the rest, as `no`."""
+
+    which: NDArray[np.bool_]
+    yes: _Node
+    no: _Node
+    tag: NDArray[np.uint8] = field(init=False)
+    width: _Each = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.tag = np.empty(len(self.which), np.uint8)
+        self.tag[self.which] = self.yes.tag
+        self.tag[~self.which] = self.no.tag
+        width = np.empty(len(self.which), np.int64)
+        width[self.which] = self.yes.width
+        width[~self.which] = self.no.width
+        self.width = width
+
+
+_Node: TypeAlias = _Number | _Text | _Record | _List | _Either
+
+
+def _same(numbers: NDArray[np.int64]) -> int | None:
+    """The number that all of them are, None when they differ or there are none."""
+    if len(numbers) and bool((numbers == numbers[0]).all()):
+        return int(numbers[0])
+    return None
+
+
+def _digits(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Decimal digits of each array key."""
+    digits = np.ones(len(index), np.int64)
+    top = int(index.max(initial=0))
+    power = 10
+    while power <= top:
+        digits += index >= power
+        power *= 10
+    return digits
+
+
+def _digits_before(count: int) -> int:
+    """Decimal digits of all array keys below `count` together."""
+    digits, power = count, 10
+    while power < count:
+        digits += count - power
+        power *= 10
+    return digits
+
+
+def _node(column: Column, limit: int) -> _Node:
+    if isinstance(column, Scalars):
+        return _number(column.values)
+    if isinstance(column, Strings):
+        return _text(column)
+    if isinstance(column, Records):
+        return _record(column, limit)
+    return _array(column, limit)
+
+
+_STORED: dict[int, np.dtype[Any]] = {
+    _BOOL: np.dtype("?"),
+    _INT32: np.dtype("<i4"),
+    _INT64: np.dtype("<i8"),
+    _DOUBLE: np.dtype("<f8"),
+}
+
+
+def _number(values: NDArray[Any], has: NDArray[np.bool_] | None = None) -> _Number:
+    kind, size = values.dtype.kind, values.dtype.itemsize
+    if has is not None and has.all():
+        has = None
+    tag: int | NDArray[np.uint8]
+    if kind == "f":
+        tag = _DOUBLE
+    elif kind == "b":
+        tag = _BOOL
+    else:
+        tag = _INT32 if size < 4 or (size == 4 and kind == "i") else _INT64
+    stored = _STORED[tag]
+    if kind == "u" and size == 8:
+        huge = values >= np.uint64(1 << 63)
+        if huge.any():
+            # Both have eight bytes: only the type and the bits differ.
+            tag = np.where(huge, _DOUBLE, _INT64).astype(np.uint8)
+            values = np.where(huge, values.astype(np.float64).view(np.uint64), values)
+            values = values.view(np.int64)
+    if has is not None:
+        tag = np.where(has, tag, _NULL).astype(np.uint8)
+    return _Number(tag, values, stored, has)
+
+
+def _text(column: Strings) -> _Text:
+    start, length = column.offset[:-1], np.diff(column.offset)
+    begin, end = int(column.offset[0]), int(column.offset[-1])
+    data = column.data[begin:end]
+    start = start - begin
+    if (data < 0x80).all():
+        return _Text(data, start, length)
+    raw = data.tobytes()
+    # Whether a string is valid must not depend on its neighbours, so each string that
+    # is not plain ASCII is checked on its own.
+    high = _offsets((data >= 0x80).astype(np.int64))
+    odd = np.flatnonzero(high[start + length] > high[start])
+    mended: dict[int, bytes] = {}
+    for row in odd.tolist():
+        text = raw[start[row] : start[row] + length[row]]
+        try:
+            text.decode()
+        except UnicodeDecodeError:
+            mended[row] = text.decode(errors="replace").encode()
+    if mended:
+        start, length = start.copy(), length.copy()
+        behind = len(raw)
+        for row, text in mended.items():
+            start[row], length[row] = behind, len(text)
+            behind += len(text)
+        data = np.frombuffer(b"".join((raw, *mended.values())), np.uint8)
+    return _Text(data, start, length)
+
+
+def _record(column: Records, limit: int, *, top: bool = False) -> _Record:
+    names = top_level_names(column.fields) if top else column.fields
+    nodes = (_node(c, limit) for c in column.fields.values())
+    fields = [(name.encode(), node) for name, node in zip(names, nodes, strict=True)]
+    return _Record(fields, len(column))
+
+
+def _array(column: Arrays, limit: int) -> _Node:
+    counts = np.diff(column.offset)
+    short = counts <= limit
+    if short.all():
+        return _List(_node(column.values, limit), counts)
+    if not short.any():
+        return _summary(column, counts)
+    some = np.flatnonzero(short)
+    part = _take(column, some)
+    assert isinstance(part, Arrays)
+    lists = _List(_node(part.values, limit), counts[short])
+    part = _take(column, np.flatnonzero(~short))
+    assert isinstance(part, Arrays)
+    return _Either(short, lists, _summary(part, counts[~short]))
+
+
+def _summary(column: Arrays, counts: NDArray[np.int64]) -> _Record:
+    fields: list[tuple[bytes, _Node]] = [(b"n", _number(counts))]
+    if isinstance(column.values, Scalars):
+        found = summarise(column.values, column.offset)
+        fields.append((b"min", _number(found.min, found.has)))
+        fields.append((b"max", _number(found.max, found.has)))
+        fields.append((b"mean", _number(found.mean, found.has)))
+    return _Record(fields, len(counts))
+
+
+# --- bytes: one layout for all rows ---------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Piece:
+    """Bytes that are the same in all rows, and the values that go into them.
+
+    Attributes:
+        template: The bytes of a row.
+        writes: Place in the row, distance of further values in it, and the values,
+            shape (n,) or (n, values a row), with the dtype they are stored in.
+    """
+
+    template: bytearray = field(default_factory=bytearray)
+    writes: list[tuple[int, int, NDArray[Any], np.dtype[Any]]] = field(default_factory=list)
+
+    def header(self, tag: int | NDArray[np.uint8], name: bytes) -> None:
+        """Appends type and key of an element; `tag` for the rows of the piece."""
+        if isinstance(tag, np.ndarray):
+            if (tag == tag[0]).all():
+                tag = int(tag[0])
+            else:
+                self.writes.append((len(self.template), 0, tag, tag.dtype))
+                tag = 0
+        self.template += b"%c%b\0" % (tag, name)
+
+    def values(self, values: NDArray[Any], stored: np.dtype[Any]) -> None:
+        """Appends one value a row."""
+        self.writes.append((len(self.template), 0, values, stored))
+        self.template += bytes(stored.itemsize)
+
+    def tile(self, rows: int) -> NDArray[np.uint8]:
+        """uint8[rows, width]: all rows."""
+        width = len(self.template)
+        out = np.empty((rows, width), np.uint8)
+        out[:] = np.frombuffer(self.template, np.uint8)
+        for at, step, values, stored in self.writes:
+            strides = (width, step)[: values.ndim]
+            np.ndarray(values.shape, stored, out.data, at, strides)[...] = values
+        return out
+
+
+def _append(piece: _Piece, name: bytes, node: _Node, rows: slice, count: int) -> bool:
+    """Appends an element; False, and nothing appended, when rows differ in layout.
+
+    Args:
+        piece: What is appended to.
+        name: Key.
+        node: Value.
+        rows: The rows of `node` that the rows of the piece have.
+        count: How many these are, at least 1.
+    """
+    template, writes = len(piece.template), len(piece.writes)
+    piece.header(node.tag if isinstance(node.tag, int) else node.tag[rows], name)
+    if _append_value(piece, node, rows, count):
+        return True
+    del piece.template[template:]
+    del piece.writes[writes:]
+    return False
+
+
+def _append_value(piece: _Piece, node: _Node, rows: slice, count: int) -> bool:
+    if isinstance(node, _Number):
+        return _append_number(piece, node, rows)
+    if isinstance(node, _Text):
+        return _append_text(piece, node, rows)
+    if isinstance(node, _Either):
+        return False
+    begin = len(piece.template)
+    piece.template += bytes(4)
+    if isinstance(node, _Record):
+        fits = all(_append(piece, name, child, rows, count) for name, child in node.fields)
+    else:
+        fits = _append_list(piece, node, rows, count)
+    if fits:
+        piece.template += b"\0"
+        struct.pack_into("<i", piece.template, begin, len(piece.template) - begin)
+    return fits
+
+
+def _append_number(piece: _Piece, node: _Number, rows: slice) -> bool:
+    has = None if node.has is None else node.has[rows]
+    if has is None or has.all():
+        piece.values(node.values[rows], node.stored)
+        return True
+    return not has.any()
+
+
+def _append_text(piece: _Piece, node: _Text, rows: slice) -> bool:
+    length = _same(node.length[rows])
+    if length is None:
+        return False
+    piece.template += struct.pack("<i", length + 1)
+    if length:
+        text = np.dtype(("V", length))
+        piece.values(_overlay(node.data, text)[node.start[rows]], text)
+    piece.template += b"\0"
+    return True
+
+
+def _append_list(piece: _Piece, node: _List, rows: slice, count: int) -> bool:
+    size, child = node.count, node.child
+    if size is None:
+        return False
+    if isinstance(child, _Number) and child.has is None and isinstance(child.tag, int):
+        grid = child.values.reshape(-1, size)[rows] if size else child.values
+        value = bytes(child.stored.itemsize)
+        begin = 0
+        while begin < size:
+            digits = len(str(begin))
+            end = min(size, 10**digits)
+            at = len(piece.template) + 2 + digits
+            step = 2 + digits + len(value)
+            piece.writes.append((at, step, grid[:, begin:end], child.stored))
+            for key in range(begin, end):
+                piece.template += b"%c%d\0%b" % (child.tag, key, value)
+            begin = end
+        return True
+    if size > max(1, count // _UNROLL):
+        return False
+    first, step = rows.start or 0, rows.step or 1
+    return all(
+        _append(piece, b"%d" % key, child, slice(first * size + key, None, step * size), count)
+        for key in range(size)
+    )
+
+
+# --- bytes: a layout of its own for each row ------------------------------------------
+
+
+def _overlay(data: NDArray[np.uint8], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """An array whose item i lies at byte i of `data`; the items overlap."""
+    return np.ndarray((len(data) - dtype.itemsize + 1,), dtype, data, 0, (1,))
+
+
+def _put_fields(record: _Record, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
+    """Writes the elements of each row from byte `at` of `out`, which is zero before.
+
+    Neighbouring fields of one layout are tiled and copied together.
+    """
+    run = _Piece()
+    for name, node in record.fields:
+        if _append(run, name, node, slice(None), record.rows):
+            continue
+        run.header(node.tag, name)
+        at = _put_run(run, out, at)
+        _put(node, out, at)
+        at = at + node.width
+        run = _Piece()
+    _put_run(run, out, at)
+
+
+def _put_run(run: _Piece, out: NDArray[np.uint8], at: NDArray[np.int64]) -> NDArray[np.int64]:
+    width = len(run.template)
+    if width:
+        block = np.dtype(("V", width))
+        _overlay(out, block)[at] = run.tile(len(at)).view(block)[:, 0]
+    return at + width
+
+
+def _put(node: _Node, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
+    """Writes the value of each row at byte `at` of `out`."""
+    if len(at) == 0:
+        return
+    if isinstance(node, _Number):
+        has = slice(None) if node.has is None else node.has
+        _overlay(out, node.stored)[at[has]] = node.values[has]
+        return
+    if isinstance(node, _Either):
+        _put(node.yes, out, at[node.which])
+        _put(node.no, out, at[~node.which])
+        return
+    size = _overlay(out, np.dtype("<i4"))
+    if isinstance(node, _Text):
+        size[at] = node.length + 1
+        _put_text(node, out, at + 4)
+        return
+    size[at] = node.width
+    if isinstance(node, _Record):
+        _put_fields(node, out, at + 4)
+    else:
+        _put_elements(node, out, at + 4)
+
+
+def _put_text(node: _Text, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
+    if int(node.length.sum()) <= _LONG * len(at):
+        out[_ranges(at, node.length)] = node.data[_ranges(node.start, node.length)]
+        return
+    places = zip(at.tolist(), node.start.tolist(), node.length.tolist(), strict=True)
+    for to, begin, length in places:
+        out[to : to + length] = node.data[begin : begin + length]
+
+
+def _put_elements(node: _List, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
+    index = node.index()
+    if len(index) == 0:
+        return
+    begin = _offsets(node.element_widths())
+    first = _offsets(node.counts)[:-1]
+    places = begin[:-1] + np.repeat(at - begin[first], node.counts)
+    digits = _digits(index)
+    tags = node.child.tag
+    for length in range(1, int(digits.max()) + 1):
+        chosen = digits == length
+        keys = index[chosen]
+        head = np.zeros((len(keys), length + 2), np.uint8)
+        head[:, 0] = tags if isinstance(tags, int) else tags[chosen]
+        for place in range(length):
+            head[:, length - place] = ord("0") + keys // 10**place % 10
+        block = np.dtype(("V", length + 2))
+        _overlay(out, block)[places[chosen]] = head.view(block)[:, 0]
+    _put(node.child, out, places + 2 + digits)

@@ -1,0 +1,122 @@
+"""Count, least, greatest and mean of arrays that are too long for an index document."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.column import Scalars
+
+
+@dataclass(slots=True)
+class Summary:
+    """Summaries of the rows of an array column.
+
+    Attributes:
+        n: int64[rows], elements, whether finite or not.
+        min: shape (rows,), least finite element: int64 for integers and booleans,
+            uint64 for uint64, float64 for floats; 0 where `has` is False.
+        max: The greatest, in the same form.
+        mean: float64[rows], mean of the finite elements; 0 where `has` is False.
+        has: bool[rows], whether the row has a finite element at all.
+    """
+
+    n: NDArray[np.int64]
+    min: NDArray[Any]
+    max: NDArray[Any]
+    mean: NDArray[np.float64]
+    has: NDArray[np.bool_]
+
+
+def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
+    """Summarises every row of a ragged array.
+
+    The summary of a row depends on the elements of that row alone, to the last bit,
+    whatever else is in the batch: sums are made by one `reduceat`, which adds up each
+    segment on its own and in the same order, and never by a regular-grid reduction,
+    whose order may differ.
+
+    Args:
+        values: All elements.
+        offset: int64[rows + 1]; row i holds elements `offset[i]:offset[i + 1]`.
+    """
+    elements = values.values[int(offset[0]) : int(offset[-1])]
+    offset = offset - offset[0]
+    counts = np.diff(offset)
+    if elements.dtype == np.bool_:
+        elements = elements.view(np.uint8)
+    with np.errstate(all="ignore"):
+        if elements.dtype.kind == "f":
+            return _floats(elements, offset, counts)
+        return _integers(elements, offset[:-1], counts)
+
+
+def _integers(
+    elements: NDArray[Any], start: NDArray[np.int64], counts: NDArray[np.int64]
+) -> Summary:
+    has = counts > 0
+    exact: type[np.generic] = np.uint64 if elements.dtype == np.uint64 else np.int64
+    low, high = (np.zeros(len(counts), exact) for _ in range(2))
+    mean = np.zeros(len(counts), np.float64)
+    if has.any():
+        # Rows without elements must not reach reduceat: it would return a neighbour's.
+        begin = start[has]
+        low[has] = np.minimum.reduceat(elements, begin)
+        high[has] = np.maximum.reduceat(elements, begin)
+        if elements.dtype.itemsize == 8:
+            # Sums of 64-bit integers could overflow.
+            sums = np.add.reduceat(elements.astype(np.float64), begin)
+        else:
+            sums = _exact_sums(elements, begin, counts[has])
+        mean[has] = sums / counts[has]
+    return Summary(counts, low, high, mean, has)
+
+
+def _exact_sums(
+    elements: NDArray[Any], begin: NDArray[np.int64], counts: NDArray[np.int64]
+) -> NDArray[Any]:
+    """Sums of segments of integers of at most 32 bits: the order does not matter."""
+    lanes = 256  # as many 8-bit values fit into a 16-bit sum, 16-bit ones into 32 bits
+    if elements.dtype.itemsize == 4 or int(counts.mean()) < 16 * lanes:
+        return np.add.reduceat(elements, begin, dtype=np.int64)
+    # Images and clouds: adding up whole columns is ten times faster than one long sum.
+    narrow = np.dtype(f"{elements.dtype.kind}{2 * elements.dtype.itemsize}")
+    sums = np.zeros(len(begin), np.int64)
+    for row, (first, count) in enumerate(zip(begin.tolist(), counts.tolist(), strict=True)):
+        even = first + count // lanes * lanes
+        block = elements[first:even].reshape(lanes, -1)
+        sums[row] = np.add.reduce(block, axis=0, dtype=narrow).sum(dtype=np.int64)
+        sums[row] += elements[even : first + count].sum(dtype=np.int64)
+    return sums
+
+
+def _floats(
+    elements: NDArray[Any], offset: NDArray[np.int64], counts: NDArray[np.int64]
+) -> Summary:
+    finite = np.isfinite(elements)
+    kept = counts
+    if not finite.all():
+        seen = np.concatenate(([0], np.cumsum(finite, dtype=np.int64)))
+        offset = seen[offset]
+        kept = np.diff(offset)
+        elements = elements[finite]
+    has = kept > 0
+    low, high, mean = (np.zeros(len(counts), np.float64) for _ in range(3))
+    if has.any():
+        begin = offset[:-1][has]
+        # Adding 0.0 turns -0.0 into 0.0: which of two equal zeros a reduction returns
+        # depends on the order in which the processor compares them.
+        low[has] = np.minimum.reduceat(elements, begin) + elements.dtype.type(0)
+        high[has] = np.maximum.reduceat(elements, begin) + elements.dtype.type(0)
+        wide = elements.astype(np.float64, copy=False)
+        mean[has] = np.add.reduceat(wide, begin) / kept[has] + 0.0
+        for row in np.flatnonzero(~np.isfinite(mean)):
+            # The sum left the range of a double, the mean cannot.
+            part = wide[offset[row] : offset[row + 1]]
+            mean[row] = np.clip(np.add.reduce(part / kept[row]), low[row], high[row])
+    return Summary(counts, low, high, mean, has)

@@ -1,0 +1,205 @@
+"""What every reader of a foreign log offers: batches in file order, and what was lost.
+
+A source never gives up because a part of its file is damaged: it yields what can be
+read and describes every place that could not be, so that the consumer can store the
+one and report the other. Only a file that gives nothing at all raises `SourceError`,
+and it does so when the source is opened.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Batch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from mcap.records import Attachment, Metadata
+
+    from hybridlog_storage.messages import Channel
+
+BATCH_BYTES = 2 << 20
+"""Payload bytes at which a source closes a batch; one larger payload may exceed it."""
+
+BATCH_MESSAGES = 16384
+"""Most messages of one batch."""
+
+MAX_CHUNK = 1 << 30
+"""Largest chunk or payload, in uncompressed bytes, that a source will unpack."""
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """One place of a file that could not be read.
+
+    Attributes:
+        file: The file.
+        offset: Byte in the file where the place starts, None when that is not known.
+        length: Bytes from `offset` on that could not be read, None when not known.
+        reason: What is wrong there, for people to read.
+        messages_lost: Number of messages that lie there, None when it cannot be known.
+    """
+
+    file: Path
+    offset: int | None
+    length: int | None
+    reason: str
+    messages_lost: int | None
+
+
+class Source(ABC):
+    """A log that hybridlog did not write. Use it as a context manager, read it once.
+
+    Attributes:
+        path: What was opened: a file, or the directory of a split log.
+        kind: `ROS 1 bag`, `ROS 2 bag (sqlite3)`, `ROS 2 bag (mcap)` or `MCAP`.
+        profile: MCAP profile of the messages: `ros1`, `ros2`, or empty.
+        files: The files that hold messages, in reading order.
+        size_bytes: Sum of the sizes of `files`.
+        channels: Channels met so far; `Batch.channel` indexes it. It only ever grows,
+            and holds every channel of a batch before that batch is yielded.
+        damage: Places that could not be read, so far. It only ever grows.
+        extras: Metadata and attachments met so far (MCAP only). The consumer takes
+            them out as it stores them.
+        message_count: Messages as the log says of itself, None when it does not.
+        time_range: Log time `[start, end)`, ns, as the log's own index says, None when
+            it does not or has no messages.
+        bytes_read: How much of `size_bytes` has been read, for showing progress.
+    """
+
+    def __init__(self, path: Path, *, kind: str, profile: str, files: Sequence[Path]) -> None:
+        self.path = path
+        self.kind = kind
+        self.profile = profile
+        self.files: list[Path] = list(files)
+        self.size_bytes: int = sum(size_of(file) for file in self.files)
+        self.channels: list[Channel] = []
+        self.damage: list[Damage] = []
+        self.extras: list[Metadata | Attachment] = []
+        self.message_count: int | None = None
+        self.time_range: tuple[int, int] | None = None
+        self.bytes_read: int = 0
+
+    @abstractmethod
+    def batches(self) -> Iterator[Batch]:
+        """Yields all messages that can be read, once, in file order, in bounded memory.
+
+        Each batch holds about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages. Its
+        buffer stays valid after the source is closed.
+
+        Raises:
+            SourceError: The file cannot be read any more at all (an I/O error).
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Closes the files. May be called more than once."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def size_of(file: Path) -> int:
+    """Size of a file in bytes.
+
+    Raises:
+        SourceError: The file is missing or may not be looked at.
+    """
+    try:
+        return file.stat().st_size
+    except OSError as error:
+        raise cannot_open(file, error) from error
+
+
+def cannot_open(path: Path, error: OSError) -> SourceError:
+    """The error for a path that the system refuses to open, with the cure."""
+    if isinstance(error, FileNotFoundError):
+        return SourceError(f"{path}: no such file or directory; check the spelling of the path")
+    if isinstance(error, PermissionError):
+        return SourceError(
+            f"{path}: permission denied; make it readable for this user (chmod u+r) "
+            "or run as its owner"
+        )
+    return SourceError(
+        f"{path}: cannot be read ({error.strerror or error}); check the disk, or copy the "
+        "file to another one and use the copy"
+    )
+
+
+def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """Joins small batches and splits large ones, in order.
+
+    Args:
+        batches: Batches of any size, as the chunks of a file give them. Empty ones are
+            left out.
+
+    Yields:
+        Batches of about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages.
+    """
+    held: list[Batch] = []
+    size = rows = 0
+    for batch in batches:
+        if not len(batch):
+            continue
+        if held and (size + len(batch.buffer) > BATCH_BYTES or rows + len(batch) > BATCH_MESSAGES):
+            yield join(held)
+            held, size, rows = [], 0, 0
+        if len(batch.buffer) * 2 > BATCH_BYTES or len(batch) * 2 > BATCH_MESSAGES:
+            if held:
+                yield join(held)
+                held, size, rows = [], 0, 0
+            yield from _split(batch)
+        else:
+            held.append(batch)
+            size += len(batch.buffer)
+            rows += len(batch)
+    if held:
+        yield join(held)
+
+
+def join(batches: Sequence[Batch]) -> Batch:
+    """One batch of several, over one buffer."""
+    if len(batches) == 1:
+        return batches[0]
+    starts = np.cumsum([0, *(len(batch.buffer) for batch in batches[:-1])])
+    offsets = [batch.offset + start for batch, start in zip(batches, starts, strict=True)]
+    return Batch(
+        b"".join(batch.buffer for batch in batches),
+        np.concatenate(offsets),
+        np.concatenate([batch.length for batch in batches]),
+        np.concatenate([batch.channel for batch in batches]),
+        np.concatenate([batch.log_time for batch in batches]),
+        np.concatenate([batch.publish_time for batch in batches]),
+        np.concatenate([batch.sequence for batch in batches]),
+    )
+
+
+def _split(batch: Batch) -> Iterator[Batch]:
+    """Parts of a batch, over the same buffer."""
+    if len(batch) <= BATCH_MESSAGES and batch.payload_bytes <= 2 * BATCH_BYTES:
+        yield batch
+        return
+    ends = np.cumsum(batch.length)
+    row = 0
+    while row < len(batch):
+        before = int(ends[row - 1]) if row else 0
+        stop = int(np.searchsorted(ends, before + BATCH_BYTES, side="right"))
+        stop = min(max(stop, row + 1), row + BATCH_MESSAGES, len(batch))
+        yield batch.take(slice(row, stop))
+        row = stop

@@ -1,0 +1,50 @@
+"""Telling whether the content of a log has been seen before, without reading it all."""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from typing import TYPE_CHECKING
+
+from hybridlog.sources.base import cannot_open
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+WHOLE = 4 << 20
+"""Files up to this size are read whole, bytes."""
+
+SAMPLES = 256
+SAMPLE_BYTES = 16 << 10
+
+
+def fingerprint(files: Sequence[Path]) -> str:
+    """Fingerprint of the content of files, in their order; their names do not matter.
+
+    It covers the size of each file and its whole content up to `WHOLE` bytes, beyond
+    that `SAMPLES` evenly spaced samples, the first at the start and the last at the end.
+
+    Returns:
+        32 hexadecimal digits.
+
+    Raises:
+        SourceError: A file is missing or cannot be read.
+    """
+    digest = blake2b(digest_size=16)
+    for path in files:
+        try:
+            with path.open("rb", buffering=SAMPLE_BYTES) as file:
+                size = file.seek(0, 2)
+                digest.update(size.to_bytes(8, "little"))
+                if size <= WHOLE:
+                    starts, count = [0], size
+                else:
+                    last = size - SAMPLE_BYTES
+                    starts = [last * number // (SAMPLES - 1) for number in range(SAMPLES)]
+                    count = SAMPLE_BYTES
+                for start in starts:
+                    file.seek(start)
+                    digest.update(file.read(count))
+        except OSError as error:
+            raise cannot_open(path, error) from error
+    return digest.hexdigest()

@@ -1,0 +1,720 @@
+"""ROS 1 bags (format 2.0), read from the top as they were written.
+
+The index at the end of a bag serves only to say what should be there. Messages are
+found by walking the records, so bags without an index (`.bag.active`), bags that were
+cut short and bags with damage in the middle give everything that can still be read.
+
+After damage the reader looks for the next bytes that make a sound record. What was
+lost is counted with the index records that follow each chunk, or with the chunk list
+at the end of the bag.
+"""
+
+from __future__ import annotations
+
+import bz2
+from bisect import bisect_left
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, BinaryIO, Protocol
+
+import lz4.frame
+import numpy as np
+
+from hybridlog.sources.base import MAX_CHUNK, Damage, Source, cannot_open, regroup
+from hybridlog.sources.rosbag1_records import (
+    MAX_HEADER,
+    OP_BAG_HEADER,
+    OP_CHUNK,
+    OP_CHUNK_INFO,
+    OP_CONNECTION,
+    OP_INDEX_DATA,
+    OP_MESSAGE,
+    Header,
+    Run,
+    RunReader,
+    Stop,
+    find_record,
+    parse_fields,
+    parse_header,
+)
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Batch, Channel, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+MAGIC = b"#ROSBAG V2.0\n"
+
+_WINDOW = 4 << 20
+_SEARCH = 1 << 20
+_OVERLAP = 8 << 10
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """One record of the file: its header, and `[start, end)` of its data."""
+
+    raw: bytes
+    header: Header
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Space:
+    """Bytes that records lie in: the file, or a chunk that was unpacked.
+
+    Attributes:
+        read: `read(pos, n)` gives up to n bytes.
+        size: Number of bytes.
+        packed: The bytes lie in a compressed chunk.
+        cut: The bytes are known to end too early.
+    """
+
+    read: Callable[[int, int], bytes]
+    size: int
+    packed: bool
+    cut: bool
+
+
+@dataclass(slots=True)
+class _Place:
+    """A chunk with its index records, or what stands where one should be.
+
+    Attributes:
+        start: Byte in the file.
+        end: Byte after it, as far as it is known by now.
+        got: Messages that were read in it.
+        indexed: Messages that its index records list, None before the first one.
+        reasons: What is wrong with it.
+        torn_index: Some of its index records could not be read.
+        cut: The file ends in it.
+    """
+
+    start: int
+    end: int
+    got: int = 0
+    indexed: int | None = None
+    reasons: list[str] = field(default_factory=list)
+    torn_index: bool = False
+    cut: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Unpacked:
+    """What came out of a compressed chunk.
+
+    Attributes:
+        data: The bytes; a sound prefix when `state` is `short`, empty when `broken`.
+        used: Compressed bytes that belong to the stream.
+        state: `whole`, `short` (the stream goes on past its bytes) or `broken`.
+        reason: What is wrong with a broken one.
+    """
+
+    data: bytes
+    used: int
+    state: str
+    reason: str = ""
+
+
+class Rosbag1Source(Source):
+    """A ROS 1 bag.
+
+    Each connection of the bag becomes a channel of its own.
+
+    Raises:
+        SourceError: No such file, no bag of version 2.0, or an encrypted one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, kind="ROS 1 bag", profile="ros1", files=[path])
+        try:
+            self._file: BinaryIO = path.open("rb", buffering=1 << 16)
+        except OSError as error:
+            raise cannot_open(path, error) from error
+        self._space = _Space(self._read, self.size_bytes, packed=False, cut=False)
+        self._runs = RunReader()
+        self._channel_of: dict[int, int] = {}
+        self._numbers: dict[tuple[int, str, str, bytes, tuple[tuple[str, str], ...]], int] = {}
+        self._fallback: dict[int, tuple[bytes, Header, tuple[int, int]]] = {}
+        self._undefined: Counter[int] = Counter()
+        self._undefined_at: int | None = None
+        self._chunk_positions: list[int] = []
+        self._chunk_counts: list[int] = []
+        self._index_pos = 0
+        self._place: _Place | None = None
+        self._pos = len(MAGIC)
+        try:
+            self._open()
+        except OSError as error:
+            self.close()
+            raise cannot_open(path, error) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def batches(self) -> Iterator[Batch]:
+        """Yields all messages that can be read, in file order."""
+        return regroup(self._pieces())
+
+    # Opening: the bag header, and the index when there is one.
+
+    def _open(self) -> None:
+        magic = self._read(0, len(MAGIC))
+        if not magic:
+            raise SourceError(
+                f"{self.path}: the file is empty; record or copy it again, there is nothing in it"
+            )
+        if magic != MAGIC:
+            raise SourceError(_not_version_2(self.path, magic))
+        record = self._record(len(MAGIC))
+        if record is None:
+            if self.size_bytes < len(MAGIC) + 4096:
+                raise SourceError(
+                    f"{self.path}: the file ends in the bag header, before any message; "
+                    "copy it again from where it was recorded"
+                )
+            return
+        if record.header.op != OP_BAG_HEADER:
+            return
+        encryptor = record.header.raw(record.raw, b"encryptor")
+        if encryptor:
+            raise SourceError(
+                f"{self.path}: the bag is encrypted ({encryptor.decode(errors='replace')}); "
+                "decrypt it with `rosbag decrypt` first"
+            )
+        self._index_pos = record.header.u64(record.raw, b"index_pos")
+        if not 0 < self._index_pos <= self.size_bytes:
+            return
+        conn_count = record.header.u32(record.raw, b"conn_count")
+        chunk_count = record.header.u32(record.raw, b"chunk_count")
+        self._read_index(conn_count, chunk_count, is_bare=self._index_pos == record.end)
+
+    def _read_index(self, conn_count: int, chunk_count: int, *, is_bare: bool) -> None:
+        """Reads connections and chunk list; what it says counts only when it is whole."""
+        chunks: list[tuple[int, int]] = []
+        begins: list[int] = []
+        ends: list[int] = []
+        pos = self._index_pos
+        connections = 0
+        while pos < self.size_bytes:
+            record = self._record(pos)
+            if record is None or record.end > self.size_bytes:
+                return
+            if record.header.op == OP_CONNECTION:
+                self._keep_definition(record)
+                connections += 1
+            elif record.header.op == OP_CHUNK_INFO:
+                data = self._read(record.start, min(record.end - record.start, 1 << 26))
+                pairs = np.frombuffer(data, "<u4", len(data) // 8 * 2).reshape(-1, 2)
+                place = record.header.u64(record.raw, b"chunk_pos")
+                chunks.append((place, int(pairs[:, 1].sum(dtype=np.int64))))
+                begins.append(record.header.time(record.raw, b"start_time"))
+                ends.append(record.header.time(record.raw, b"end_time"))
+            else:
+                return
+            pos = record.end
+        if connections != conn_count or len(chunks) != chunk_count:
+            return
+        chunks.sort()
+        self._chunk_positions = [place for place, _ in chunks]
+        self._chunk_counts = [count for _, count in chunks]
+        # Messages of a bag without chunks are in no list.
+        if chunks or is_bare:
+            self.message_count = sum(self._chunk_counts)
+        if chunks and self.message_count:
+            self.time_range = (min(begins), max(ends) + 1)
+
+    def _keep_definition(self, record: _Record) -> None:
+        """Remembers a connection of the index: its definition in a chunk may be lost."""
+        if record.end - record.start > MAX_CHUNK:
+            return
+        data = self._read(record.start, record.end - record.start)
+        raw = record.raw + data
+        span = (len(record.raw), len(raw))
+        self._fallback[record.header.u32(record.raw, b"conn")] = (raw, record.header, span)
+
+    # Reading the file.
+
+    def _read(self, pos: int, count: int) -> bytes:
+        self._file.seek(pos)
+        return self._file.read(count)
+
+    def _record(self, pos: int) -> _Record | None:
+        """The record at a place of the file, None when there is no sound one.
+
+        The end of its data may lie past the end of the file.
+        """
+        size = int.from_bytes(self._read(pos, 4), "little")
+        if not 0 < size <= min(MAX_HEADER, self.size_bytes - pos - 8):
+            return None
+        raw = self._read(pos + 4, size + 4)
+        if len(raw) < size + 4:
+            return None
+        header = parse_header(raw, 0, size)
+        if header is None:
+            return None
+        start = pos + 8 + size
+        return _Record(raw, header, start, start + int.from_bytes(raw[size:], "little"))
+
+    def _pieces(self) -> Iterator[Batch]:
+        """Walks the file record by record, chunk by chunk."""
+        try:
+            while self._pos < self.size_bytes:
+                yield from self._step()
+                self.bytes_read = min(self._pos, self.size_bytes)
+        except OSError as error:
+            place = self._place_at(self._pos)
+            place.reasons.append(f"the system cannot read on: {error.strerror or error}")
+            place.end = self.size_bytes
+        self.bytes_read = self.size_bytes
+        was_cut = self._place is not None and self._place.cut
+        self._finish_place()
+        if self._index_pos > self.size_bytes and not was_cut:
+            self._report(
+                self.size_bytes,
+                None,
+                f"the file ends before its index, which should start at byte {self._index_pos}: "
+                "it was cut short",
+                None,
+            )
+        self._report_undefined()
+
+    def _step(self) -> Iterator[Batch]:
+        """Reads one record, chunk or run of loose messages at `_pos` and moves it on."""
+        pos = self._pos
+        record = self._record(pos)
+        if record is None:
+            self._skip_damage(pos)
+        elif record.header.op == OP_CHUNK:
+            yield from self._chunk(pos, record)
+        elif record.header.op in {OP_MESSAGE, OP_CONNECTION}:
+            # Also what follows an uncompressed chunk whose length field is too small.
+            yield from self._run(self._space, pos, None)
+        elif record.end > self.size_bytes:
+            place = self._place_at(pos)
+            place.reasons.append("the file ends in a record")
+            place.cut = place.torn_index = True
+            if 0 < self._index_pos <= pos:
+                place.indexed = place.got
+            self._pos = place.end = self.size_bytes
+        else:
+            if record.header.op == OP_INDEX_DATA:
+                place = self._place_at(pos, has_index=True)
+                place.indexed = (place.indexed or 0) + record.header.u32(record.raw, b"count")
+                place.end = record.end
+            elif record.header.op == OP_CHUNK_INFO:
+                self._finish_place()
+            self._pos = record.end
+
+    def _skip_damage(self, pos: int) -> None:
+        """Nothing sound at `pos`: goes to the next place that is."""
+        place = self._place_at(pos)
+        tail = self.size_bytes - pos
+        found = self._search(self._space, pos + 1)
+        self._pos = place.end = self.size_bytes if found is None else found
+        if found is None and tail < MAX_HEADER:
+            place.cut = True
+            place.reasons.append(f"the file ends in a record ({tail} bytes of it are there)")
+        else:
+            place.reasons.append(f"{self._pos - pos} bytes at byte {pos} are no record")
+        place.torn_index = True
+
+    def _search(self, space: _Space, pos: int) -> int | None:
+        """First place from `pos` on that looks like a record."""
+        while pos < space.size:
+            data = space.read(pos, min(_SEARCH + _OVERLAP, space.size - pos))
+            found = find_record(data, 0, space.size - pos)
+            if found is not None and (found < _SEARCH or len(data) <= _SEARCH):
+                return pos + found
+            if len(data) <= _SEARCH:
+                return None
+            pos += _SEARCH
+        return None
+
+    # Chunks.
+
+    def _chunk(self, pos: int, record: _Record) -> Iterator[Batch]:
+        self._finish_place()
+        place = self._place = _Place(pos, min(record.end, self.size_bytes))
+        compression = record.header.raw(record.raw, b"compression")
+        size = record.header.u32(record.raw, b"size")
+        if compression == b"none":
+            if size != record.end - record.start:
+                place.reasons.append(
+                    f"the chunk's header says {size} bytes, its record {record.end - record.start}"
+                )
+            yield from self._run(self._space, record.start, record.end)
+            return
+        if compression not in _UNPACKERS:
+            name = compression.decode(errors="replace")
+            place.reasons.append(f"the chunk's compression {name!r} is not known")
+            self._after_broken_chunk(record)
+            return
+        unpacked = self._unpack(record, compression, size)
+        if unpacked.state == "broken":
+            place.reasons.append(unpacked.reason)
+            self._after_broken_chunk(record)
+            return
+        end = record.start + unpacked.used
+        if unpacked.state == "short":
+            place.reasons.append("the file ends in a chunk")
+            place.cut = True
+            end = self.size_bytes
+        elif end != record.end:
+            place.reasons.append(
+                f"the chunk's record says {record.end - record.start} compressed bytes, "
+                f"there are {unpacked.used}"
+            )
+        if unpacked.state == "whole" and len(unpacked.data) != size:
+            place.reasons.append(
+                f"the chunk's header says {size} bytes, there are {len(unpacked.data)}"
+            )
+        yield from self._packed_messages(unpacked)
+        self._pos = place.end = end
+
+    def _packed_messages(self, unpacked: _Unpacked) -> Iterator[Batch]:
+        data = unpacked.data
+
+        def read(pos: int, count: int) -> bytes:
+            return data if pos == 0 and count >= len(data) else data[pos : pos + count]
+
+        space = _Space(read, len(data), packed=True, cut=unpacked.state == "short")
+        yield from self._run(space, 0, len(data))
+
+    def _unpack(self, record: _Record, compression: bytes, size: int) -> _Unpacked:
+        """Unpacks a chunk, reading on when its record says too few bytes."""
+        length = min(record.end, self.size_bytes) - record.start
+        if length > MAX_CHUNK:
+            return _Unpacked(b"", length, "broken", "the chunk is too large to be one")
+        unpack = _UNPACKERS[compression]
+        unpacked = unpack(self._read(record.start, length), size)
+        rest = self.size_bytes - record.end
+        if unpacked.state == "short" and rest > 0:
+            # Index records follow in a sound bag, so a little more is enough to see.
+            more = min(length + max(length, 1 << 20), self.size_bytes - record.start)
+            unpacked = unpack(self._read(record.start, more), size)
+            if unpacked.state == "short":
+                reason = "the chunk's compressed bytes end too early"
+                return _Unpacked(b"", length, "broken", reason)
+        return unpacked
+
+    def _after_broken_chunk(self, record: _Record) -> None:
+        """Goes on after a chunk that gave nothing, believing its length only if it fits."""
+        place = self._place_at(record.start)
+        if record.end == self.size_bytes or (
+            record.end < self.size_bytes and self._record(record.end) is not None
+        ):
+            self._pos = place.end = record.end
+            return
+        found = self._search(self._space, record.start)
+        self._pos = place.end = self.size_bytes if found is None else found
+        place.cut = found is None
+
+    # Runs of messages.
+
+    def _run(self, space: _Space, pos: int, soft_end: int | None) -> Iterator[Batch]:
+        """Reads message and connection records from `pos` on until another kind comes.
+
+        Args:
+            space: Where they lie. In the file, `_pos` is moved to where the run ended.
+            pos: First byte.
+            soft_end: Where the run should end; nothing is read past it in vain.
+        """
+        need = 0
+        while pos < space.size and (soft_end is None or pos < soft_end):
+            stop = space.size if soft_end is None else soft_end
+            count = space.size if space.packed else max(min(_WINDOW, stop - pos), need)
+            data = space.read(pos, count)
+            if not data:
+                break
+            run = self._runs.read(data)
+            go_on, need = self._after_run(space, run, pos, soft_end)
+            batch = self._batch(space, data, run, pos)
+            if len(batch):
+                yield batch
+            if go_on is None:
+                pos += run.end
+                break
+            pos = go_on
+            if not space.packed:
+                self.bytes_read = min(pos, space.size)
+        if not space.packed:
+            self._pos = pos
+
+    def _after_run(
+        self, space: _Space, run: Run, pos: int, soft_end: int | None
+    ) -> tuple[int | None, int]:
+        """Decides where to go on after a run that started at `pos`.
+
+        Returns:
+            The next place (None: the run is over where it stopped), and how many bytes
+            to read there at least.
+        """
+        end = pos + run.end
+        if run.why is Stop.END:
+            return end, 0
+        if run.why is Stop.FOREIGN and not space.packed:
+            if soft_end is not None:
+                reason = "a record that does not belong into a chunk"
+                self._place_at(end).reasons.append(f"{reason} at byte {end}")
+            return None, 0
+        if run.why is Stop.CUT:
+            need = self._need(space, run, end, soft_end)
+            if need:
+                return end, need
+            if space.cut:
+                return space.size, 0
+            if not space.packed and end + run.need > space.size:
+                return self._cut_in_file(space, end), 0
+        self._trouble(space, end, "bytes that are no record")
+        return self._resume(space, run, pos), 0
+
+    def _need(self, space: _Space, run: Run, end: int, soft_end: int | None) -> int:
+        """Bytes to read for the incomplete record at `end`, 0 when it cannot be whole."""
+        if end + run.need > space.size or run.need > MAX_CHUNK:
+            return 0
+        if soft_end is None or end + run.need <= soft_end:
+            return run.need
+        # It crosses the end of its chunk. Either the chunk's length is wrong or its own:
+        # that one is right after which another record stands.
+        record = self._record(end)
+        if record is None or record.end - end > MAX_CHUNK or not self._fits(space, record.end):
+            return 0
+        return record.end - end
+
+    def _fits(self, space: _Space, pos: int) -> bool:
+        """Whether a record may end at `pos`: the space ends there or another one starts."""
+        return pos == space.size or (not space.packed and self._record(pos) is not None)
+
+    def _cut_in_file(self, space: _Space, end: int) -> int:
+        """A record reaches past the end of the file: cut, or its length is wrong."""
+        found = self._search(space, end + 8)
+        if found is not None:
+            self._trouble(space, end, "a record whose length is wrong")
+            self._place_at(end).end = found
+            return found
+        place = self._place_at(end)
+        place.reasons.append(f"the file ends in a record that starts at byte {end}")
+        place.cut = True
+        place.end = space.size
+        return space.size
+
+    def _resume(self, space: _Space, run: Run, pos: int) -> int:
+        """Where records go on after bad bytes; drops the last message if it reaches there."""
+        end = pos + run.end
+        found = self._search(space, end + 1 if run.last is None else pos + run.last)
+        if found is None:
+            found = space.size
+        elif found < end:
+            run.without_last()
+        if not space.packed:
+            place = self._place_at(end)
+            place.end = max(place.end, found)
+        return found
+
+    def _trouble(self, space: _Space, pos: int, reason: str) -> None:
+        """Notes that something in the current place is wrong."""
+        place = self._place_at(pos) if not space.packed else self._place
+        assert place is not None
+        where = f"at byte {pos}" + (" of the unpacked chunk" if space.packed else "")
+        place.reasons.append(f"{reason} {where}")
+
+    def _batch(self, space: _Space, data: bytes, run: Run, pos: int) -> Batch:
+        """Gives the messages of a run their channels; counts those that have none."""
+        channel = np.full(len(run.offset), -1, np.int32)
+        done = 0
+        for before, header, span in run.connections:
+            conn = header.u32(data, b"conn")
+            number = self._define(conn, data, header, span)
+            if self._channel_of.get(conn, number) != number:
+                # The id now means something else: what came before keeps the old meaning.
+                channel[done:before] = self._channels(run.connection[done:before])
+                done = before
+            self._channel_of[conn] = number
+        channel[done:] = self._channels(run.connection[done:])
+        if len(run.offset):
+            place = self._place if space.packed else self._place_at(pos)
+            assert place is not None
+            place.got += len(run.offset)
+            if not space.packed:
+                place.end = max(place.end, pos + run.end)
+        zeros = np.zeros(len(run.offset), np.uint32)
+        times = run.log_time
+        batch = Batch(data, run.offset, run.length, channel, times, times, zeros)
+        known = channel >= 0
+        if not known.all():
+            self._undefined.update(run.connection[~known].tolist())
+            if self._undefined_at is None:
+                self._undefined_at = self._pos if space.packed else pos
+            batch = batch.take(known)
+        return batch
+
+    def _channels(
+        self, connection: np.ndarray[tuple[int], np.dtype[np.int64]]
+    ) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
+        """Channel numbers of connection ids, -1 for ids without a definition."""
+        ids, where = np.unique(connection, return_inverse=True)
+        numbers = np.empty(len(ids), np.int32)
+        for row, conn in enumerate(ids.tolist()):
+            if conn not in self._channel_of and conn in self._fallback:
+                self._channel_of[conn] = self._define(conn, *self._fallback[conn])
+            numbers[row] = self._channel_of.get(conn, -1)
+        return numbers[where]
+
+    def _define(self, conn: int, data: bytes, header: Header, span: tuple[int, int]) -> int:
+        """Channel number of a connection record; the same record twice is one channel."""
+        topic = header.raw(data, b"topic").decode(errors="replace")
+        fields = parse_fields(data, *span) or {}
+        values = {
+            name.decode(errors="replace"): data[start:end] for name, (start, end) in fields.items()
+        }
+        definition = values.pop("message_definition", None)
+        name = values.pop("type", b"").decode(errors="replace")
+        values.pop("topic", None)
+        metadata = {key: value.decode(errors="replace") for key, value in values.items()}
+        key = (conn, topic, name, definition or b"", tuple(sorted(metadata.items())))
+        number = self._numbers.get(key)
+        if number is None:
+            encoding = "" if definition is None else "ros1msg"
+            schema = Schema(name, encoding, definition or b"") if name else None
+            number = self._numbers[key] = len(self.channels)
+            self.channels.append(Channel(topic, "ros1", schema, metadata, has_publish_time=False))
+        return number
+
+    # What was lost.
+
+    def _place_at(self, pos: int, *, has_index: bool = False) -> _Place:
+        """The place that `pos` belongs to: the current one unless that is complete."""
+        place = self._place
+        if place is None or (not has_index and place.indexed is not None):
+            self._finish_place()
+            place = self._place = _Place(pos, pos)
+        return place
+
+    def _finish_place(self) -> None:
+        """Reports what the current place lacks."""
+        place, self._place = self._place, None
+        if place is None:
+            return
+        expected = self._listed(place)
+        if expected is None and not (place.torn_index and place.reasons):
+            expected = place.indexed
+        lost = None if expected is None else max(0, expected - place.got)
+        if not place.reasons:
+            if not lost:
+                return
+            place.reasons.append(f"its index lists {expected} messages, {place.got} are there")
+        elif lost is None and not place.cut and self._is_harmless(place):
+            lost = 0
+        self._report(
+            place.start, max(place.end, place.start) - place.start, "; ".join(place.reasons), lost
+        )
+
+    def _is_harmless(self, place: _Place) -> bool:
+        """Nothing but size fields was wrong, and the messages themselves were whole."""
+        return all(reason.startswith("the chunk's header says") for reason in place.reasons)
+
+    def _listed(self, place: _Place) -> int | None:
+        """Messages that the chunk list at the end of the bag has in a place."""
+        if not self._chunk_positions:
+            return None
+        first = bisect_left(self._chunk_positions, place.start)
+        stop = bisect_left(self._chunk_positions, max(place.end, place.start + 1))
+        if first == stop and 0 < self._index_pos <= place.start:
+            return place.got
+        return sum(self._chunk_counts[first:stop])
+
+    def _report(self, offset: int, length: int | None, reason: str, lost: int | None) -> None:
+        self.damage.append(Damage(self.path, offset, length, reason, lost))
+
+    def _report_undefined(self) -> None:
+        """Reports messages of connections that the bag does not define."""
+        if not self._undefined:
+            return
+        ids = sorted(self._undefined)
+        shown = ", ".join(str(conn) for conn in ids[:10]) + (", ..." if len(ids) > 10 else "")
+        self._report(
+            self._undefined_at or 0,
+            None,
+            f"messages of connections that the bag does not define (id {shown})",
+            self._undefined.total(),
+        )
+
+
+def _not_version_2(path: Path, magic: bytes) -> str:
+    if MAGIC.startswith(magic):
+        return (
+            f"{path}: the file ends after {len(magic)} bytes, before any message; "
+            "copy it again from where it was recorded"
+        )
+    if magic.startswith((b"#ROSBAG V", b"#ROSRECORD")):
+        version = magic.split(b"V", 1)[-1].strip().decode(errors="replace")
+        return (
+            f"{path}: a ROS bag of version {version}, only 2.0 can be read; "
+            "convert it with `rosbag fix` or `rosbag reindex` of ROS 1"
+        )
+    return f"{path}: no ROS 1 bag; it does not start with {MAGIC.decode().strip()!r}"
+
+
+# Compressed chunks.
+
+
+class _Decompressor(Protocol):
+    @property
+    def eof(self) -> bool: ...
+    @property
+    def needs_input(self) -> bool: ...
+    @property
+    def unused_data(self) -> bytes | None: ...
+    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+
+
+def _unpack_with(
+    make: Callable[[], _Decompressor], data: bytes, magic: bytes, size: int
+) -> _Unpacked:
+    """Unpacks the streams at the start of `data`, at most `MAX_CHUNK` bytes."""
+    parts: list[bytes] = []
+    total = 0
+    rest = data
+    step = min(max(size, 1 << 16), MAX_CHUNK) + 1
+    try:
+        while rest.startswith(magic):
+            stream = make()
+            while not stream.eof:
+                part = stream.decompress(rest, step)
+                parts.append(part)
+                total += len(part)
+                if total > MAX_CHUNK:
+                    reason = f"the chunk unpacks to more than {MAX_CHUNK >> 20} MiB"
+                    return _Unpacked(b"", len(data), "broken", reason)
+                if not stream.eof and (stream.needs_input or not part):
+                    return _Unpacked(b"".join(parts), len(data), "short")
+                rest = b""
+            rest = stream.unused_data or b""
+    except (OSError, EOFError, RuntimeError, ValueError) as error:
+        return _Unpacked(b"", len(data), "broken", f"the chunk cannot be unpacked: {error}")
+    if not parts and data:
+        if magic.startswith(data):
+            return _Unpacked(b"", len(data), "short")
+        return _Unpacked(b"", 0, "broken", "the chunk cannot be unpacked: it has another format")
+    return _Unpacked(b"".join(parts), len(data) - len(rest), "whole")
+
+
+def _unpack_bz2(data: bytes, size: int) -> _Unpacked:
+    return _unpack_with(bz2.BZ2Decompressor, data, b"BZh", size)
+
+
+def _unpack_lz4(data: bytes, size: int) -> _Unpacked:
+    return _unpack_with(lz4.frame.LZ4FrameDecompressor, data, b"\x04\x22\x4d\x18", size)
+
+
+_UNPACKERS: dict[bytes, Callable[[bytes, int], _Unpacked]] = {
+    b"bz2": _unpack_bz2,
+    b"lz4": _unpack_lz4,
+}

@@ -1,0 +1,105 @@
+"""`metadata.yaml` of ROS 2 bags: what the recorder says about the files beside it.
+
+Versions 1 to 9 are read alike: every key is optional, and what has the wrong type
+counts as missing. Nothing in it is believed where the files themselves can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import PureWindowsPath
+
+NAME = "metadata.yaml"
+
+MAX_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class BagMetadata:
+    """What is used of a bag's metadata.
+
+    Attributes:
+        files: Names of its files in order, without folders.
+        counts: Messages of each file, where the metadata says it.
+        message_count: Messages in all, None when unknown.
+        time_range: Log time `[start, end)`, ns, None when unknown.
+        packed_messages: Each payload is a zstd frame of its own.
+        ros_distro: Name of the ROS release, empty when unknown.
+    """
+
+    files: list[str] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    message_count: int | None = None
+    time_range: tuple[int, int] | None = None
+    packed_messages: bool = False
+    ros_distro: str = ""
+
+
+def parse_metadata(text: str) -> BagMetadata | None:
+    """Reads the metadata of a bag.
+
+    Returns:
+        What it says, or None when it is no YAML or not that of a bag.
+    """
+    # Hostile YAML may nest deeply; the safe loader makes nothing but plain values.
+    from ruamel.yaml import YAML  # noqa: PLC0415
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+
+    if len(text) > MAX_BYTES:
+        return None
+    try:
+        root: object = YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError, TypeError, RecursionError, OverflowError):
+        return None
+    bag = _mapping(root).get("rosbag2_bagfile_information")
+    if not isinstance(bag, Mapping):
+        return None
+    listed = _list(bag.get("files"))
+    counts: dict[str, int] = {}
+    for entry in map(_mapping, listed):
+        count = _count(entry.get("message_count"))
+        if isinstance(entry.get("path"), str) and count is not None:
+            counts[_name(str(entry["path"]))] = count
+    paths = [item for item in _list(bag.get("relative_file_paths")) if isinstance(item, str)]
+    files = [_name(item) for item in paths] or list(counts)
+    total = _count(bag.get("message_count"))
+    if len(files) == 1 and total is not None:
+        counts.setdefault(files[0], total)
+    mode = bag.get("compression_mode")
+    distro = bag.get("ros_distro")
+    return BagMetadata(
+        files=list(dict.fromkeys(name for name in files if name)),
+        counts=counts,
+        message_count=total,
+        time_range=_time_range(bag, total),
+        packed_messages=isinstance(mode, str) and mode.lower() == "message",
+        ros_distro=distro if isinstance(distro, str) else "",
+    )
+
+
+def _time_range(bag: Mapping[object, object], total: int | None) -> tuple[int, int] | None:
+    start = _count(_mapping(bag.get("starting_time")).get("nanoseconds_since_epoch"))
+    duration = _count(_mapping(bag.get("duration")).get("nanoseconds"))
+    if not total or start is None or duration is None or start + duration >= 2**63 - 1:
+        return None
+    return start, start + duration + 1
+
+
+def _mapping(value: object) -> Mapping[object, object]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _list(value: object) -> list[object]:
+    return value if isinstance(value, list) else []
+
+
+def _count(value: object) -> int | None:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**63:
+        return None
+    return value
+
+
+def _name(path: str) -> str:
+    """The last part of a path; early versions wrote the folder's name before it."""
+    return PureWindowsPath(path).name

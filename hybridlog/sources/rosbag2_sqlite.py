@@ -1,0 +1,401 @@
+"""One `.db3` file of a ROS 2 bag.
+
+SQLite reads it; this module asks in the order of row ids and, where the database is
+damaged, goes on behind the damage.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections import Counter
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from hybridlog.sources.base import (
+    BATCH_BYTES,
+    BATCH_MESSAGES,
+    MAX_CHUNK,
+    Damage,
+    Source,
+    cannot_open,
+)
+from hybridlog.sources.rosbag2_metadata import MAX_BYTES, parse_metadata
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Batch, Channel, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import Any
+
+    from rosbags.typesys.store import Typestore
+
+MAGIC = b"SQLite format 3\x00"
+
+# Without an index on time, counting reads the whole file: only small ones are counted.
+_COUNT_BYTES = 64 << 20
+
+_MAX_ROWID = 2**63 - 1
+
+
+class _Row(NamedTuple):
+    """Message as it comes out of the database."""
+
+    rowid: int
+    topic: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class SqliteSource(Source):
+    """A `.db3` file of rosbag2.
+
+    Attributes:
+        packed_messages: Each payload is a zstd frame of its own, as the bag says.
+
+    Raises:
+        SourceError: No such file, no ROS 2 bag, or a database that gives nothing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])
+        self.packed_messages = False
+        self._channel_of: dict[int, int] = {}
+        self._undefined: Counter[int] = Counter()
+        self._select = ""
+        self._got = 0
+        try:
+            with path.open("rb") as file:
+                magic = file.read(len(MAGIC))
+        except OSError as error:
+            raise cannot_open(path, error) from error
+        if magic != MAGIC:
+            raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
+        try:
+            self._db, log_unread = _connect(path)
+        except sqlite3.Error as error:
+            raise _unreadable(path, error) from error
+        if log_unread is not None:
+            reason = "its messages are left out: SQLite cannot read this write-ahead log here"
+            self.damage.append(Damage(log_unread, 0, None, reason, None))
+        try:
+            self._open()
+        except (sqlite3.Error, OverflowError) as error:
+            self.close()
+            raise _unreadable(path, error) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Closes the database."""
+        self._db.close()
+
+    # Opening.
+
+    def _open(self) -> None:
+        tables = self._tables()
+        messages = self._columns("messages") if "messages" in tables else set()
+        topics = self._columns("topics") if "topics" in tables else set()
+        if not {"topic_id", "data"} <= messages or not {"id", "name", "type"} <= topics:
+            raise SourceError(
+                f"{self.path}: an SQLite database, but no ROS 2 bag (it has no messages and "
+                "topics tables as rosbag2 writes them); give the .db3 file of a bag"
+            )
+        log_time = next((name for name in _LOG_TIMES if name in messages), None)
+        if log_time is None:
+            raise SourceError(f"{self.path}: its messages have no time; record it again")
+        has_publish_time = "send_timestamp" in messages
+        publish = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
+        self._select = (
+            f"SELECT rowid, CAST(topic_id AS INTEGER), ifnull(CAST({log_time} AS INTEGER), 0), "
+            f"{publish if has_publish_time else '0'}, ifnull(CAST(data AS BLOB), x'') "
+            "FROM messages WHERE rowid > ? ORDER BY rowid"
+        )
+        self._has_publish_time = has_publish_time
+        distro = self._read_metadata(tables)
+        self._read_topics(topics, tables, distro)
+        self._read_totals(tables, log_time)
+
+    def _tables(self) -> set[str]:
+        """Names of real tables: a view may cost anything to read."""
+        query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%'"
+        try:
+            rows = self._db.execute(query).fetchall()
+        except sqlite3.DatabaseError:
+            # A file that is shorter than its header says is refused unless this is set.
+            self._db.execute("PRAGMA writable_schema = ON")
+            rows = self._db.execute(query).fetchall()
+        return {name for (name,) in rows}
+
+    def _columns(self, table: str) -> set[str]:
+        return {row[1] for row in self._db.execute(f"PRAGMA table_info({table})")}
+
+    def _read_metadata(self, tables: set[str]) -> str:
+        """Reads the bag's own metadata where it has some; returns the ROS release."""
+        distro = ""
+        if "metadata" in tables:
+            query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
+            for (text,) in self._optional(query):
+                found = parse_metadata(text) if isinstance(text, str) else None
+                if found is not None and len(text) <= MAX_BYTES:
+                    self.packed_messages = found.packed_messages
+                    distro = found.ros_distro
+        if "schema" in tables:
+            for (name,) in self._optional("SELECT ros_distro FROM schema LIMIT 1"):
+                distro = str(name or distro)
+        return distro
+
+    def _read_topics(self, columns: set[str], tables: set[str], distro: str) -> None:
+        definitions: dict[str, tuple[str, bytes]] = {}
+        if "message_definitions" in tables:
+            query = (
+                "SELECT topic_type, encoding, CAST(encoded_message_definition AS BLOB) "
+                "FROM message_definitions"
+            )
+            for name, encoding, data in self._optional(query):
+                if data and encoding and str(encoding) != "unknown":
+                    definitions.setdefault(str(name), (str(encoding), data))
+        optional = [
+            name if name in columns else "''"
+            for name in ("serialization_format", "offered_qos_profiles", "type_description_hash")
+        ]
+        query = f"SELECT id, name, type, {', '.join(optional)} FROM topics ORDER BY id"  # noqa: S608
+        for number, name, kind, encoding, qos, type_hash in self._db.execute(query):
+            type_name = str(kind or "")
+            found = definitions.get(type_name)
+            if found is None:
+                found = known_definition(type_name, distro)
+            metadata = {}
+            if "offered_qos_profiles" in columns:
+                metadata["offered_qos_profiles"] = str(qos or "")
+            if type_hash:
+                metadata["topic_type_hash"] = str(type_hash)
+            self._channel_of[int(number)] = len(self.channels)
+            self.channels.append(
+                Channel(
+                    topic=str(name),
+                    message_encoding=str(encoding or ""),
+                    schema=Schema(type_name, *found),
+                    metadata=metadata,
+                    has_publish_time=self._has_publish_time,
+                )
+            )
+
+    def _read_totals(self, tables: set[str], log_time: str) -> None:
+        indexed = any(
+            row[0] == log_time
+            for name in self._indexes()
+            for row in self._optional("SELECT name FROM pragma_index_info(?) LIMIT 1", name)
+        )
+        if "messages" not in tables or (not indexed and self.size_bytes > _COUNT_BYTES):
+            return
+        rows = self._optional("SELECT count(*) FROM messages")
+        if not rows:
+            return
+        self.message_count = int(rows[0][0])
+        # Two questions: SQLite answers each from the end of the index.
+        first = self._optional(f"SELECT min({log_time}) FROM messages")  # noqa: S608
+        last = self._optional(f"SELECT max({log_time}) FROM messages")  # noqa: S608
+        if first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int):
+            self.time_range = (first[0][0], last[0][0] + 1)
+
+    def _indexes(self) -> list[str]:
+        return [row[1] for row in self._optional("PRAGMA index_list(messages)")]
+
+    def _optional(self, query: str, *values: str) -> list[tuple[Any, ...]]:
+        """Rows of a question whose answer is not needed: none when it fails."""
+        try:
+            return self._db.execute(query, values).fetchall()
+        except (sqlite3.Error, OverflowError):
+            return []
+
+    # Reading.
+
+    def batches(self) -> Iterator[Batch]:
+        """Yields all messages that SQLite gives, in the order of their row ids."""
+        after = -(2**63)
+        regions = 0
+        while True:
+            rows: list[_Row] = []
+            size = 0
+            problem = ""
+            try:
+                for row in self._db.execute(self._select, (after,)):
+                    if row[0] <= after:
+                        problem = "rows out of order"
+                        break
+                    rows.append(row)
+                    after = row[0]
+                    size += len(row[4])
+                    if size >= BATCH_BYTES or len(rows) >= BATCH_MESSAGES:
+                        yield from self._batch(rows, size)
+                        rows, size = [], 0
+            except (sqlite3.Error, OverflowError) as error:
+                problem = str(error)
+            yield from self._batch(rows, size)
+            if not problem:
+                break
+            regions += 1
+            found = self._next_sound(after) if regions <= _MAX_REGIONS else None
+            self._report_gap(after, found, problem)
+            if found is None:
+                break
+            after = found
+        self.bytes_read = self.size_bytes
+        self._report_undefined()
+
+    def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
+        if not rows:
+            return
+        self._got += len(rows)
+        self.bytes_read = min(self.bytes_read + size, self.size_bytes)
+        _, topics, log_times, publish_times, payloads = zip(*rows, strict=True)
+        length = np.fromiter(map(len, payloads), np.int64, len(rows))
+        log_time = np.array(log_times, np.int64)
+        channel = np.array([self._channel_of.get(topic, -1) for topic in topics], np.int32)
+        batch = Batch(
+            buffer=b"".join(payloads),
+            offset=np.cumsum(length) - length,
+            length=length,
+            channel=channel,
+            log_time=log_time,
+            publish_time=np.array(publish_times, np.int64) if self._has_publish_time else log_time,
+            sequence=np.zeros(len(rows), np.uint32),
+        )
+        if len(channel) and int(channel.min()) < 0:
+            self._undefined.update(topic for topic in topics if topic not in self._channel_of)
+            batch = batch.take(channel >= 0)
+        if len(batch):
+            yield batch
+
+    def _is_sound(self, after: int) -> bool:
+        """Whether the first row past `after` can be read, or there is none."""
+        try:
+            row = self._db.execute(f"{self._select} LIMIT 1", (after,)).fetchone()
+        except (sqlite3.Error, OverflowError):
+            return False
+        return row is None or row[0] > after
+
+    def _next_sound(self, after: int) -> int | None:
+        """Smallest id found past which rows can be read again, None when there is none."""
+        bad, step = max(after, 0), 1
+        while not self._is_sound(bad + step):
+            step *= 2
+            if bad + step > _MAX_ROWID:
+                return None
+        good = bad + step
+        bad += step // 2
+        while good - bad > 1:
+            middle = (good + bad) // 2
+            if self._is_sound(middle):
+                good = middle
+            else:
+                bad = middle
+        return good
+
+    def _report_gap(self, after: int, found: int | None, problem: str) -> None:
+        """Reports rows that SQLite does not give; row ids of rosbag2 have no gaps."""
+        first = max(after, 0) + 1
+        lost: int | None = None
+        if found is None:
+            if self.message_count is not None:
+                known = sum(damage.messages_lost or 0 for damage in self.damage)
+                lost = max(0, self.message_count - self._got - known)
+            where = f"rows from id {first} on"
+        else:
+            lost = found - first + 1
+            where = f"row {first}" if lost == 1 else f"rows {first} to {found}"
+        self.damage.append(
+            Damage(self.path, None, None, f"{where} cannot be read: SQLite says {problem}", lost)
+        )
+
+    def _report_undefined(self) -> None:
+        if self._undefined:
+            ids = ", ".join(str(number) for number in sorted(self._undefined)[:10])
+            reason = f"messages of topics that the bag does not list (topic id {ids})"
+            lost = self._undefined.total()
+            self.damage.append(Damage(self.path, None, None, reason, lost))
+
+
+_LOG_TIMES = ("timestamp", "recv_timestamp")
+_MAX_REGIONS = 4096
+
+
+def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
+    """Opens a database for reading only, without trusting what it says.
+
+    A database that a crashed recorder left with a write-ahead log is opened together
+    with it; all others as they stand, so that nothing is written beside them.
+
+    Returns:
+        The connection, and the write-ahead log when it could not be used.
+    """
+    unread: Path | None = None
+    uri = "file:" + quote(os.fsencode(path.absolute())) + "?mode=ro"
+    log = path.with_name(path.name + "-wal")
+    if log.is_file() and log.stat().st_size:
+        db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        try:
+            db.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
+        except sqlite3.Error:
+            db.close()
+            unread = log
+        else:
+            return _guarded(db), None
+    db = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
+    return _guarded(db), unread
+
+
+def _guarded(db: sqlite3.Connection) -> sqlite3.Connection:
+    db.text_factory = lambda data: data.decode(errors="replace")
+    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
+    db.execute("PRAGMA trusted_schema = OFF")
+    db.execute("PRAGMA cell_size_check = ON")
+    db.execute("PRAGMA query_only = ON")
+    return db
+
+
+def _unreadable(path: Path, error: Exception) -> SourceError:
+    return SourceError(
+        f"{path}: SQLite cannot read it ({error}); try to repair a copy with "
+        "`sqlite3 FILE .recover | sqlite3 NEW` and use that"
+    )
+
+
+@cache
+def _typestore(name: str) -> Typestore:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    return get_typestore(Stores(name))
+
+
+@lru_cache(maxsize=1024)
+def known_definition(type_name: str, distro: str = "") -> tuple[str, bytes]:
+    """Definition of a standard ROS 2 type, for bags that do not carry definitions.
+
+    Args:
+        type_name: As the bag spells it, with or without `/msg/`.
+        distro: ROS release that recorded the bag, empty when unknown.
+
+    Returns:
+        Schema encoding and definition, both empty when the type is not known.
+    """
+    from rosbags.typesys import Stores, TypesysError  # noqa: PLC0415
+
+    parts = type_name.split("/")
+    name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
+    stores = [Stores.ROS2_HUMBLE, Stores.LATEST]
+    recorded = Stores.__members__.get(f"ROS2_{distro.upper()}")
+    for store in dict.fromkeys([recorded, *stores] if recorded else stores):
+        try:
+            text, _ = _typestore(store.value).generate_msgdef(name, ros_version=2)
+        except (TypesysError, KeyError, ValueError):
+            continue
+        return "ros2msg", text.encode()
+    return "", b""

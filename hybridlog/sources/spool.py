@@ -1,0 +1,123 @@
+"""Files that are compressed as a whole, unpacked to where a reader can seek in them."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import zstandard
+
+from hybridlog.sources.base import cannot_open
+from hybridlog_storage.errors import SourceError
+
+if TYPE_CHECKING:
+    from typing import IO
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+_PIECE = 1 << 20
+_SPARE = 64 << 20
+# Frames that need more memory than this to unpack are refused (zstd's own `--long=27`).
+_MAX_WINDOW = 1 << 27
+
+
+@dataclass(slots=True)
+class Spooled:
+    """A file unpacked to a temporary one. Call `remove` once a reader has it open.
+
+    Attributes:
+        path: The temporary file.
+        problem: Why the content ends too early, None when it is whole.
+    """
+
+    path: Path
+    problem: str | None
+
+    def remove(self) -> None:
+        """Removes the temporary file's name; a reader that has it open keeps it."""
+        self.path.unlink(missing_ok=True)
+
+
+def peek(path: Path, count: int) -> bytes:
+    """The first bytes of what a zstd file unpacks to, fewer when it is damaged.
+
+    Raises:
+        SourceError: The file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(1 << 17)
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    try:
+        unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+        with unpacker.stream_reader(data) as reader:
+            return reader.read(count)
+    except zstandard.ZstdError:
+        return b""
+
+
+def spool(path: Path) -> Spooled:
+    """Unpacks a zstd file to a temporary file, as much of it as is sound.
+
+    Raises:
+        SourceError: It cannot be read, or there is no room for it.
+    """
+    folder = Path(tempfile.gettempdir())
+    room = shutil.disk_usage(folder).free - _SPARE
+    try:
+        source = path.open("rb")
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    with source:
+        packed = source.seek(0, 2)
+        source.seek(0)
+        size = zstandard.frame_content_size(source.read(32))
+        source.seek(0)
+        if size > room:
+            raise _no_room(path, folder, f"{size} bytes")
+        with tempfile.NamedTemporaryFile(prefix="hybridlog-", delete=False) as target:
+            spooled = Spooled(Path(target.name), None)
+            try:
+                spooled.problem = _unpack(source, target, room)
+            except BaseException as error:
+                spooled.remove()
+                if isinstance(error, OSError):
+                    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
+                        raise _no_room(path, folder, f"more than {packed} bytes") from error
+                    raise cannot_open(path, error) from error
+                raise
+    return spooled
+
+
+def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
+    """Copies what the frames of `source` hold; returns what is wrong with them."""
+    done = 0
+    data = source.read(_PIECE)
+    while data:
+        frame = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompressobj()
+        while not frame.eof:
+            if not data:
+                return f"the compressed file is cut short; it gives {done} bytes"
+            try:
+                part = frame.decompress(data)
+            except zstandard.ZstdError as error:
+                return f"the compressed file is damaged after {done} unpacked bytes: {error}"
+            done += len(part)
+            if done > room:
+                raise OSError(errno.ENOSPC, "no space left")
+            target.write(part)
+            data = frame.unused_data if frame.eof else source.read(_PIECE)
+        data = data or source.read(_PIECE)
+    return None
+
+
+def _no_room(path: Path, folder: Path, size: str) -> SourceError:
+    return SourceError(
+        f"{path}: unpacks to {size}, for which {folder} has no room; make room there, or set "
+        "TMPDIR to a folder that has it"
+    )

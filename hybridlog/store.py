@@ -1,0 +1,394 @@
+"""Opening a store: the one module that wires directory, database, segments and reader."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
+from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.errors import (
+    DatabaseError,
+    HybridlogError,
+    MissingDependencyError,
+    StoreError,
+    TopicError,
+)
+from hybridlog_storage.segment_reader import SegmentReader
+
+from hybridlog import maintenance
+from hybridlog.query.topics import resolve
+
+if TYPE_CHECKING:
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongod import EmbeddedMongod
+
+    from hybridlog.query.plan import Lane
+    from hybridlog.reader import Query
+    from hybridlog.recorder import RecordOptions, RecordReport
+    from hybridlog.segment_catalog import SegmentCatalog
+
+DEFAULT_STORE = "hybridlog-store"
+_MOST_OPEN_SEGMENTS = 256
+
+
+def store_path(path: str | Path | None = None) -> Path:
+    """Where the store is: the argument, else `HYBRIDLOG_STORE`, else `./hybridlog-store`."""
+    return Path(path or os.environ.get("HYBRIDLOG_STORE") or DEFAULT_STORE)
+
+
+def open_store(
+    path: str | Path | None = None,
+    *,
+    mongo: str | None = None,
+    create: bool = False,
+    require_database: bool = False,
+    progress: maintenance.Progress | None = None,
+) -> Store:
+    """Open a store; what a crash has left is mended first.
+
+    Args:
+        path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
+        mongo: URI of the MongoDB that holds the index; without, `HYBRIDLOG_MONGO_URI`,
+            the store's own setting, or the embedded MongoDB.
+        create: Make the store if there is none.
+        require_database: Fail when MongoDB is away, rather than read by time only.
+        progress: Called while an index is brought up to date.
+
+    Raises:
+        StoreError: there is no store there, or it is of a newer format.
+        DatabaseError: MongoDB does not answer and `require_database` is set.
+    """
+    where = store_path(path)
+    wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
+    directory = (
+        StoreDirectory.create(where, mongo=mongo) if create else StoreDirectory(where)
+    )
+    store = Store(directory)
+    try:
+        store.connect(wanted or directory.settings.mongo)
+        store.tended = maintenance.tend(directory, store.database_for("This"), progress)
+    except (DatabaseError, MissingDependencyError) as error:
+        if require_database:
+            store.close()
+            raise
+        store.disconnect()
+        store.without_database = error
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+class Store:
+    """A directory of recordings and the database that makes them answerable.
+
+    Use `hybridlog.open`; a store is a context manager. One store may be used by several
+    threads for reading.
+
+    Attributes:
+        directory: Where it lies.
+        database: The index; None while MongoDB is away.
+        without_database: Why it is away.
+        tended: What had to be mended when it was opened.
+    """
+
+    def __init__(self, directory: StoreDirectory) -> None:
+        self.directory = directory
+        self.database: Database | None = None
+        self.without_database: HybridlogError | None = None
+        self.tended = maintenance.Tended()
+        self._mongod: EmbeddedMongod | None = None
+        self._catalog: Catalog | SegmentCatalog | None = None
+        self._recordings: list[RecordingEntry] | None = None
+        self._lanes: dict[str, list[Lane]] = {}
+        self._segments: dict[tuple[str, int], SegmentReader] = {}
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Store:
+        """The store itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Store {self.directory.path}>"
+
+    # Connection.
+
+    def connect(self, uri: str | None) -> None:
+        """Connect to the MongoDB at a URI, or to the embedded one.
+
+        Raises:
+            DatabaseError: it does not answer, or holds the index of another store.
+        """
+        from hybridlog_storage.database import Database
+
+        if uri is None:
+            from hybridlog_storage.mongod import EmbeddedMongod
+
+            self._mongod = EmbeddedMongod(self.directory.mongod)
+            uri = self._mongod.start()
+        self.database = Database.connect(uri)
+        self._claim(self.database)
+        catalog = Catalog(self.database)
+        catalog.prepare()
+        self._catalog = catalog
+
+    def disconnect(self) -> None:
+        """Leave the database; what remains is reading by time."""
+        if self.database is not None:
+            self.database.close()
+        self.database = None
+        self._catalog = None
+        if self._mongod is not None:
+            self._mongod.stop()
+        self._mongod = None
+
+    def close(self) -> None:
+        """Give everything back. May be called more than once."""
+        with self._lock:
+            for reader in self._segments.values():
+                reader.close()
+            self._segments.clear()
+        self.disconnect()
+
+    def database_for(self, purpose: str) -> Database:
+        """The database.
+
+        Raises:
+            DatabaseError: it is away; says what it was needed for and why it is away.
+        """
+        if self.database is None:
+            raise DatabaseError(f"{purpose} needs MongoDB. {self.without_database or ''}".strip())
+        return self.database
+
+    @property
+    def catalog(self) -> Catalog | SegmentCatalog:
+        """The catalog, out of MongoDB, or out of the segments while that is away."""
+        if self._catalog is None:
+            from hybridlog.segment_catalog import SegmentCatalog
+
+            self._catalog = SegmentCatalog(self.directory)
+        return self._catalog
+
+    # What is in it.
+
+    def recordings(self) -> list[RecordingEntry]:
+        """All recordings, oldest first."""
+        if self._recordings is None:
+            self._recordings = self.catalog.recordings()
+        return self._recordings
+
+    def refresh(self) -> None:
+        """Forget what was read of the catalog."""
+        self._recordings = None
+        self._lanes.clear()
+
+    def select(self, names: Sequence[str]) -> list[RecordingEntry]:
+        """Recordings by id, by name, or by the beginning of an id when it is unambiguous.
+
+        Raises:
+            TopicError: there is no such recording, or there are several.
+        """
+        everything = self.recordings()
+        chosen: list[RecordingEntry] = []
+        for name in names:
+            found = (
+                [r for r in everything if r.id == name]
+                or [r for r in everything if r.name == name]
+                or [r for r in everything if r.id.startswith(name)]
+            )
+            if len(found) != 1:
+                candidates = ", ".join(r.id for r in (found or everything)[:10]) or "none"
+                problem = "is ambiguous" if found else "is not in the store"
+                raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
+            if found[0] not in chosen:
+                chosen.append(found[0])
+        return chosen
+
+    def topics(self) -> list[str]:
+        """Names of all topics, sorted."""
+        return sorted({c.topic for r in self.recordings() for c in r.channels})
+
+    def lanes(self, recording: RecordingEntry) -> list[Lane]:
+        """The channels of a recording, with what reads them."""
+        from hybridlog_storage.messages import Channel
+
+        from hybridlog.query.plan import Lane
+        from hybridlog.schema.codec import codec_for
+
+        lanes = self._lanes.get(recording.id)
+        if lanes is None:
+            channels: dict[int, Channel]
+            if self.database is None:
+                from hybridlog.segment_catalog import channels_of_recording
+
+                channels = channels_of_recording(self.directory, recording.id)
+            else:
+                schemas = Catalog(self.database).schemas(
+                    {c.schema for c in recording.channels if c.schema is not None}
+                )
+                channels = {
+                    c.id: Channel(
+                        c.topic,
+                        c.message_encoding,
+                        schemas[c.schema] if c.schema is not None else None,
+                        c.metadata,
+                        has_publish_time=c.has_publish_time,
+                    )
+                    for c in recording.channels
+                }
+            lanes = [Lane(recording, i, c, codec_for(c)) for i, c in sorted(channels.items())]
+            self._lanes[recording.id] = lanes
+        return lanes
+
+    # Asking.
+
+    def topic(self, *names: str) -> Query:
+        """A question about one topic or several.
+
+        Args:
+            names: Full names, short ones that are unambiguous (`scan`), globs, or
+                `re:` and a regular expression.
+
+        Raises:
+            TopicError: a name fits nothing, or several topics; lists the candidates.
+        """
+        if not names:
+            raise TopicError("Which topic? " + _listed(self.topics()))
+        return self.query(resolve(names, self.topics()))
+
+    def all_topics(self) -> Query:
+        """A question about everything."""
+        return self.query(self.topics())
+
+    def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
+        """A question about topics by their full names, in some recordings or all."""
+        from hybridlog.reader import Query
+
+        wanted = set(topics)
+        chosen = tuple(
+            r.id
+            for r in self.recordings()
+            if (recordings is None or r.id in recordings)
+            and any(c.topic in wanted for c in r.channels)
+        )
+        if wanted and not chosen:
+            raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
+        return Query(self, tuple(topics), chosen)
+
+    def chunks(
+        self,
+        recording: str,
+        channels: Sequence[int],
+        bounds: tuple[int, int] | None,
+        clock: str,
+    ) -> list[ChunkEntry]:
+        """Chunks that may hold messages of some channels in a time range."""
+        return self.catalog.chunks(recording, channels, bounds, clock)
+
+    def segment(self, recording: str, number: int) -> SegmentReader:
+        """The reader of a sealed segment, kept open. Thread safe."""
+        key = (recording, number)
+        with self._lock:
+            reader = self._segments.get(key)
+            if reader is None:
+                if len(self._segments) >= _MOST_OPEN_SEGMENTS:
+                    self._segments.pop(next(iter(self._segments))).close()
+                path = self.directory.recording(recording) / f"{number:06d}.mcap"
+                reader = self._segments[key] = SegmentReader(path, number)
+            return reader
+
+    # Changing.
+
+    def record(
+        self,
+        path: str | Path,
+        options: RecordOptions | None = None,
+        progress: Callable[[int, int], None] | None = None,
+        **choices: Any,  # noqa: ANN401 - the fields of RecordOptions
+    ) -> RecordReport:
+        """Record a ROS 1 bag, a ROS 2 bag or an MCAP file.
+
+        Args:
+            path: The log.
+            options: What and how.
+            progress: Called with bytes read and messages stored.
+            choices: Fields of `RecordOptions`, instead of it.
+
+        Raises:
+            SourceError: nothing could be read.
+            AlreadyRecordedError: its content is in the store already.
+        """
+        from hybridlog.recorder import RecordOptions, record
+        from hybridlog.sources.detect import open_source
+        from hybridlog.sources.fingerprint import fingerprint
+
+        with open_source(Path(path)) as source:
+            report = record(
+                source,
+                self.directory,
+                self.database_for("Recording a log"),
+                fingerprint(source.files),
+                options or RecordOptions(**choices),
+                progress,
+            )
+        self.refresh()
+        return report
+
+    def reindex(self, progress: maintenance.Progress | None = None) -> list[RecordingEntry]:
+        """Drop the index and make it again from the segments."""
+        found = maintenance.reindex(self.directory, self.database_for("reindex"), progress)
+        self.refresh()
+        return found
+
+    def verify(
+        self,
+        recordings: Sequence[str] | None = None,
+        progress: maintenance.Progress | None = None,
+    ) -> maintenance.Verification:
+        """Read everything, check checksums, compare the index with the segments."""
+        chosen = (
+            self.directory.recording_ids()
+            if recordings is None
+            else [r.id for r in self.select(recordings)]
+        )
+        return maintenance.verify(
+            self.directory, self.database_for("verify"), chosen, progress
+        )
+
+    def remove(self, recording: str) -> None:
+        """Delete a recording: first from the catalog, then its files."""
+        entry = self.select([recording])[0]
+        database = self.database_for("Removing a recording")
+        Catalog(database).remove_recording(
+            entry.id, {maintenance.collection_of(c.topic) for c in entry.channels}
+        )
+        with self._lock:
+            for key in [k for k in self._segments if k[0] == entry.id]:
+                self._segments.pop(key).close()
+        self.directory.remove_recording(entry.id)
+        self.refresh()
+
+    def _claim(self, database: Database) -> None:
+        """Make sure that the database is this store's, and nobody else's."""
+        mine = self.directory.settings.store_id
+        mark = database.find_one(maintenance.STORE_MARK, {"_id": "store"})
+        if mark is None:
+            database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
+        elif mark.get("id") != mine:
+            raise StoreError(
+                f"The database {database.name!r} at {database.address} holds the index of "
+                "another store. Name a database of its own in the URI: mongodb://host/NAME."
+            )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return "There are: " + ", ".join(names[:20]) if names else "The store is empty."

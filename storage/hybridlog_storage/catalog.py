@@ -1,0 +1,292 @@
+"""The catalog: which recordings, segments, chunks and schemas exist.
+
+Everything in it can be read again from the segments; `reindex` does. A chunk's entry is
+written after its index documents, so a chunk that has an entry is indexed, and what a
+crash left out is found by comparing entries with the segment's own list of chunks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final, cast
+
+from hybridlog_storage.database import Database
+from hybridlog_storage.messages import Channel, Schema
+
+RECORDINGS: Final = "hybridlog.recordings"
+SCHEMAS: Final = "hybridlog.schemas"
+CHUNKS: Final = "hybridlog.chunks"
+LOSSES: Final = "hybridlog.losses"
+
+
+@dataclass(slots=True)
+class ChannelStats:
+    """What is known of the messages of one channel, in a chunk or in a recording.
+
+    Times are nanoseconds; `first` and `last` are both inclusive; None without messages
+    or, for stamps, without a header. Skew is log time minus header stamp.
+    """
+
+    messages: int = 0
+    payload_bytes: int = 0
+    unreadable: int = 0
+    first: int | None = None
+    last: int | None = None
+    first_publish: int | None = None
+    last_publish: int | None = None
+    first_stamp: int | None = None
+    last_stamp: int | None = None
+    stamped: int = 0
+    skew_sum: float = 0.0
+    skew_min: int | None = None
+    skew_max: int | None = None
+
+    def add(self, other: ChannelStats) -> None:
+        """Take in the messages of another part of the channel."""
+        for name in ("messages", "payload_bytes", "unreadable", "stamped", "skew_sum"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in ("first", "first_publish", "first_stamp", "skew_min"):
+            setattr(self, name, _least(getattr(self, name), getattr(other, name)))
+        for name in ("last", "last_publish", "last_stamp", "skew_max"):
+            setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
+
+
+@dataclass(slots=True)
+class ChannelEntry:
+    """One channel of a recording."""
+
+    id: int
+    topic: str
+    message_encoding: str
+    schema: str | None
+    type: str
+    metadata: dict[str, str]
+    has_publish_time: bool
+    reason: str | None
+    """Why its fields are not in the index, None when they are."""
+    stats: ChannelStats = field(default_factory=ChannelStats)
+
+
+@dataclass(slots=True)
+class RecordingEntry:
+    """One recording.
+
+    Attributes:
+        id: Name of its directory, unique in the store.
+        key: Number of the recording, 32 bits, unique in the store.
+        name: As the user calls it.
+        tags: As the user gave them.
+        source: Where it came from: path, kind, profile, bytes, fingerprint.
+        created: When it was recorded, ns.
+        status: `open`, `complete`, `damaged` (the source was), `recovered` (from a crash).
+        end: How it ended: losses, damage.
+        channels: Its channels.
+        stored_bytes: Size of its segments.
+        segments: Number of segments.
+        chunks: Number of chunks.
+    """
+
+    id: str
+    key: int
+    name: str
+    tags: dict[str, str]
+    source: dict[str, Any]
+    created: int
+    status: str
+    end: dict[str, Any] = field(default_factory=dict)
+    channels: list[ChannelEntry] = field(default_factory=list)
+    stored_bytes: int = 0
+    segments: int = 0
+    chunks: int = 0
+
+    @property
+    def messages(self) -> int:
+        """Messages in all channels."""
+        return sum(c.stats.messages for c in self.channels)
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Log time `[first, last]`, ns, both inclusive; None without messages."""
+        firsts = [c.stats.first for c in self.channels if c.stats.first is not None]
+        lasts = [c.stats.last for c in self.channels if c.stats.last is not None]
+        return (min(firsts), max(lasts)) if firsts else None
+
+    def to_document(self) -> dict[str, Any]:
+        """As it stands in MongoDB."""
+        document = asdict(self)
+        document["_id"] = document.pop("id")
+        return document
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
+        """From MongoDB."""
+        values = dict(document)
+        values["id"] = values.pop("_id")
+        values["channels"] = [
+            ChannelEntry(**{**c, "stats": ChannelStats(**c["stats"])}) for c in values["channels"]
+        ]
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkEntry:
+    """One chunk: where it lies and what is in it, by channel id."""
+
+    recording: str
+    segment: int
+    offset: int
+    length: int
+    trailer: int
+    first: int
+    last: int
+    stats: dict[int, ChannelStats]
+
+
+class Catalog:
+    """The catalog collections of a database."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def prepare(self) -> None:
+        """Make the indexes that questions to the catalog need."""
+        self._db.create_index(CHUNKS, [("rec", 1), ("ch.c", 1), ("first", 1)])
+
+    def put_recording(self, entry: RecordingEntry) -> None:
+        """Write or replace a recording."""
+        self._db.replace(RECORDINGS, {"_id": entry.id}, entry.to_document())
+
+    def recordings(self) -> list[RecordingEntry]:
+        """All recordings, oldest log time first, empty ones last."""
+        found = [RecordingEntry.from_document(d) for d in self._db.find(RECORDINGS, {})]
+        return sorted(found, key=lambda r: (r.span is None, r.span or (0, 0), r.id))
+
+    def put_schema(self, schema: Schema) -> str:
+        """Keep a schema; returns its hash, which is its key."""
+        digest = schema_hash(schema)
+        self._db.replace(
+            SCHEMAS,
+            {"_id": digest},
+            {"_id": digest, "name": schema.name, "encoding": schema.encoding, "data": schema.data},
+        )
+        return digest
+
+    def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
+        """Schemas by hash."""
+        return {
+            d["_id"]: Schema(d["name"], d["encoding"], bytes(d["data"]))
+            for d in self._db.find(SCHEMAS, {"_id": {"$in": list(hashes)}})
+        }
+
+    def put_chunk(self, chunk: ChunkEntry) -> None:
+        """Note that a chunk is in its segment and its messages are in the index."""
+        key = {"rec": chunk.recording, "seg": chunk.segment, "off": chunk.offset}
+        self._db.replace(
+            CHUNKS,
+            {"_id": key},
+            {
+                "_id": key,
+                "rec": chunk.recording,
+                "seg": chunk.segment,
+                "len": chunk.length,
+                "trailer": chunk.trailer,
+                "first": chunk.first,
+                "last": chunk.last,
+                "ch": [{"c": c, **asdict(stats)} for c, stats in sorted(chunk.stats.items())],
+            },
+        )
+
+    def chunks(
+        self,
+        recording: str,
+        channels: Sequence[int] | None = None,
+        bounds: tuple[int, int] | None = None,
+        clock: str = "log",
+    ) -> list[ChunkEntry]:
+        """Chunks of a recording that may hold messages of some channels in a time range.
+
+        Args:
+            recording: Its id.
+            channels: Channel ids, None for all.
+            bounds: `[begin, end)`, ns, None for all times.
+            clock: `log`, `publish` or `header`: which time `bounds` is about.
+        """
+        query: dict[str, Any] = {"rec": recording}
+        of_channel: dict[str, Any] = {}
+        if channels is not None:
+            of_channel["c"] = {"$in": list(channels)}
+        if bounds is not None:
+            suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
+            of_channel[f"first{suffix}"] = {"$lt": bounds[1]}
+            of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
+        if of_channel:
+            query["ch"] = {"$elemMatch": of_channel}
+        return [_chunk_entry(d) for d in self._db.find(CHUNKS, query)]
+
+    def forget_chunk_entries(self, recording: str) -> None:
+        """Remove the chunk entries of a recording."""
+        self._db.delete(CHUNKS, {"rec": recording})
+
+    def remove_recording(self, recording: str, collections: Iterable[str]) -> None:
+        """Remove every trace of a recording from the database."""
+        for collection in collections:
+            self._db.delete(collection, {"_meta.rec": recording})
+        self._db.delete(CHUNKS, {"rec": recording})
+        self._db.delete(LOSSES, {"rec": recording})
+        self._db.delete(RECORDINGS, {"_id": recording})
+
+    def put_losses(self, recording: str, losses: Sequence[Mapping[str, object]]) -> None:
+        """Replace the loss ledger of a recording."""
+        self._db.delete(LOSSES, {"rec": recording})
+        for number, loss in enumerate(losses):
+            key = {"rec": recording, "n": number}
+            self._db.replace(LOSSES, {"_id": key}, {"_id": key, "rec": recording, **loss})
+
+
+def schema_hash(schema: Schema) -> str:
+    """SHA-256 of name, encoding and definition, as hex digits."""
+    digest = hashlib.sha256()
+    for part in (schema.name.encode(), schema.encoding.encode(), bytes(schema.data)):
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.hexdigest()
+
+
+def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> ChannelEntry:
+    """The catalog entry of a channel, without messages yet."""
+    return ChannelEntry(
+        id=channel_id,
+        topic=channel.topic,
+        message_encoding=channel.message_encoding,
+        schema=schema_hash(channel.schema) if channel.schema is not None else None,
+        type=channel.schema.name if channel.schema is not None else "",
+        metadata=dict(channel.metadata),
+        has_publish_time=channel.has_publish_time,
+        reason=reason,
+    )
+
+
+def _chunk_entry(document: Mapping[str, Any]) -> ChunkEntry:
+    stats = {}
+    for item in document["ch"]:
+        values = dict(item)
+        stats[cast(int, values.pop("c"))] = ChannelStats(**values)
+    return ChunkEntry(
+        document["rec"],
+        document["seg"],
+        document["_id"]["off"],
+        document["len"],
+        document["trailer"],
+        document["first"],
+        document["last"],
+        stats,
+    )
+
+
+def _least(a: int | None, b: int | None) -> int | None:
+    return b if a is None else a if b is None else min(a, b)
+
+
+def _greatest(a: int | None, b: int | None) -> int | None:
+    return b if a is None else a if b is None else max(a, b)

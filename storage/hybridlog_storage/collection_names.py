@@ -1,0 +1,37 @@
+"""From topics to names of MongoDB collections, one to one.
+
+The plain rule (drop the leading slash, `/` becomes `__`) maps several topics to one
+name: `/a/b`, `/a__b` and `a/b` meet. It is used for canonical names only, where it can
+be undone; every other topic gets a name with a part of its hash in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from functools import lru_cache
+
+CATALOG_PREFIX = "hybridlog."
+"""Catalog collections start with this; no topic's collection has a dot in its name."""
+
+_CANONICAL = re.compile(r"(?:/[A-Za-z0-9]+(?:_[A-Za-z0-9]+)*)+")
+_ODD = re.compile(r"[^A-Za-z0-9_]")
+_LONGEST = 120  # a MongoDB namespace (database.collection) has at most 255 bytes
+
+
+@lru_cache(maxsize=4096)
+def collection_of(topic: str) -> str:
+    """The collection that holds the index documents of a topic.
+
+    Args:
+        topic: Any string at all.
+
+    Returns:
+        `r_gripper_controller__command` for `/r_gripper_controller/command`; for a
+        topic that is no canonical ROS name, a readable form, `~` and eight hex digits.
+    """
+    if _CANONICAL.fullmatch(topic) and len(topic) <= _LONGEST:
+        return topic[1:].replace("/", "__")
+    digest = hashlib.sha256(topic.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    readable = _ODD.sub("_", topic.removeprefix("/").replace("/", "__"))[:100]
+    return f"{readable}~{digest}"

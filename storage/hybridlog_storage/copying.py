@@ -1,0 +1,67 @@
+"""Moving many payloads at once from one buffer to another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog_storage.messages import Batch, Buffer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_SLICE_FROM = 2048  # mean payload bytes from which one slice copy a message is cheapest
+
+
+def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
+    """Every run of `width` bytes of a buffer, by the offset at which it starts."""
+    return np.ndarray(
+        (max(len(buffer) - width + 1, 0),), dtype=f"V{width}", buffer=buffer, strides=(1,)
+    )
+
+
+def copy_payloads(batch: Batch, target: bytearray, starts: NDArray[np.int64]) -> None:
+    """Copy each payload of a batch to its place in a buffer that is large enough."""
+    if batch.payload_bytes >= _SLICE_FROM * len(batch):
+        source = memoryview(batch.buffer)
+        view = memoryview(target)
+        for to, at, size in zip(
+            starts.tolist(), batch.offset.tolist(), batch.length.tolist(), strict=True
+        ):
+            view[to : to + size] = source[at : at + size]
+        return
+    lengths = np.unique(batch.length)
+    for length in lengths[lengths > 0].tolist():
+        rows = slice(None) if len(lengths) == 1 else batch.length == length
+        places = windows(target, length)
+        places[starts[rows]] = windows(batch.buffer, length)[batch.offset[rows]]
+
+
+def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
+    """The messages of several batches in another order, over one new buffer.
+
+    Args:
+        batches: At least one.
+        order: intp[n], row i of the result is row `order[i]` of the batches put together.
+    """
+    length = np.concatenate([b.length for b in batches])[order]
+    ends = np.cumsum(length)
+    offset = ends - length
+    target = bytearray(int(ends[-1]) if len(ends) else 0)
+    place = np.empty(len(order), np.int64)
+    place[order] = offset
+    at = 0
+    for batch in batches:
+        copy_payloads(batch, target, place[at : at + len(batch)])
+        at += len(batch)
+    return Batch(
+        target,
+        offset,
+        length,
+        np.concatenate([b.channel for b in batches])[order],
+        np.concatenate([b.log_time for b in batches])[order],
+        np.concatenate([b.publish_time for b in batches])[order],
+        np.concatenate([b.sequence for b in batches])[order],
+    )

@@ -1,0 +1,156 @@
+"""Index documents as bytes: what stands around the fields of a message.
+
+A document is `_id`, the message's fields, and `_meta` (see the design note "The hybrid
+store"). The fields come ready made as BSON elements; here thousands of documents are
+put together at once: a template row is tiled, and each value that differs is a column.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog_storage.segment_writer import StoredChunk
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+KEY_BYTES: Final = 20
+_HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
+_KEY_AT: Final = _HEAD_WIDTH - KEY_BYTES
+_MAX_TIME: Final = (1 << 63) - 1
+
+
+def key_bound(log_time: int) -> bytes:
+    """The smallest key (`_id`) of any message at or after a log time in nanoseconds."""
+    return struct.pack(">QIQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What all documents of one channel of one recording share.
+
+    Attributes:
+        recording: Recording id.
+        key: Number of the recording, 32 bits, unique in the store.
+        topic: As the source spells it.
+        has_publish_time: Whether `_meta.pub` is written.
+    """
+
+    recording: str
+    key: int
+    topic: str
+    has_publish_time: bool
+
+
+class DocumentAssembler:
+    """Puts together the index documents of one channel."""
+
+    def __init__(self, origin: Origin) -> None:
+        self._origin = origin
+        self._tails: dict[str | None, _Tail] = {}
+
+    def assemble(
+        self,
+        chunk: StoredChunk,
+        rows: NDArray[np.intp],
+        body: NDArray[np.uint8],
+        error: str | None = None,
+    ) -> NDArray[np.uint8]:
+        """Documents of some messages of a chunk.
+
+        Args:
+            chunk: Where the messages lie.
+            rows: intp[k], which of the chunk's messages.
+            body: uint8[k, w], BSON elements of each message's fields.
+            error: Why there are no fields, for `_meta.error`.
+
+        Returns:
+            uint8[k, width]: one whole BSON document a row.
+        """
+        tail = self._tails.get(error)
+        if tail is None:
+            if len(self._tails) > 256:
+                self._tails.clear()
+            tail = self._tails[error] = _Tail(self._origin, error)
+        count, fields = body.shape
+        width = _HEAD_WIDTH + fields + len(tail.template)
+        out = np.empty((count, width), np.uint8)
+        head = struct.pack("<i", width) + b"\x05_id\x00" + struct.pack("<iB", KEY_BYTES, 0)
+        out[:, :_KEY_AT] = np.frombuffer(head, np.uint8)
+        batch = chunk.batch
+        log_time = batch.log_time[rows]
+        seq = chunk.seq[rows]
+        _column(out, _KEY_AT, ">i8")[:] = log_time
+        _column(out, _KEY_AT + 8, ">u4")[:] = self._origin.key
+        _column(out, _KEY_AT + 12, ">i8")[:] = seq
+        out[:, _HEAD_WIDTH : _HEAD_WIDTH + fields] = body
+        start = _HEAD_WIDTH + fields
+        out[:, start:] = tail.template
+        at = tail.at
+        _column(out, start + at["inserted_at"], "<i8")[:] = log_time // 1_000_000
+        _column(out, start + at["t"], "<i8")[:] = log_time
+        if "pub" in at:
+            _column(out, start + at["pub"], "<i8")[:] = batch.publish_time[rows]
+        _column(out, start + at["seq"], "<i8")[:] = seq
+        _column(out, start + at["seg"], "<i4")[:] = chunk.segment
+        _column(out, start + at["chunk"], "<i8")[:] = chunk.offset
+        _column(out, start + at["off"], "<i8")[:] = batch.offset[rows]
+        _column(out, start + at["len"], "<i8")[:] = batch.length[rows]
+        return out
+
+
+class _Tail:
+    """The `_meta` element and the document's end, and where its values stand in it."""
+
+    def __init__(self, origin: Origin, error: str | None) -> None:
+        self.at: dict[str, int] = {}
+        body = bytearray()
+
+        def number(name: str, kind: int, size: int) -> None:
+            body.extend(bytes([kind]) + name.encode() + b"\x00")
+            self.at[name] = len(body)
+            body.extend(bytes(size))
+
+        def text(name: str, value: str) -> None:
+            data = value.encode("utf-8", "replace")
+            body.extend(b"\x02" + name.encode() + b"\x00")
+            body.extend(struct.pack("<i", len(data) + 1) + data + b"\x00")
+
+        def document(name: str) -> int:
+            body.extend(b"\x03" + name.encode() + b"\x00")
+            start = len(body)
+            body.extend(bytes(4))
+            return start
+
+        def end(start: int) -> None:
+            body.append(0)
+            struct.pack_into("<i", body, start, len(body) - start)
+
+        meta = document("_meta")
+        number("inserted_at", 0x09, 8)
+        number("t", 0x12, 8)
+        if origin.has_publish_time:
+            number("pub", 0x12, 8)
+        text("rec", origin.recording)
+        text("topic", origin.topic)
+        number("seq", 0x12, 8)
+        ref = document("ref")
+        number("seg", 0x10, 4)
+        number("chunk", 0x12, 8)
+        number("off", 0x12, 8)
+        number("len", 0x12, 8)
+        end(ref)
+        if error is not None:
+            text("error", error[:1000])
+        end(meta)
+        body.append(0)
+        self.template = np.frombuffer(bytes(body), np.uint8)
+
+
+def _column(out: NDArray[np.uint8], offset: int, dtype: str) -> NDArray[np.int64]:
+    """One value a row, at a fixed place of the row."""
+    return np.ndarray((len(out),), dtype, buffer=out, offset=offset, strides=(out.shape[1],))

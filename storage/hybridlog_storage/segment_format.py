@@ -1,0 +1,199 @@
+"""What a segment is made of: the parts of MCAP we write, and the one record we add.
+
+Pure functions from values to bytes and back. Rare records are built with the classes
+of the `mcap` package; the records written once a chunk are packed here, so that a
+payload is copied once on its way to the disk.
+
+Names in channel metadata and metadata records that start with `hybridlog.` are ours.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import McapRecord, Metadata
+from mcap.records import Schema as SchemaRecord
+
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import Buffer, Channel, Schema
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+PROFILE: Final = "hybridlog"
+LIBRARY: Final = "hybridlog"
+FORMAT_VERSION: Final = 1
+
+RECORDING_METADATA: Final = "hybridlog.recording"
+END_METADATA: Final = "hybridlog.end"
+NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
+
+ARRIVAL_OPCODE: Final = 0x90
+"""Record of the application range of opcodes: arrival numbers of a chunk's messages."""
+
+RECORD_HEAD: Final = struct.Struct("<BQ")
+CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
+INDEX_HEAD: Final = struct.Struct("<BQHI")
+ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
+
+MESSAGE_HEAD: Final = np.dtype(
+    {
+        "names": ["opcode", "size", "channel", "sequence", "log_time", "publish_time"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 11, 15, 23],
+        "itemsize": 31,
+    }
+)
+"""Everything of a message record that stands before its payload."""
+
+_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_MAX_ARRIVALS = 1 << 27
+
+
+def record_bytes(record: McapRecord) -> bytes:
+    """One record of the `mcap` package as bytes."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def schema_record(schema_id: int, schema: Schema) -> SchemaRecord:
+    """The MCAP record of a schema."""
+    return SchemaRecord(
+        id=schema_id, name=schema.name, encoding=schema.encoding, data=bytes(schema.data)
+    )
+
+
+def channel_record(channel_id: int, schema_id: int, channel: Channel) -> ChannelRecord:
+    """The MCAP record of a channel, with what MCAP cannot say in our metadata keys."""
+    metadata = dict(channel.metadata)
+    metadata.pop(NO_PUBLISH_TIME, None)
+    if not channel.has_publish_time:
+        metadata[NO_PUBLISH_TIME] = "1"
+    return ChannelRecord(
+        id=channel_id,
+        topic=channel.topic,
+        message_encoding=channel.message_encoding,
+        schema_id=schema_id,
+        metadata=metadata,
+    )
+
+
+def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Channel:
+    """The channel that a record of one of our segments describes.
+
+    Raises:
+        SegmentError: its schema was never defined.
+    """
+    schema: Schema | None = None
+    if record.schema_id:
+        found = schemas.get(record.schema_id)
+        if found is None:
+            raise SegmentError(f"channel {record.id} refers to schema {record.schema_id}: unknown")
+        schema = Schema(found.name, found.encoding, bytes(found.data))
+    metadata = dict(record.metadata)
+    unknown = metadata.pop(NO_PUBLISH_TIME, None)
+    return Channel(
+        record.topic, record.message_encoding, schema, metadata, has_publish_time=unknown is None
+    )
+
+
+def json_metadata(name: str, value: object) -> Metadata:
+    """A metadata record that carries one JSON value."""
+    text = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
+    return Metadata(name=name, metadata={"json": text})
+
+
+def json_of(record: Metadata) -> dict[str, object]:
+    """The value of a metadata record made by `json_metadata`.
+
+    Raises:
+        SegmentError: it is not one.
+    """
+    try:
+        value = json.loads(record.metadata["json"])
+    except (KeyError, ValueError) as error:
+        raise SegmentError(f"metadata record {record.name!r} cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise SegmentError(f"metadata record {record.name!r} is no JSON object")
+    return value
+
+
+def chunk_head(
+    *,
+    first: int,
+    last: int,
+    uncompressed_size: int,
+    crc: int,
+    compression: str,
+    compressed_size: int,
+) -> bytes:
+    """All of a chunk record that stands before the compressed data."""
+    name = compression.encode()
+    body = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + compressed_size
+    return b"".join(
+        (
+            CHUNK_HEAD.pack(Opcode.CHUNK, body, first, last, uncompressed_size, crc),
+            struct.pack("<I", len(name)),
+            name,
+            struct.pack("<Q", compressed_size),
+        )
+    )
+
+
+def message_indexes(
+    channel: NDArray[np.int32],
+    log_time: NDArray[np.int64],
+    record_offset: NDArray[np.int64],
+) -> dict[int, bytes]:
+    """Message index record of each channel in a chunk, by channel id."""
+    order = np.lexsort((log_time, channel))
+    channels = channel[order]
+    entries = np.empty(len(order), _INDEX_ENTRY)
+    entries["log_time"] = log_time[order]
+    entries["offset"] = record_offset[order]
+    starts = np.flatnonzero(np.diff(channels, prefix=-1)).tolist()
+    records: dict[int, bytes] = {}
+    for start, end in zip(starts, [*starts[1:], len(channels)], strict=True):
+        data = entries[start:end].tobytes()
+        head = INDEX_HEAD.pack(
+            Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data)
+        )
+        records[int(channels[start])] = head + data
+    return records
+
+
+def arrival_record(chunk_offset: int, seq: NDArray[np.int64]) -> bytes:
+    """The record that keeps the arrival numbers of a chunk's messages, in chunk order."""
+    deltas = np.diff(seq, prefix=0).astype("<i8")
+    packed = zstandard.ZstdCompressor(level=1).compress(deltas.tobytes())
+    return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, 8 + len(packed), chunk_offset) + packed
+
+
+def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
+    """Chunk offset and arrival numbers from the body of an arrival record.
+
+    Raises:
+        SegmentError: the record is damaged or does not hold `count` numbers.
+    """
+    if len(body) < 8 or count > _MAX_ARRIVALS:
+        raise SegmentError("the record of arrival numbers is damaged")
+    try:
+        raw = zstandard.ZstdDecompressor().decompress(
+            memoryview(body)[8:], max_output_size=count * 8
+        )
+    except zstandard.ZstdError as error:
+        raise SegmentError(f"the record of arrival numbers is damaged: {error}") from error
+    if len(raw) != count * 8:
+        raise SegmentError(f"arrival numbers of {len(raw) // 8} messages, {count} expected")
+    (chunk_offset,) = struct.unpack_from("<Q", body)
+    return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8")).astype(np.int64)

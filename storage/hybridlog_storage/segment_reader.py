@@ -1,0 +1,263 @@
+"""Reading segments: their summary, and chunks one at a time.
+
+A sealed segment never changes, so a reader may be used by several threads: every read
+names its place.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, Metadata
+
+from hybridlog_storage.compression import decompress
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap_scan import (
+    parse_content,
+    read_summary,
+)
+from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_format import (
+    ARRIVAL_HEAD,
+    ARRIVAL_OPCODE,
+    CHUNK_HEAD,
+    END_METADATA,
+    FORMAT_VERSION,
+    RECORDING_METADATA,
+    arrivals_of,
+    channel_of,
+    json_of,
+)
+from hybridlog_storage.segment_writer import StoredChunk
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkPlace:
+    """Where a chunk lies in its segment.
+
+    Attributes:
+        offset: Byte of the chunk record.
+        length: Bytes of the chunk record.
+        trailer: Bytes of message indexes and arrival numbers behind it, -1 if unknown.
+        first: Smallest log time in it, ns.
+        last: Largest log time in it, ns.
+        channels: Ids of the channels in it.
+    """
+
+    offset: int
+    length: int
+    trailer: int
+    first: int
+    last: int
+    channels: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentSummary:
+    """What a sealed segment says of itself.
+
+    Attributes:
+        recording: Catalog entry of the recording, as when the segment was started.
+        end: How the recording ended; None in all but a recording's last segment.
+        channels: By channel id.
+        chunks: In file order.
+        counts: Messages by channel id.
+    """
+
+    recording: dict[str, object]
+    end: dict[str, object] | None
+    channels: dict[int, Channel]
+    chunks: list[ChunkPlace]
+    counts: dict[int, int]
+
+
+class SegmentReader:
+    """One sealed segment file.
+
+    Raises:
+        SegmentError: the file is missing or cannot be opened.
+    """
+
+    def __init__(self, path: Path, number: int) -> None:
+        self.path = path
+        self.number = number
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise SegmentError(
+                f"Segment {path} cannot be opened: {error.strerror}. "
+                "Restore the file, or run `hybridlog verify` for a list of what is affected."
+            ) from error
+        self.size = os.fstat(self._fd).st_size
+        self.bytes_read = 0
+
+    def close(self) -> None:
+        """Give the file back."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def __enter__(self) -> SegmentReader:
+        """The reader itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def summary(self) -> SegmentSummary:
+        """Channels, chunks and metadata, from the summary at the end of the file.
+
+        Raises:
+            SegmentError: there is none, or it is damaged.
+        """
+        with self.path.open("rb") as file:
+            summary = read_summary(file, self.size)
+        if summary is None or summary.statistics is None:
+            raise SegmentError(
+                f"Segment {self.path} has no readable summary. It was sealed and has changed "
+                "since: restore it, or see what is left with `mcap recover`."
+            )
+        metadata = {
+            index.name: self._metadata(index.offset, index.length)
+            for index in summary.metadata_indexes
+            if index.name in {RECORDING_METADATA, END_METADATA}
+        }
+        if RECORDING_METADATA not in metadata:
+            raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+        recording = json_of(metadata[RECORDING_METADATA])
+        check_format(recording, self.path)
+        end = metadata.get(END_METADATA)
+        return SegmentSummary(
+            recording,
+            json_of(end) if end is not None else None,
+            {i: channel_of(record, summary.schemas) for i, record in summary.channels.items()},
+            [_place(index) for index in summary.chunk_indexes],
+            dict(summary.statistics.channel_message_counts),
+        )
+
+    def read_chunk(self, place: ChunkPlace) -> StoredChunk:
+        """Read, decompress and check one chunk.
+
+        Raises:
+            SegmentError: it is not there, or it is damaged; names file and offset.
+        """
+        data = self._read(place.offset, place.length + max(place.trailer, 0))
+        try:
+            batch, compressed = open_chunk(memoryview(data)[: place.length])
+            if place.trailer >= 0:
+                trailer = memoryview(data)[place.length :]
+            else:
+                trailer = memoryview(self._trailer(place))
+            seq = _arrivals(trailer, place.offset, len(batch))
+        except SegmentError as error:
+            raise SegmentError(
+                f"Chunk at byte {place.offset} of {self.path} is damaged: {error}"
+            ) from error
+        return StoredChunk(
+            self.number, place.offset, place.length, len(trailer), batch, seq, compressed
+        )
+
+    def _read(self, offset: int, length: int) -> bytes:
+        if offset + length > self.size:
+            raise SegmentError(
+                f"{self.path} ends at byte {self.size}, but bytes {offset} to "
+                f"{offset + length} are referred to: the file was cut short."
+            )
+        try:
+            data = os.pread(self._fd, length, offset)
+        except OSError as error:
+            raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
+        if len(data) != length:
+            raise SegmentError(f"{self.path} gives {len(data)} bytes of {length} at {offset}.")
+        self.bytes_read += length
+        return data
+
+    def _trailer(self, place: ChunkPlace) -> bytes:
+        """Walk the records behind a chunk as far as its arrival numbers."""
+        start = at = place.offset + place.length
+        while at + 9 <= self.size:
+            opcode, length = struct.unpack("<BQ", self._read(at, 9))
+            at += 9 + length
+            if opcode == ARRIVAL_OPCODE:
+                return self._read(start, at - start)
+            if opcode != Opcode.MESSAGE_INDEX:
+                break
+        raise SegmentError("its arrival numbers are missing")
+
+    def _metadata(self, offset: int, length: int) -> Metadata:
+        try:
+            return Metadata.read(ReadDataStream(BytesIO(self._read(offset, length)[9:])))
+        except (ValueError, struct.error, EOFError) as error:
+            raise SegmentError(f"Metadata at byte {offset} of {self.path} is damaged.") from error
+
+
+def check_format(recording: Mapping[str, object], path: Path) -> None:
+    """Refuse a segment of a newer format."""
+    version = recording.get("format")
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise SegmentError(
+            f"{path} has segment format {version}, this hybridlog knows up to "
+            f"{FORMAT_VERSION}. Install a newer hybridlog."
+        )
+
+
+def open_chunk(record: memoryview) -> tuple[Batch, int]:
+    """The messages of a whole chunk record, checksum verified, and its compressed size.
+
+    Raises:
+        SegmentError: it is no chunk record, or damaged.
+    """
+    if len(record) < CHUNK_HEAD.size + 4:
+        raise SegmentError("the record is too short")
+    opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
+    if opcode != Opcode.CHUNK or length + 9 != len(record):
+        raise SegmentError("no chunk record is there")
+    at = CHUNK_HEAD.size
+    (name_length,) = struct.unpack_from("<I", record, at)
+    at += 4
+    if name_length > 16 or at + name_length + 8 > len(record):
+        raise SegmentError("its compression cannot be read")
+    compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
+    at += name_length + 8
+    content = decompress(compression, record[at:], size)
+    if zlib.crc32(content) != crc:
+        raise SegmentError("its checksum differs")
+    return parse_content(content).batch, len(record) - at
+
+
+def _arrivals(trailer: memoryview, chunk_offset: int, count: int) -> NDArray[np.int64]:
+    at = 0
+    while at + ARRIVAL_HEAD.size <= len(trailer):
+        opcode, length = struct.unpack_from("<BQ", trailer, at)
+        if opcode == ARRIVAL_OPCODE:
+            owner, seq = arrivals_of(trailer[at + 9 : at + 9 + length], count)
+            if owner != chunk_offset:
+                raise SegmentError("its arrival numbers belong to another chunk")
+            return seq
+        at += 9 + length
+    raise SegmentError("its arrival numbers are missing")
+
+
+def _place(index: ChunkIndex) -> ChunkPlace:
+    return ChunkPlace(
+        index.chunk_start_offset,
+        index.chunk_length,
+        -1,
+        index.message_start_time,
+        index.message_end_time,
+        tuple(sorted(index.message_index_offsets)),
+    )

