@@ -202,7 +202,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
     """Channel ids in a chunk, ascending, and the rows of each, in chunk order."""
     order = np.argsort(channel, kind="stable")
     ids = channel[order]
-    starts = np.flatnonzero(np.diff(ids, prefix=-1)).tolist()
+    starts = np.flatnonzero(np.diff(ids, prepend=-1)).tolist()
     for start, end in zip(starts, [*starts[1:], len(ids)], strict=True):
         yield int(ids[start]), order[start:end]
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
+from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -301,7 +302,8 @@ class Store:
             reader = self._segments.get(key)
             if reader is None:
                 if len(self._segments) >= _MOST_OPEN_SEGMENTS:
-                    self._segments.pop(next(iter(self._segments))).close()
+                    # It is closed when the last thread that reads from it lets go of it.
+                    self._segments.pop(next(iter(self._segments)))
                 path = self.directory.recording(recording) / f"{number:06d}.mcap"
                 reader = self._segments[key] = SegmentReader(path, number)
             return reader
@@ -369,7 +371,7 @@ class Store:
         entry = self.select([recording])[0]
         database = self.database_for("Removing a recording")
         Catalog(database).remove_recording(
-            entry.id, {maintenance.collection_of(c.topic) for c in entry.channels}
+            entry.id, {collection_of(c.topic) for c in entry.channels}
         )
         with self._lock:
             for key in [k for k in self._segments if k[0] == entry.id]:

@@ -116,8 +116,8 @@ class Camera:
             below, np.where(inside, _FLOOR, _ASPHALT), np.where(inside, _CEILING, _SKY)
         ).astype(np.uint8)
         fade = np.float32(0.55) + np.float32(0.45) / (1 + self._plane * self._plane / 30)
-        joint = (np.mod(px, 0.6) < 0.03) | (np.mod(py, 0.6) < 0.03)
-        lamp = (np.mod(px, 3.0) < 0.4) & (np.mod(py, 2.5) < 1.2)
+        joint = (_modulo(px, 0.6) < 0.03) | (_modulo(py, 0.6) < 0.03)
+        lamp = (_modulo(px, 3.0) < 0.4) & (_modulo(py, 2.5) < 1.2)
         shade = np.where(below & inside & joint, fade * np.float32(0.7), fade)
         shade = np.where(material == _SKY, np.float32(1.0), shade)
         shade = np.where(~below & inside & lamp, np.float32(1.25), shade * np.float32(0.92))
@@ -169,19 +169,27 @@ class Camera:
         out[:] = flat
 
 
+def _modulo(values: Image, period: float) -> Image:
+    """Like numpy's mod for a positive period, several times faster."""
+    turns = values * np.float32(1 / period)
+    turns -= np.floor(turns)
+    turns *= np.float32(period)
+    return turns
+
+
 def _texture(kind: NDArray[np.int64], along: Image, z: Image, top: Image) -> Image:
     """Brightness of bricks, planks and skirting boards, float32[rows, columns]."""
     grain = np.ones(z.shape, np.float32)
     bricks = kind == _BRICK
     if bricks.any():
         course = np.floor(z[:, bricks] / 0.15)
-        joint = np.mod(z[:, bricks], 0.15) < 0.02
-        joint |= np.mod(along[bricks] + 0.17 * np.mod(course, 2), 0.34) < 0.02
+        joint = _modulo(z[:, bricks], 0.15) < 0.02
+        joint |= _modulo(along[bricks] + 0.17 * _modulo(course, 2), 0.34) < 0.02
         grain[:, bricks] = np.where(joint, 1.5, 1.0)
     planks = kind == _WOOD
     if planks.any():
         streaks = 1 + 0.12 * np.sin(along[planks] * 37) * np.cos(along[planks] * 11)
-        grain[:, planks] = np.where(np.mod(z[:, planks], 0.5) < 0.025, 0.6, streaks)
+        grain[:, planks] = np.where(_modulo(z[:, planks], 0.5) < 0.025, 0.6, streaks)
     # A dark skirting board where a surface meets the floor, a light rim where it ends.
     grain[z < 0.08] *= np.float32(0.55)
     grain[z > top - 0.03] *= np.float32(0.8)

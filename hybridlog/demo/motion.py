@@ -161,6 +161,9 @@ class Lap:
             times.append(np.concatenate(([clock], clock + spent)))
             distances.append(leg)
             clock += float(spent[-1])
+        # A little rest at the end, so that smoothing carries no speed into the next lap.
+        times.append(np.array([clock + _SMOOTHING_S]))
+        distances.append(np.array([self.length]))
         return np.concatenate(times), np.concatenate(distances), tuple(stops)
 
     def _grid(self, times: Floats, distances: Floats) -> None:
@@ -233,7 +236,8 @@ def _slope_limited(at: Floats, values: Floats, slope: float) -> Floats:
     """The largest function below `values` that rises by at most `slope` a metre."""
     ramp = slope * np.abs(at - at[0])
     lowest: Floats = np.minimum.accumulate(values - ramp)
-    return lowest + ramp
+    limited: Floats = lowest + ramp
+    return limited
 
 
 def _closed(values: Floats, step: float) -> Floats:

@@ -176,7 +176,7 @@ class _Checker:
             raise _refused(path, "has flags that are not understood")
         table = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s"}
         options = "".join(letter for flag, letter in table.items() if flags & flag)
-        if flags & ~(re.I | re.M | re.S | re.U):
+        if flags & ~(re.IGNORECASE | re.MULTILINE | re.DOTALL | re.UNICODE):
             raise _refused(path, "may have the flags i, m and s only")
         return self._regex(pattern, options, path)
 
@@ -219,10 +219,12 @@ class _Checker:
     def _literal(self, value: object, path: _Path, depth: int) -> object:
         """A value to compare with; no operator has a meaning in it."""
         if isinstance(value, Mapping):
-            return {
-                key: self._literal(item, (*path, key), depth + 1)
-                for key, item in self._items(value, path, depth, dollars=path[-1] == "$literal")
-            }
+            checked: dict[str, object] = {}
+            for key, item in self._items(value, path, depth):
+                if key.startswith("$"):
+                    raise _refused((*path, key), "the operator is not allowed here")
+                checked[key] = self._literal(item, (*path, key), depth + 1)
+            return checked
         if isinstance(value, list | tuple):
             self._enter(path, depth)
             return [self._literal(item, path, depth + 1) for item in value]
@@ -230,18 +232,21 @@ class _Checker:
         return _scalar(value, path)
 
     def _items(
-        self, value: Mapping[str, object], path: _Path, depth: int, *, dollars: bool = True
+        self, value: Mapping[str, object], path: _Path, depth: int
     ) -> list[tuple[str, object]]:
         self._enter(path, depth)
         items: list[tuple[str, object]] = []
-        in_literal = bool(path) and path[-1] in _LITERAL | _LISTS | {"$literal"}
         for key, item in value.items():
             if not isinstance(key, str):
                 raise _refused(path, f"has a key that is no string: {key!r}")
-            if "\0" in key or (in_literal and not dollars and key.startswith("$")):
-                raise _refused((*path, key), "is no name of a field")
-            self._count(path, len(key))
-            items.append((str(key), item))
+            try:
+                plain = _plain_text(key)
+            except ValueError:
+                raise _refused(path, "has a name that is not valid Unicode") from None
+            if "\0" in plain:
+                raise _refused(path, "has a name with a NUL character")
+            self._count(path, len(plain))
+            items.append((plain, item))
         return items
 
     def _enter(self, path: _Path, depth: int) -> None:
@@ -271,6 +276,8 @@ def _is_bson(value: object) -> bool:
 
 def _plain_number(value: object) -> object:
     """A numpy scalar or an int as a Python number that BSON can hold."""
+    if getattr(value, "shape", ()) != ():
+        raise TypeError(f"a value of type {type(value).__name__} is not allowed")
     number = value.item() if hasattr(value, "item") else value
     if isinstance(number, int) and not isinstance(number, bool) and not -(2**63) <= number < 2**63:
         raise OverflowError(f"{number} does not fit into 64 bits; write it as a float")

@@ -37,6 +37,7 @@ _OPERATORS = {"==": "$eq", "!=": "$ne", "<": "$lt", "<=": "$lte", ">": "$gt", ">
 _STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 _SHOWN = 10
 _INF = float("inf")
+_NULL: dict[str, object] = {"$type": "null"}
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
 
 _KINDS: dict[str, _Kind] = {
@@ -157,7 +158,7 @@ class _Compiler:
             case Compare(order=order, value=value):
                 return {path: _comparison(_OPERATORS[order], value)}
             case Member(values=values, negated=negated):
-                return {path: {"$nin" if negated else "$in": list(values), "$exists": True}}
+                return _membership(path, values, negated=negated)
             case Exists(present=present):
                 return {path: {"$exists": present}}
             case Match(pattern=pattern, negated=False):
@@ -344,10 +345,21 @@ class _Test:
 
 
 def _comparison(operator: str, value: Value) -> Filter:
-    if operator == "$ne" or value is None:
-        # Without this, documents that lack the field would match.
-        return {operator: value, "$exists": True}
+    # MongoDB's own equality with null is true of missing fields too, `$ne` as well.
+    if value is None:
+        return _NULL if operator == "$eq" else {"$exists": True, "$not": _NULL}
+    if operator == "$ne":
+        return {"$ne": value, "$exists": True}
     return {operator: value}
+
+
+def _membership(path: str, values: tuple[Value, ...], *, negated: bool) -> Filter:
+    others = [value for value in values if value is not None]
+    if len(others) == len(values):
+        return {path: {"$nin": others, "$exists": True} if negated else {"$in": others}}
+    if negated:
+        return {path: {"$nin": others, "$exists": True, "$not": _NULL}}
+    return {"$or": [{path: _NULL}, {path: {"$in": others}}]}
 
 
 def _is_nan(value: Value) -> bool:

@@ -38,12 +38,14 @@ from typing import TYPE_CHECKING, TypeAlias
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
+    from typing import Any
+
     import numpy as np
 
-    TimeLike: TypeAlias = (
-        "str | int | float | date | np.datetime64 | np.integer[np.typing.NBitBase]"
-        " | np.floating[np.typing.NBitBase]"
-    )
+TimeLike: TypeAlias = (
+    "str | int | float | date | np.datetime64 | np.integer[Any] | np.floating[Any]"
+)
+"""What `parse_time` takes; `datetime` and `pandas.Timestamp` are dates."""
 
 TIME_LIMIT = 2**63
 """Times lie below this many nanoseconds (the year 2262)."""

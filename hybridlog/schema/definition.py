@@ -355,8 +355,10 @@ class _Resolver:
             return ArrayOf(element, None, raw.bound), _Extent(
                 extent.depth, extent.fields, extent.characters, 4
             )
-        if width > MAX_WIDTH:
-            raise self._fail(f"{owner}.{raw.name} has {width} elements; at most {MAX_WIDTH}")
+        if not 0 < width <= MAX_WIDTH:
+            raise self._fail(
+                f"{owner}.{raw.name} has {width} elements; from 1 to {MAX_WIDTH} are indexed"
+            )
         extent = _Extent(extent.depth, extent.fields, extent.characters, extent.size * width)
         return ArrayOf(element, width), extent
 

@@ -74,28 +74,25 @@ def bodies(
         array_limit: Longer arrays are summarised.
         max_bytes: Largest body.
     """
-    yield from _bodies(records, np.arange(len(records), dtype=np.intp), array_limit, max_bytes)
-
-
-def _bodies(
-    records: Records, rows: NDArray[np.intp], limit: int, max_bytes: int
-) -> Iterator[Bodies | TooLarge]:
-    if len(rows) == 0:
+    if len(records) == 0:
         return
-    top = _record(records, limit, top=True)
-    width = _spread(top.width, len(rows)) - 5
+    top = _record(records, array_limit, top=True)
+    width = _spread(top.width, len(records)) - 5
     large = width > max_bytes
     if large.any():
-        yield TooLarge(rows[large])
-        keep = np.flatnonzero(~large)
-        yield from _bodies(take(records, keep), rows[keep], limit, max_bytes)
-        return
-    total = int(width.sum())
-    if total > _SLAB and len(rows) > 1:
-        slab = (np.cumsum(width) - width) // _SLAB
-        for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(slab)) + 1):
-            yield from _bodies(take(records, part), rows[part], limit, max_bytes)
-        return
+        yield TooLarge(np.flatnonzero(large))
+    rows = np.flatnonzero(~large)
+    slab = np.cumsum(width[rows]) // _SLAB
+    for part in np.split(rows, np.flatnonzero(np.diff(slab)) + 1):
+        if len(part) == len(records):
+            yield from _made(top, part, width)
+        elif len(part):
+            sub = _record(take(records, part), array_limit, top=True)
+            yield from _made(sub, part, width[part])
+
+
+def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Iterator[Bodies]:
+    """Bodies of all rows of `top`, which are called `rows`; `width` of each."""
     template = _Piece()
     if all(_append(template, name, node, slice(None), len(rows)) for name, node in top.fields):
         yield Bodies(rows, template.tile(len(rows)))
@@ -104,7 +101,7 @@ def _bodies(
     order = np.argsort(width, kind="stable")
     at = np.empty(len(rows), np.int64)
     at[order] = np.cumsum(width[order]) - width[order]
-    out = np.zeros(total, np.uint8)
+    out = np.zeros(int(width.sum()), np.uint8)
     _put_fields(top, out, at)
     edges = np.flatnonzero(np.diff(width[order])) + 1
     begin = 0
@@ -459,9 +456,10 @@ class _Piece:
         width = len(self.template)
         out = np.empty((rows, width), np.uint8)
         out[:] = np.frombuffer(self.template, np.uint8)
-        for at, step, values, stored in self.writes:
-            strides = (width, step)[: values.ndim]
-            np.ndarray(values.shape, stored, out.data, at, strides)[...] = values
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+            for at, step, values, stored in self.writes:
+                strides = (width, step)[: values.ndim]
+                np.ndarray(values.shape, stored, out.data, at, strides)[...] = values
         return out
 
 
@@ -589,7 +587,8 @@ def _put(node: _Node, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
         return
     if isinstance(node, _Number):
         has = slice(None) if node.has is None else node.has
-        _overlay(out, node.stored)[at[has]] = node.values[has]
+        with np.errstate(invalid="ignore"):
+            _overlay(out, node.stored)[at[has]] = node.values[has]
         return
     if isinstance(node, _Either):
         _put(node.yes, out, at[node.which])

@@ -15,6 +15,7 @@ import bz2
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import lz4.frame
@@ -145,6 +146,7 @@ class Rosbag1Source(Source):
         self._index_pos = 0
         self._place: _Place | None = None
         self._pos = len(MAGIC)
+        self._skipped: int | None = None
         try:
             self._open()
         except OSError as error:
@@ -246,21 +248,8 @@ class Rosbag1Source(Source):
         return self._file.read(count)
 
     def _record(self, pos: int) -> _Record | None:
-        """The record at a place of the file, None when there is no sound one.
-
-        The end of its data may lie past the end of the file.
-        """
-        size = int.from_bytes(self._read(pos, 4), "little")
-        if not 0 < size <= min(MAX_HEADER, self.size_bytes - pos - 8):
-            return None
-        raw = self._read(pos + 4, size + 4)
-        if len(raw) < size + 4:
-            return None
-        header = parse_header(raw, 0, size)
-        if header is None:
-            return None
-        start = pos + 8 + size
-        return _Record(raw, header, start, start + int.from_bytes(raw[size:], "little"))
+        """The sound record at a place of the file, see `_record_in`."""
+        return _record_in(self._space, pos)
 
     def _pieces(self) -> Iterator[Batch]:
         """Walks the file record by record, chunk by chunk."""
@@ -289,47 +278,53 @@ class Rosbag1Source(Source):
         """Reads one record, chunk or run of loose messages at `_pos` and moves it on."""
         pos = self._pos
         record = self._record(pos)
+        # After a record that is only skipped, its length may be what is wrong.
+        skipped, self._skipped = self._skipped, None
         if record is None:
-            self._skip_damage(pos)
+            self._skip_damage(pos, skipped or pos + 1)
         elif record.header.op == OP_CHUNK:
             yield from self._chunk(pos, record)
         elif record.header.op in {OP_MESSAGE, OP_CONNECTION}:
             # Also what follows an uncompressed chunk whose length field is too small.
             yield from self._run(self._space, pos, None)
-        elif record.end > self.size_bytes:
-            place = self._place_at(pos)
-            place.reasons.append("the file ends in a record")
-            place.cut = place.torn_index = True
+        else:
+            self._skip_record(pos, record)
+
+    def _skip_record(self, pos: int, record: _Record) -> None:
+        """Passes a record that holds no messages; counts those that an index lists."""
+        if record.end > self.size_bytes:
+            self._skip_damage(pos, record.start)
+            return
+        if record.header.op == OP_INDEX_DATA:
+            place = self._place_at(pos, has_index=True)
+            place.indexed = (place.indexed or 0) + record.header.u32(record.raw, b"count")
+            place.end = record.end
+        elif record.header.op == OP_CHUNK_INFO:
+            self._finish_place()
+        self._skipped = record.start
+        self._pos = record.end
+
+    def _skip_damage(self, pos: int, start: int) -> None:
+        """Nothing sound at `pos`: goes to the first place from `start` on that is."""
+        place = self._place_at(pos)
+        found = self._search(self._space, start)
+        place.torn_index = True
+        if found is None:
+            place.cut = True
+            place.reasons.append(f"the file ends in a record that starts at byte {pos}")
             if 0 < self._index_pos <= pos:
                 place.indexed = place.got
             self._pos = place.end = self.size_bytes
-        else:
-            if record.header.op == OP_INDEX_DATA:
-                place = self._place_at(pos, has_index=True)
-                place.indexed = (place.indexed or 0) + record.header.u32(record.raw, b"count")
-                place.end = record.end
-            elif record.header.op == OP_CHUNK_INFO:
-                self._finish_place()
-            self._pos = record.end
-
-    def _skip_damage(self, pos: int) -> None:
-        """Nothing sound at `pos`: goes to the next place that is."""
-        place = self._place_at(pos)
-        tail = self.size_bytes - pos
-        found = self._search(self._space, pos + 1)
-        self._pos = place.end = self.size_bytes if found is None else found
-        if found is None and tail < MAX_HEADER:
-            place.cut = True
-            place.reasons.append(f"the file ends in a record ({tail} bytes of it are there)")
-        else:
-            place.reasons.append(f"{self._pos - pos} bytes at byte {pos} are no record")
-        place.torn_index = True
+            return
+        place.reasons.append(f"bytes that are no record at byte {pos}")
+        self._pos = found
+        place.end = max(place.end, found)
 
     def _search(self, space: _Space, pos: int) -> int | None:
         """First place from `pos` on that looks like a record."""
         while pos < space.size:
             data = space.read(pos, min(_SEARCH + _OVERLAP, space.size - pos))
-            found = find_record(data, 0, space.size - pos)
+            found = find_record(data, space.size - pos, partial(_is_sound, space, pos))
             if found is not None and (found < _SEARCH or len(data) <= _SEARCH):
                 return pos + found
             if len(data) <= _SEARCH:
@@ -484,13 +479,9 @@ class Rosbag1Source(Source):
         # It crosses the end of its chunk. Either the chunk's length is wrong or its own:
         # that one is right after which another record stands.
         record = self._record(end)
-        if record is None or record.end - end > MAX_CHUNK or not self._fits(space, record.end):
+        if record is None or record.end - end > MAX_CHUNK or not _is_sound(space, 0, record.end):
             return 0
         return record.end - end
-
-    def _fits(self, space: _Space, pos: int) -> bool:
-        """Whether a record may end at `pos`: the space ends there or another one starts."""
-        return pos == space.size or (not space.packed and self._record(pos) is not None)
 
     def _cut_in_file(self, space: _Space, end: int) -> int:
         """A record reaches past the end of the file: cut, or its length is wrong."""
@@ -645,6 +636,29 @@ class Rosbag1Source(Source):
             f"messages of connections that the bag does not define (id {shown})",
             self._undefined.total(),
         )
+
+
+def _record_in(space: _Space, pos: int) -> _Record | None:
+    """The record at a place, None when there is no sound one.
+
+    The end of its data may lie past the end of the space.
+    """
+    size = int.from_bytes(space.read(pos, 4), "little")
+    if not 0 < size <= min(MAX_HEADER, space.size - pos - 8):
+        return None
+    raw = space.read(pos + 4, size + 4)
+    if len(raw) < size + 4:
+        return None
+    header = parse_header(raw, 0, size)
+    if header is None:
+        return None
+    start = pos + 8 + size
+    return _Record(raw, header, start, start + int.from_bytes(raw[size:], "little"))
+
+
+def _is_sound(space: _Space, base: int, pos: int) -> bool:
+    """Whether a record starts at `base + pos`, or the space ends there."""
+    return base + pos == space.size or _record_in(space, base + pos) is not None
 
 
 def _not_version_2(path: Path, magic: bytes) -> str:

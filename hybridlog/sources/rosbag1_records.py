@@ -20,6 +20,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 OP_MESSAGE: Final = 2
@@ -347,21 +349,25 @@ def _apply(
     return todo[~is_message[todo]]
 
 
-def find_record(data: bytes, start: int, limit: int) -> int | None:
+def find_record(data: bytes, limit: int, sound_at: Callable[[int], bool]) -> int | None:
     """Looks for the next place that looks like a record, after damage.
+
+    A message is believed only when another record follows it. Pieces of messages stand
+    in compressed chunks too, but nothing sound stands after those.
 
     Args:
         data: Bytes to search.
-        start: First place where a record may start.
-        limit: Length of the whole space that `data` is the start of: a message that
-            goes past it is not believed.
+        limit: Length of the whole space that `data` is the start of: a record that
+            goes past it is not believed, unless it is a chunk.
+        sound_at: Whether a record, or the end of the space, is at a place past `data`'s
+            start.
 
     Returns:
         Where the record starts in `data`, or None.
     """
-    hit = data.find(_OP_FIELD, start)
+    hit = data.find(_OP_FIELD)
     while hit >= 0:
-        low = max(start, hit - _LOOK_BACK)
+        low = max(0, hit - _LOOK_BACK)
         # The header's length stands before its first field and must reach past the op.
         window = np.frombuffer(data, np.uint8, hit - low, low)
         if len(window) >= 4:
@@ -369,17 +375,23 @@ def find_record(data: bytes, start: int, limit: int) -> int | None:
             reach = hit + 8 - (low + 4 + np.arange(len(lengths)))
             for index in np.flatnonzero((lengths >= reach) & (lengths <= 4096))[::-1]:
                 place = low + int(index)
-                if _believable(data, place, place + 4 + int(lengths[index]), limit):
+                body = place + 4 + int(lengths[index])
+                if _believable(data, place, body, limit, sound_at):
                     return place
         hit = data.find(_OP_FIELD, hit + 1)
     return None
 
 
-def _believable(data: bytes, place: int, body: int, limit: int) -> bool:
+def _believable(
+    data: bytes, place: int, body: int, limit: int, sound_at: Callable[[int], bool]
+) -> bool:
     if body + 4 > len(data):
         return False
     header = parse_header(data, place + 4, body)
     if header is None or header.op not in _REQUIRED:
         return False
     # A chunk may have been cut short; all other records are small enough to be whole.
-    return header.op == OP_CHUNK or body + 4 + _u32(data, body)[0] <= limit
+    end = body + 4 + int(_u32(data, body)[0])
+    if header.op == OP_CHUNK:
+        return True
+    return end <= limit and (header.op != OP_MESSAGE or sound_at(end))

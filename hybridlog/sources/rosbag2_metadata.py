@@ -52,8 +52,10 @@ def parse_metadata(text: str) -> BagMetadata | None:
         root: object = YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, TypeError, RecursionError, OverflowError):
         return None
-    bag = _mapping(root).get("rosbag2_bagfile_information")
-    if not isinstance(bag, Mapping):
+    bag = _mapping(root)
+    # The copy inside a database has no outer key.
+    bag = bag if "storage_identifier" in bag else _mapping(bag.get("rosbag2_bagfile_information"))
+    if not bag:
         return None
     listed = _list(bag.get("files"))
     counts: dict[str, int] = {}

@@ -85,7 +85,7 @@ class SqliteSource(Source):
             self.damage.append(Damage(log_unread, 0, None, reason, None))
         try:
             self._open()
-        except (sqlite3.Error, OverflowError) as error:
+        except (sqlite3.Error, OverflowError, ValueError) as error:
             self.close()
             raise _unreadable(path, error) from error
         except BaseException:
@@ -111,12 +111,17 @@ class SqliteSource(Source):
         if log_time is None:
             raise SourceError(f"{self.path}: its messages have no time; record it again")
         has_publish_time = "send_timestamp" in messages
-        publish = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
-        self._select = (
-            f"SELECT rowid, CAST(topic_id AS INTEGER), ifnull(CAST({log_time} AS INTEGER), 0), "
-            f"{publish if has_publish_time else '0'}, ifnull(CAST(data AS BLOB), x'') "
-            "FROM messages WHERE rowid > ? ORDER BY rowid"
+        # Types in SQLite are those of each value, so all are forced; names come from here.
+        sent = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
+        columns = (
+            "rowid",
+            "CAST(topic_id AS INTEGER)",
+            f"ifnull(CAST({log_time} AS INTEGER), 0)",
+            sent if has_publish_time else "0",
+            "ifnull(CAST(data AS BLOB), x'')",
         )
+        chosen = ", ".join(columns)
+        self._select = f"SELECT {chosen} FROM messages WHERE rowid > ? ORDER BY rowid"  # noqa: S608
         self._has_publish_time = has_publish_time
         distro = self._read_metadata(tables)
         self._read_topics(topics, tables, distro)

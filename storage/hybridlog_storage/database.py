@@ -131,6 +131,8 @@ class Database:
         except PyMongoError as error:  # an SRV record that cannot be resolved
             raise DatabaseError(f"MongoDB at {address} cannot be found: {error}") from error
         name = parsed["database"] or name
+        if parsed["collection"]:
+            name = f"{name}.{parsed['collection']}"
         if name in _RESERVED_NAMES or not re.fullmatch(r"[A-Za-z0-9_-]{1,38}", name):
             raise UsageError(
                 f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "
@@ -496,7 +498,7 @@ def _document_ends(
         if len(lengths) != count:
             raise ValueError(f"{len(lengths)} lengths were given for {count} documents")
         np.cumsum(lengths, out=ends[1:])
-    if ends[-1] != len(documents):
+    if ends[-1] != len(documents) or ends.max() > len(documents):
         raise ValueError(f"{count} documents end at byte {ends[-1]} of {len(documents)}")
     if count and np.diff(ends).min() < 5:
         raise ValueError("a document has a length below 5 bytes")
@@ -618,7 +620,7 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
             f"MongoDB at {address} does not answer: {_first_words(error)}. See that it runs and "
             f"can be reached."
         ) from error
-    except (DocumentTooLarge, BSONError, OverflowError, RecursionError) as error:
+    except (DocumentTooLarge, BSONError, OverflowError, RecursionError, UnicodeError) as error:
         if question:
             raise WhereError(f"The predicate cannot be sent to MongoDB: {error}") from error
         raise DatabaseError(

@@ -90,6 +90,7 @@ class ScanDamage:
         reason: What is wrong, for people to read.
         messages: Messages that lie there, None when not known.
         torn: What there is of a chunk whose end is missing.
+        opcode: Kind of the damaged record, None when not known.
     """
 
     offset: int
@@ -97,6 +98,7 @@ class ScanDamage:
     reason: str
     messages: int | None = None
     torn: TornChunk | None = None
+    opcode: int | None = None
 
 
 @dataclass(slots=True)
@@ -179,7 +181,7 @@ def parse_content(
     for row, opcode, start, end in walk.others:
         content = memoryview(buffer)[start + RECORD_HEAD.size : end]
         try:
-            record = read_record(opcode, content)
+            record, _ = read_record(opcode, content)
         except SegmentError as error:
             damage.append(ScanDamage(start, end - start, str(error), 0))
             continue
@@ -276,11 +278,12 @@ class _Fields(ReadDataStream):
         return data
 
 
-def _read_message_index(content: Buffer) -> records.MessageIndex:
+def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
     channel, length = struct.unpack_from("<HI", content)
     if length > len(content) - 6 or length % 16:
         raise SegmentError("its list of messages has the wrong length")
-    return records.MessageIndex(channel, list(struct.iter_unpack("<QQ", content[6 : 6 + length])))
+    entries = list(struct.iter_unpack("<QQ", content[6 : 6 + length]))
+    return records.MessageIndex(channel, entries), 6 + length
 
 
 _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
@@ -299,7 +302,7 @@ _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
 }
 
 
-def read_record(opcode: int, content: Buffer) -> Record | None:
+def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
     """Read one record that is neither a message nor a chunk.
 
     Args:
@@ -307,7 +310,8 @@ def read_record(opcode: int, content: Buffer) -> Record | None:
         content: Its bytes, without the head. More bytes than its fields are ignored.
 
     Returns:
-        The record, None for an opcode of no such record.
+        The record, None for an opcode of no such record; and how many of its bytes its
+        fields take (0 for None).
 
     Raises:
         SegmentError: Its fields do not fit into it, are no UTF-8, or its checksum
@@ -319,14 +323,15 @@ def read_record(opcode: int, content: Buffer) -> Record | None:
             return _read_message_index(content)
         reader = _READERS.get(opcode)
         if reader is None:
-            return None
+            return None, 0
         stream = _Fields(BytesIO(content))
         record = reader(stream)
     except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
     if isinstance(record, records.Attachment):
+        # The mcap package steps over the checksum, which is the last field.
         _check_attachment(content, stream.count)
-    return record
+    return record, stream.count
 
 
 _NAMED = frozenset(int(opcode) for opcode in Opcode)

@@ -254,7 +254,8 @@ def read_summary(file: BinaryIO, size: int) -> Summary | None:
             opcode, length = RECORD_HEAD.unpack_from(view, at)
             if length > len(view) - at - _HEAD or not _is_in_summary(opcode):
                 return None
-            _add_to_summary(summary, read_record(opcode, view[at + _HEAD : at + _HEAD + length]))
+            record, _ = read_record(opcode, view[at + _HEAD : at + _HEAD + length])
+            _add_to_summary(summary, record)
             at += _HEAD + length
     except (SegmentError, struct.error):
         return None
@@ -362,8 +363,8 @@ class _Places:
     """Where the summary says that chunks start, and whether to believe it.
 
     A summary that a careless writer got wrong must not spoil a file that is fine, so at
-    the first contradiction the records themselves are asked: the summary wins when most
-    of its entries point at chunk records of the length they say.
+    the first contradiction the records themselves are asked: the summary wins when half
+    of its entries or more point at chunk records of the length they say.
     """
 
     def __init__(self, window: _Window, summary: Summary | None) -> None:
@@ -383,10 +384,10 @@ class _Places:
         return self._starts[i] if i < len(self._starts) else None
 
     def believed(self) -> bool:
-        """Whether most entries are right."""
+        """Whether enough entries are right."""
         if self._believed is None:
             right = sum(self._is_right(offset) for offset in self._starts)
-            self._believed = right * 2 > len(self._starts) or (right == 0 and self._single())
+            self._believed = self._single() if right == 0 else right * 2 >= len(self._starts)
         return self._believed
 
     def _is_right(self, offset: int) -> bool:
@@ -415,7 +416,10 @@ class _Scanner:
         self._at = start
         self._places = _Places(self._window, summary)
         self._footer = _read_footer(file, size)
-        self._behind = start  # a search after damage starts here at the earliest
+        # Where the fields of the last record end. When the length of that record was wrong,
+        # the next one is to be searched from here on, not from where the length led.
+        self._behind = start
+        self._summary_start = self._footer.summary_start if self._footer and summary else None
         self._chunked = False
         self._in_data = True
         self._crc: int | None = None
@@ -453,22 +457,21 @@ class _Scanner:
     def _step(self) -> Iterator[tuple[int, Item]]:
         """One record, one run of messages, or one place of damage."""
         at = self._at
-        head = self._window.at(at, _HEAD)
-        indexed = self._places.length(at) if self._in_data else None
+        head = self._window.peek(at, _HEAD)
         if len(head) < _HEAD:
-            if indexed is None and not len(head):
-                return
             yield from self._torn(at, "the file ends in the middle of a record")
             return
         opcode, length = RECORD_HEAD.unpack(head)
-        if indexed is not None and (opcode, length + _HEAD) != (Opcode.CHUNK, indexed):
-            if self._places.believed() and at + indexed <= self._window.size:
-                reason = "the head of a chunk is damaged; the chunk is read by the summary"
-                yield at, ScanDamage(at, _HEAD, reason, 0)
-                self._crc = None
-                yield from self._chunk(at, at + indexed)
-                return
-        if not self._in_data:
+        if self._in_data and self._summary_start is not None and at >= self._summary_start:
+            self._in_data = False
+            yield at, ScanDamage(at, 0, "the record that ends the data is damaged", 0)
+        if self._contradicts_index(at, opcode, length):
+            indexed = self._places.length(at)
+            reason = "the head of a chunk is damaged; the chunk is read by the summary"
+            yield at, ScanDamage(at, _HEAD, reason, 0)
+            self._crc = None
+            yield from self._chunk(at, at + (indexed or 0))
+        elif not self._in_data:
             yield from self._summary_record(at, opcode, length)
         elif opcode == Opcode.CHUNK:
             yield from self._chunk_or_damage(at, length)
@@ -477,28 +480,39 @@ class _Scanner:
         else:
             yield from self._plain(at, opcode, length)
 
+    def _contradicts_index(self, at: int, opcode: int, length: int) -> bool:
+        """Whether a chunk is known to be here, which the record's head denies."""
+        indexed = self._places.length(at) if self._in_data else None
+        if indexed is None or (opcode, length + _HEAD) == (Opcode.CHUNK, indexed):
+            return False
+        return _HEAD < indexed <= self._window.size - at and self._places.believed()
+
     # Chunks
 
     def _chunk_or_damage(self, at: int, length: int) -> Iterator[tuple[int, Item]]:
         end = at + _HEAD + length
         fields = _chunk_head(self._window, at)
         fits = end <= self._window.size and not self._swallows(at, end)
-        if fields is not None and fields.end <= end and fits:
-            if fields.end == end or self._goes_on(end) or not self._goes_on(fields.end):
-                yield from self._chunk(at, end)
-                return
-        if fields is not None and fields.end <= self._window.size and self._goes_on(fields.end):
+        if (
+            fields is not None
+            and fits
+            and fields.end <= end
+            and (fields.end == end or self._goes_on(end) or not self._goes_on(fields.end))
+        ):
+            yield from self._chunk(at, end)
+        elif fields is not None and fields.end <= self._window.size and self._goes_on(fields.end):
             yield at, ScanDamage(at, _HEAD, "the length of a chunk record is wrong", 0)
             self._crc = None
             yield from self._chunk(at, fields.end)
         elif fields is not None and fields.end == end > self._window.size:
-            data = self._window.at(fields.data, min(fields.end, self._window.size) - fields.data)
+            there = min(self._window.size - fields.data, self._limit)
+            data = self._window.at(fields.data, there)
             torn = TornChunk(fields.compression, fields.size, data, self._limit)
             yield from self._torn(at, "the file ends in the middle of a chunk", torn)
         elif fits and self._goes_on(end):
             yield from self._chunk(at, end)
         else:
-            yield from self._lost(at, f"a chunk record claims {length} bytes")
+            yield from self._lost(at, f"a chunk record claims {length} bytes", Opcode.CHUNK)
 
     def _chunk(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
         """The chunk that fills `[at, end)`; its own fields may still be wrong."""
@@ -506,11 +520,12 @@ class _Scanner:
         self._at = self._behind = end
         fields = _chunk_head(self._window, at)
         if fields is None or fields.data > end:
-            yield at, ScanDamage(at, end - at, "the fields of a chunk are damaged")
+            reason = "the fields of a chunk are damaged"
+            yield at, ScanDamage(at, end - at, reason, opcode=Opcode.CHUNK)
         elif end - at > self._limit:
-            yield at, self._too_large(at, end)
+            yield at, self._too_large(at, end, Opcode.CHUNK)
         else:
-            data_end = min(fields.end, end) if fields.end > fields.data else fields.data
+            data_end = min(fields.end, end)
             data = self._window.at(at, end - at)[fields.data - at : data_end - at]
             self._behind = data_end
             yield (
@@ -537,7 +552,7 @@ class _Scanner:
             return
         if length > self._limit:
             self._at = self._behind = end
-            yield at, self._too_large(at, end, 1)
+            yield at, self._too_large(at, end, Opcode.MESSAGE)
             return
         self._window.at(at, end - at)
         until = self._places.next(at) if self._places.believed() else None
@@ -558,7 +573,7 @@ class _Scanner:
         known = opcode <= max(Opcode)
         if length > (self._limit if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
             if known:
-                yield at, self._too_large(at, end)
+                yield at, self._too_large(at, end, opcode)
             return
         if opcode >= _FIRST_PRIVATE:
             content = self._window.at(at + _HEAD, length)
@@ -568,26 +583,39 @@ class _Scanner:
 
     def _known(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         try:
-            record = read_record(opcode, self._window.at(at + _HEAD, end - at - _HEAD))
+            record, used = read_record(opcode, self._window.at(at + _HEAD, end - at - _HEAD))
         except SegmentError as error:
             yield at, ScanDamage(at, end - at, str(error), 0)
             return
-        self._behind = max(self._behind, at + _HEAD)
+        self._behind = at + _HEAD + used
         if isinstance(record, records.DataEnd):
-            yield from self._data_end(at, record)
-        elif isinstance(record, records.Footer):
-            self._in_data = False
-            yield at, record
+            yield from self._data_end(at, end, record)
         elif record is not None:
+            self._in_data = self._in_data and not isinstance(record, records.Footer)
             yield at, record
 
-    def _data_end(self, at: int, record: records.DataEnd) -> Iterator[tuple[int, Item]]:
+    def _data_end(self, at: int, end: int, record: records.DataEnd) -> Iterator[tuple[int, Item]]:
+        if not self._ends_data(end):
+            yield at, ScanDamage(at, end - at, "an end of data stands in the middle of the data")
+            self._crc = None
+            return
         self._in_data = False
         if self._crc is not None and record.data_section_crc not in {0, self._crc}:
             reason = "the checksum of all data differs: some bytes before this one have changed"
-            yield 0, ScanDamage(0, at, reason)
+            yield at, ScanDamage(0, at, reason)
         self._crc = None
         yield at, record
+
+    def _ends_data(self, end: int) -> bool:
+        """Whether the summary, or the end of the file, is what follows."""
+        if end in {self._window.size, self._summary_start}:
+            return True
+        raw = self._window.peek(end, _HEAD)
+        if len(raw) < _HEAD:
+            return True
+        opcode, length = RECORD_HEAD.unpack(raw)
+        known = opcode == Opcode.FOOTER or _is_in_summary(opcode)
+        return known and length <= self._window.size - end - _HEAD
 
     def _summary_record(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
         end = at + _HEAD + length
@@ -602,17 +630,19 @@ class _Scanner:
 
     # Damage
 
-    def _too_large(self, at: int, end: int, messages: int | None = None) -> ScanDamage:
+    def _too_large(self, at: int, end: int, opcode: int) -> ScanDamage:
+        messages = {Opcode.CHUNK: None, Opcode.MESSAGE: 1}.get(opcode, 0)
         reason = f"a record of {end - at} bytes is above the limit of {self._limit}"
-        return ScanDamage(at, end - at, reason, messages)
+        return ScanDamage(at, end - at, reason, messages, opcode=opcode)
 
     def _torn(
         self, at: int, reason: str, torn: TornChunk | None = None
     ) -> Iterator[tuple[int, Item]]:
         self._at = self._window.size
-        yield at, ScanDamage(at, self._window.size - at, reason, torn=torn)
+        messages = None if self._in_data else 0
+        yield at, ScanDamage(at, self._window.size - at, reason, messages, torn)
 
-    def _lost(self, at: int, reason: str) -> Iterator[tuple[int, Item]]:
+    def _lost(self, at: int, reason: str, opcode: int | None = None) -> Iterator[tuple[int, Item]]:
         """Skip to where records make sense again."""
         self._crc = None
         found = self._resume(at)
@@ -622,8 +652,10 @@ class _Scanner:
                 yield from self._torn(at, f"the file ends in the middle of a record: {reason}")
                 return
             found = end
+        where = min(at, self._behind, found)
         self._at = self._behind = found
-        yield at, ScanDamage(at, found - at, f"{reason}; reading goes on {found - at} bytes on")
+        reason += f"; reading goes on at byte {found}"
+        yield where, ScanDamage(where, found - where, reason, opcode=opcode)
 
     def _resume(self, at: int) -> int | None:
         known = self._places.next(at)
@@ -631,7 +663,7 @@ class _Scanner:
             return known
         end = self._end_of_data()
         stop = self._window.size if end is None else end
-        return self._search(max(at + 1, self._behind), stop)
+        return self._search(self._behind if self._behind < at else at + 1, stop)
 
     def _end_of_data(self) -> int | None:
         """Where the DataEnd record must be, when the file has its footer."""
@@ -689,19 +721,19 @@ class _Scanner:
             return None
         opcode, length = RECORD_HEAD.unpack_from(raw)
         end = at + _HEAD + length
-        if opcode < _FIRST_PRIVATE and length < _LEAST.get(opcode, 1 << 63):
-            return None
-        if opcode == Opcode.CHUNK:
+        weight = 1 if opcode >= _FIRST_PRIVATE or length >= _LEAST.get(opcode, 1 << 64) else 0
+        if opcode == Opcode.CHUNK and weight:
+            # The one record that may run over the end of the file: it can be told to be real.
             fields = _chunk_head(self._window, at)
             if fields is None or fields.end > end:
                 return None
             return (3 if fields.end == end else 1), end
-        if end > self._window.size:
-            return None
-        if opcode == Opcode.MESSAGE_INDEX:
+        if opcode == Opcode.MESSAGE_INDEX and weight:
             (entries,) = struct.unpack_from("<I", raw, _HEAD + 2)
-            return None if entries + 6 > length or entries % 16 else (2, end)
-        return (3 if opcode == Opcode.DATA_END and length == 4 else 1), end
+            weight = 0 if entries + 6 > length or entries % 16 else 2
+        elif opcode == Opcode.DATA_END and length == 4:
+            weight = 3
+        return (weight, end) if weight and end <= self._window.size else None
 
     def _is_plausible(self, opcode: int, end: int) -> bool:
         if opcode == 0 or end > self._window.size:

@@ -161,7 +161,7 @@ def message_indexes(
     entries = np.empty(len(order), _INDEX_ENTRY)
     entries["log_time"] = log_time[order]
     entries["offset"] = record_offset[order]
-    starts = np.flatnonzero(np.diff(channels, prefix=-1)).tolist()
+    starts = np.flatnonzero(np.diff(channels, prepend=-1)).tolist()
     records: dict[int, bytes] = {}
     for start, end in zip(starts, [*starts[1:], len(channels)], strict=True):
         data = entries[start:end].tobytes()
@@ -174,7 +174,7 @@ def message_indexes(
 
 def arrival_record(chunk_offset: int, seq: NDArray[np.int64]) -> bytes:
     """The record that keeps the arrival numbers of a chunk's messages, in chunk order."""
-    deltas = np.diff(seq, prefix=0).astype("<i8")
+    deltas = np.diff(seq, prepend=0).astype("<i8")
     packed = zstandard.ZstdCompressor(level=1).compress(deltas.tobytes())
     return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, 8 + len(packed), chunk_offset) + packed
 

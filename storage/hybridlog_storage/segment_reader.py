@@ -110,6 +110,10 @@ class SegmentReader:
             os.close(self._fd)
             self._fd = -1
 
+    def __del__(self) -> None:
+        if hasattr(self, "_fd"):
+            self.close()
+
     def __enter__(self) -> SegmentReader:
         """The reader itself."""
         return self

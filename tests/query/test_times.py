@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import time
 from datetime import UTC, date, datetime, timedelta, timezone
 from fractions import Fraction
@@ -179,10 +180,8 @@ def test_iso_like_datetime(moment: datetime) -> None:
 
 @given(st.text(alphabet="0123456789.+-: TZmshdnu"))
 def test_nothing_but_times_and_time_errors(text: str) -> None:
-    try:
+    with contextlib.suppress(TimeError):
         assert 0 <= at(text) < 2**63
-    except TimeError:
-        pass
 
 
 def test_ranges() -> None:
@@ -193,7 +192,9 @@ def test_ranges() -> None:
     assert between(None, None) == (START, END)
     assert between("-10s", None) == (END - 10 * 10**9, END)
     assert parse_range(None, None, start=None, end=None) == (0, 2**63 - 1)
-    with pytest.raises(TimeError, match=r"'\+6s'.*2015-03-03T18:28:39.*'\+5s'.*2015-03-03T18:28:38"):
+    with pytest.raises(
+        TimeError, match=r"'\+6s'.*2015-03-03T18:28:39.*'\+5s'.*2015-03-03T18:28:38"
+    ):
         between("+6s", "+5s")
     with pytest.raises(TimeError, match="not later"):
         between("+6s", "+6s")
@@ -235,7 +236,20 @@ def test_durations(text: object, ns: int) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "-5s", "5 apples", "0.1ns", "s", "1s1s", "1000000d", -1, True, float("nan"), None, "5" * 300],
+    [
+        "",
+        "-5s",
+        "5 apples",
+        "0.1ns",
+        "s",
+        "1s1s",
+        "1000000d",
+        -1,
+        True,
+        float("nan"),
+        None,
+        "5" * 300,
+    ],
 )
 def test_what_is_no_duration(text: object) -> None:
     with pytest.raises(TimeError):

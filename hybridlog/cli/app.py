@@ -1,0 +1,345 @@
+"""Commands and their options. Imports nothing heavy: `--help` answers at once."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hybridlog.cli.complete import complete_recording, complete_topic
+
+app = typer.Typer(
+    name="hybridlog",
+    help=(
+        "Record what a robot says, and ask it.\n\n"
+        "Payloads go into MCAP files, fields into MongoDB, one reader joins the two."
+    ),
+    epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+class ClockName(str, Enum):
+    """Which time a range is about."""
+
+    LOG = "log"
+    PUBLISH = "publish"
+    HEADER = "header"
+
+
+class Compression(str, Enum):
+    """Compression of chunks."""
+
+    ZSTD = "zstd"
+    LZ4 = "lz4"
+    NONE = "none"
+
+
+class FetchFormat(str, Enum):
+    """What `fetch` writes."""
+
+    TABLE = "table"
+    JSONL = "jsonl"
+    CSV = "csv"
+    PARQUET = "parquet"
+    ARROW = "arrow"
+    NPZ = "npz"
+    MCAP = "mcap"
+    BAG = "bag"
+    RAW = "raw"
+
+
+class ExportFormat(str, Enum):
+    """What `export` writes."""
+
+    PARQUET = "parquet"
+    CSV = "csv"
+    MCAP = "mcap"
+    BAG = "bag"
+
+
+StoreOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--store", envvar="HYBRIDLOG_STORE", help="Directory of the store.", metavar="DIR"
+    ),
+]
+MongoOption = Annotated[
+    str | None,
+    typer.Option(
+        "--mongo",
+        envvar="HYBRIDLOG_MONGO_URI",
+        help="URI of the MongoDB that holds the index; without, the embedded one.",
+        metavar="URI",
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")
+]
+RecordingOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--recording",
+        "-r",
+        help="Only this recording (id, name, or the beginning of an id). Repeatable.",
+        autocompletion=complete_recording,
+    ),
+]
+BetweenOption = Annotated[
+    tuple[str, str] | None,
+    typer.Option(
+        help="From T0 up to, not including, T1: ISO 8601, epoch seconds or nanoseconds, "
+        "+5s from the start, -10s from the end.",
+        metavar="T0 T1",
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing files.")]
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,  # noqa: FBT002
+) -> None:
+    """Options before the command."""
+    if version:
+        from hybridlog import __version__
+
+        typer.echo(f"hybridlog {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def record(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files."),
+    ],
+    store: StoreOption = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option("--topics", "-t", help="Only these: name, glob, or re:REGEX. Repeatable."),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None, typer.Option("--exclude", "-x", help="Not these. Repeatable.")
+    ] = None,
+    between: BetweenOption = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the recording; without, the file's.")
+    ] = None,
+    tag: Annotated[
+        list[str] | None, typer.Option(help="Keep KEY=VALUE with it. Repeatable.", metavar="K=V")
+    ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Record it even if its content is in the store.")
+    ] = False,  # noqa: FBT002
+    chunk_size: Annotated[
+        str, typer.Option(help="Uncompressed size of a chunk, such as 512KiB.")
+    ] = "1MiB",
+    compression: Annotated[
+        Compression, typer.Option(help="Compression of chunks.")
+    ] = Compression.ZSTD,
+    level: Annotated[int, typer.Option(help="zstd level, 1 to 19.", min=1, max=19)] = 1,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+    quiet: QuietOption = False,  # noqa: FBT002
+) -> None:
+    """Record logs into the store; each path becomes a recording."""
+    from hybridlog.cli import record as command
+
+    command.run(
+        paths,
+        command.Choices(
+            store, topics, exclude, between, name, tag, again, chunk_size, compression.value,
+            level, mongo, as_json, quiet,
+        ),
+    )
+
+
+@app.command()
+def ls(
+    store: StoreOption = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+) -> None:
+    """List the recordings."""
+    from hybridlog.cli import look
+
+    look.list_recordings(store, mongo, as_json=as_json)
+
+
+@app.command()
+def info(
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            help="A recording or a segment file; without, every recording.",
+            metavar="[RECORDING|SEGMENT]",
+            autocompletion=complete_recording,
+        ),
+    ] = None,
+    store: StoreOption = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+) -> None:
+    """Topics, types, counts, rates, sizes, time span, clock skew, losses."""
+    from hybridlog.cli import look
+
+    look.show_info(what, store, mongo, as_json=as_json)
+
+
+@app.command()
+def schema(
+    topic: Annotated[str, typer.Argument(help="A topic.", autocompletion=complete_topic)],
+    store: StoreOption = None,
+    recording: RecordingOption = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+) -> None:
+    """The message definition of a topic, and the fields that can be asked about."""
+    from hybridlog.cli import look
+
+    look.show_schema(topic, store, recording, mongo, as_json=as_json)
+
+
+@app.command()
+def fetch(
+    topic: Annotated[
+        list[str],
+        typer.Option(
+            "--topic",
+            "-t",
+            help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+            autocompletion=complete_topic,
+        ),
+    ],
+    store: StoreOption = None,
+    between: BetweenOption = None,
+    clock: Annotated[
+        ClockName, typer.Option(help="The time that --between is about.")
+    ] = ClockName.LOG,
+    at: Annotated[
+        str | None, typer.Option(help="Only the message that was current at this time.")
+    ] = None,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(help="Only messages that satisfy: 'ranges.min < 0.5'. Repeatable."),
+    ] = None,
+    recording: RecordingOption = None,
+    limit: Annotated[
+        int | None, typer.Option("--limit", "-n", help="At most so many messages.", min=0)
+    ] = None,
+    every: Annotated[int, typer.Option(help="Only every n-th message.", min=1)] = 1,
+    reverse: Annotated[bool, typer.Option("--reverse", help="Latest first.")] = False,  # noqa: FBT002
+    fields: Annotated[
+        str | None, typer.Option(help="Only these fields: a,b.c", metavar="A,B.C")
+    ] = None,
+    count: Annotated[bool, typer.Option("--count", help="Only print how many.")] = False,  # noqa: FBT002
+    form: Annotated[
+        FetchFormat | None,
+        typer.Option(
+            "--format",
+            "-F",
+            help="Without: by the suffix of -o; a table on a terminal, else jsonl.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write here (raw: a directory).")
+    ] = None,
+    force: ForceOption = False,  # noqa: FBT002
+    mongo: MongoOption = None,
+    quiet: QuietOption = False,  # noqa: FBT002
+) -> None:
+    """Fetch messages by topic, time and content."""
+    from hybridlog.cli import fetch as command
+
+    command.run(
+        command.Choices(
+            topic, store, between, clock.value, at, where, recording, limit, every, reverse,
+            fields, count, form.value if form else None, output, force, mongo, quiet,
+        )
+    )
+
+
+@app.command()
+def export(
+    output: Annotated[Path, typer.Argument(help="File (mcap, bag) or directory (tables).")],
+    form: Annotated[ExportFormat, typer.Option("--format", "-F", help="What to write.")],
+    store: StoreOption = None,
+    recording: RecordingOption = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", "-t", help="Only these. Repeatable.", autocompletion=complete_topic),
+    ] = None,
+    between: BetweenOption = None,
+    force: ForceOption = False,  # noqa: FBT002
+    mongo: MongoOption = None,
+    quiet: QuietOption = False,  # noqa: FBT002
+) -> None:
+    """Export whole recordings; tables get one file a topic."""
+    from hybridlog.cli import export as command
+
+    command.run(output, form.value, store, recording, topic, between, force, mongo, quiet)
+
+
+@app.command()
+def reindex(
+    store: StoreOption = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+    quiet: QuietOption = False,  # noqa: FBT002
+) -> None:
+    """Drop the index and make it again from the segments."""
+    from hybridlog.cli import maintain
+
+    maintain.reindex(store, mongo, as_json=as_json, quiet=quiet)
+
+
+@app.command()
+def verify(
+    recording: Annotated[
+        list[str] | None,
+        typer.Argument(help="Only these recordings.", autocompletion=complete_recording),
+    ] = None,
+    store: StoreOption = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,  # noqa: FBT002
+    quiet: QuietOption = False,  # noqa: FBT002
+) -> None:
+    """Read everything, check checksums and references; exit 1 with a list if something is off."""
+    from hybridlog.cli import maintain
+
+    maintain.verify(recording, store, mongo, as_json=as_json, quiet=quiet)
+
+
+@app.command()
+def rm(
+    recording: Annotated[
+        list[str], typer.Argument(help="Recordings.", autocompletion=complete_recording)
+    ],
+    store: StoreOption = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,  # noqa: FBT002
+    mongo: MongoOption = None,
+) -> None:
+    """Delete recordings, payloads and index."""
+    from hybridlog.cli import maintain
+
+    maintain.remove(recording, store, mongo, yes=yes)
+
+
+@app.command()
+def demo(
+    directory: Annotated[
+        Path, typer.Argument(help="Where the bag and the store of the demo go.")
+    ] = Path("hybridlog-demo"),
+    duration: Annotated[float, typer.Option(help="Seconds of robot time.", min=5)] = 60.0,
+    seed: Annotated[int, typer.Option(help="Another number, another drive.")] = 1,
+) -> None:
+    """Simulate a robot, record what it says, and ask it: a tour in one command."""
+    from hybridlog.demo import tour
+
+    raise typer.Exit(tour.run(directory, duration_s=duration, seed=seed))

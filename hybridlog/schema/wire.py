@@ -1,0 +1,200 @@
+"""Reading the wire formats of ROS 1 and ROS 2 (CDR) by columns.
+
+For all messages of one type in a chunk, each field is gathered with one numpy
+operation. Payloads are untrusted: what does not fit its definition is reported by row
+with a reason, and everything else is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from hybridlog.schema.column import Records
+from hybridlog.schema.wire_gather import Source, concatenate, take
+from hybridlog.schema.wire_program import Wire, compile_type
+from hybridlog.schema.wire_scan import MisfitError, Scanner
+from hybridlog.schema.wire_walk import Walker
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.definition import MessageType
+    from hybridlog_storage.messages import Buffer
+
+_HEADER = 4
+_LITTLE = 0x0001
+_BIG = 0x0000
+_OTHER_ENCAPSULATIONS = {
+    0x0002: "PL_CDR",
+    0x0003: "PL_CDR",
+    0x0006: "XCDR2",
+    0x0007: "XCDR2",
+    0x0008: "XCDR2 (delimited)",
+    0x0009: "XCDR2 (delimited)",
+    0x000A: "XCDR2 (parameter list)",
+    0x000B: "XCDR2 (parameter list)",
+}
+
+
+@dataclass(slots=True)
+class Unreadable:
+    """Rows that do not fit the definition, all for the same reason.
+
+    Attributes:
+        rows: Rows of the input, ascending.
+        reason: What is wrong and where, without the topic or the file.
+    """
+
+    rows: NDArray[np.intp]
+    reason: str
+
+
+@dataclass(slots=True)
+class Decoded:
+    """What was read.
+
+    Attributes:
+        rows: Rows of the input that could be read, ascending.
+        records: Their columns; as many rows as `rows`.
+        unreadable: The other rows, each in one of these.
+    """
+
+    rows: NDArray[np.intp]
+    records: Records
+    unreadable: list[Unreadable]
+
+
+class WireReader:
+    """Reads payloads of one message type.
+
+    Args:
+        message_type: What the payloads hold.
+        wire: Their format.
+        fields: Dotted paths of the fields to read, top-level or nested (`header.stamp`,
+            `transforms[].child_frame_id`; the brackets may be left out). A path takes
+            everything below it. Paths that do not exist are ignored. None reads all.
+            Fields that are not read are checked all the same.
+
+    Raises:
+        DefinitionError: The type cannot be read with bounded effort.
+    """
+
+    def __init__(
+        self, message_type: MessageType, wire: Wire, fields: Collection[str] | None = None
+    ) -> None:
+        self._wire: Wire = wire
+        self._program = compile_type(message_type, wire, fields)
+
+    def read(self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]) -> Decoded:
+        """Read payloads. Never raises for what is in them.
+
+        Large arrays of a single row may be views into `buffer`.
+
+        Args:
+            buffer: Holds the payloads.
+            offset: int64[n], where each payload starts.
+            length: int64[n], bytes of each payload.
+        """
+        offset = np.asarray(offset, np.int64)
+        end = offset + np.asarray(length, np.int64)
+        bad: dict[str, list[NDArray[np.intp]]] = {}
+        rows: NDArray[np.intp] | None = None
+        outside = (offset < 0) | (end < offset) | (end > memoryview(buffer).nbytes)
+        if bool(outside.any()):
+            rows = np.flatnonzero(~outside)
+            bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
+        if self._wire == "ros1":
+            everything = np.arange(len(offset)) if rows is None else rows
+            good, records = self._read(Source(buffer, "<"), everything, offset, end, bad)
+        else:
+            good, records = self._read_cdr(buffer, rows, offset, end, bad)
+        unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in bad.items()]
+        return Decoded(good, records, unreadable)
+
+    def _read_cdr(
+        self,
+        buffer: Buffer,
+        rows: NDArray[np.intp] | None,
+        offset: NDArray[np.int64],
+        end: NDArray[np.int64],
+        bad: dict[str, list[NDArray[np.intp]]],
+    ) -> tuple[NDArray[np.intp], Records]:
+        """Split the rows by byte order, read both, and merge them."""
+        if rows is None:
+            rows = np.arange(len(offset))
+        short = end[rows] - offset[rows] < _HEADER
+        if bool(short.any()):
+            bad["is shorter than a CDR header"] = [rows[short]]
+            rows = rows[~short]
+        start = offset + _HEADER
+        little = Source(buffer, "<")
+        if len(rows) == 0:
+            return self._read(little, rows, start, end, bad)
+        begin = offset[rows]
+        kind = little.u1(begin, 0).astype(np.int64) << 8
+        kind |= little.u1(begin, 1)
+        if bool((kind == _LITTLE).all()):
+            return self._read(little, rows, start, end, bad)
+        for code in np.unique(kind).tolist():
+            if code not in {_LITTLE, _BIG}:
+                name = _OTHER_ENCAPSULATIONS.get(code, "unknown")
+                bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]
+        orders: tuple[tuple[Literal["<", ">"], int], ...] = (("<", _LITTLE), (">", _BIG))
+        (first_rows, first), (second_rows, second) = (
+            self._read(Source(buffer, order), rows[kind == code], start, end, bad)
+            for order, code in orders
+        )
+        if len(second_rows) == 0:
+            return first_rows, first
+        if len(first_rows) == 0:
+            return second_rows, second
+        both = np.concatenate([first_rows, second_rows])
+        order = np.argsort(both)
+        merged = take(concatenate(first, second), order)
+        assert isinstance(merged, Records)
+        return both[order], merged
+
+    def _read(
+        self,
+        source: Source,
+        rows: NDArray[np.intp],
+        start: NDArray[np.int64],
+        end: NDArray[np.int64],
+        bad: dict[str, list[NDArray[np.intp]]],
+    ) -> tuple[NDArray[np.intp], Records]:
+        """Read rows of one byte order; those that do not fit go to `bad`."""
+        walker = Walker(source, self._wire)
+        try:
+            column = walker.read(self._program, start[rows], end[rows])
+        except MisfitError:
+            rows = self._sort_out(source, rows, start, end, bad)
+            column = walker.read(self._program, start[rows], end[rows])
+        if column is None:
+            return rows, Records({}, len(rows))
+        assert isinstance(column, Records)
+        return rows, column
+
+    def _sort_out(
+        self,
+        source: Source,
+        rows: NDArray[np.intp],
+        start: NDArray[np.int64],
+        end: NDArray[np.int64],
+        bad: dict[str, list[NDArray[np.intp]]],
+    ) -> NDArray[np.intp]:
+        """The rows that fit, after each was looked at on its own."""
+        scanner = Scanner(source, self._wire)
+        good = np.ones(len(rows), np.bool_)
+        places = zip(rows.tolist(), start[rows].tolist(), end[rows].tolist(), strict=True)
+        for index, (row, begin, finish) in enumerate(places):
+            try:
+                scanner.check(self._program, begin, finish)
+            except MisfitError as misfit:
+                good[index] = False
+                bad.setdefault(str(misfit), []).append(np.array([row], np.intp))
+        return rows[good]

@@ -1,0 +1,224 @@
+"""Gathering columns out of a buffer, and putting rows of columns into another order."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, TypeVar, cast
+
+import numpy as np
+
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.definition import Instant, Primitive
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.wire_program import Fixed
+    from hybridlog_storage.messages import Buffer
+
+# From here on a single row is a view into the buffer: below, a copy costs less than
+# keeping the whole buffer alive.
+_VIEW_BYTES = 4096
+# numpy's void type counts its bytes in 31 bits, and gains nothing for long blocks.
+_LONG_BLOCK = 1 << 16
+# Rows of equal length are copied together when that pays for finding them.
+_MAX_GROUPS = 32
+_ROWS_A_GROUP = 16
+
+
+class Source:
+    """Reads from a buffer at many positions at once.
+
+    Each gather indexes a view of the buffer that has an element at every byte: the
+    elements overlap, and nothing but the chosen ones is touched. Callers have checked
+    that all they ask for lies within the payloads.
+    """
+
+    def __init__(self, buffer: Buffer, order: Literal["<", ">"]) -> None:
+        """Read numbers of one byte order (`<` little endian, `>` big endian)."""
+        self.buffer = memoryview(buffer).cast("B")
+        self.order = order
+        self._length = len(self.buffer)
+
+    def _gather(
+        self, dtype: str | np.dtype[np.generic], size: int, base: NDArray[np.int64], delta: int
+    ) -> NDArray[np.generic]:
+        view: NDArray[np.generic] = np.ndarray(
+            (self._length - delta - size + 1,),
+            dtype,
+            buffer=self.buffer,
+            offset=delta,
+            strides=(1,),
+        )
+        return view[base]
+
+    def u1(self, base: NDArray[np.int64], delta: int) -> NDArray[np.uint8]:
+        """The byte at each `base + delta`."""
+        return cast("NDArray[np.uint8]", self._gather("u1", 1, base, delta))
+
+    def u4(self, base: NDArray[np.int64], delta: int) -> NDArray[np.int64]:
+        """The 32-bit unsigned number at each `base + delta`."""
+        return self._gather(f"{self.order}u4", 4, base, delta).astype(np.int64)
+
+    def block(self, base: NDArray[np.int64], delta: int, size: int) -> NDArray[np.uint8]:
+        """`size` bytes from each `base + delta`, one row after the other: uint8[n * size]."""
+        if size == 0:
+            return np.empty(0, np.uint8)
+        if len(base) == 1 and size >= _VIEW_BYTES:
+            return np.frombuffer(self.buffer, np.uint8, size, int(base[0]) + delta)
+        if size >= _LONG_BLOCK:
+            return self._join((base + delta).tolist(), [size] * len(base))
+        return cast("NDArray[np.uint8]", self._gather(f"V{size}", size, base, delta).view("u1"))
+
+    def ragged(self, start: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """`size[i]` bytes from `start[i]`, one row after the other."""
+        if len(start) >= 2 * _ROWS_A_GROUP and int(size.max()) < _LONG_BLOCK:
+            sizes, group = np.unique(size, return_inverse=True)
+            if len(sizes) <= _MAX_GROUPS and len(sizes) * _ROWS_A_GROUP <= len(start):
+                return self._by_size(start, size, sizes, group)
+        return self._join(start.tolist(), size.tolist())
+
+    def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
+        buffer = self.buffer
+        # A bytearray, since arrays over bytes would be read-only.
+        joined = bytearray().join(
+            [buffer[at : at + count] for at, count in zip(start, size, strict=True)]
+        )
+        return np.frombuffer(joined, np.uint8) if joined else np.empty(0, np.uint8)
+
+    def _by_size(
+        self,
+        start: NDArray[np.int64],
+        size: NDArray[np.int64],
+        sizes: NDArray[np.int64],
+        group: NDArray[np.intp],
+    ) -> NDArray[np.uint8]:
+        offset = np.cumsum(size) - size
+        target = np.empty(int(size.sum()), np.uint8)
+        for number, count in enumerate(sizes.tolist()):
+            if count == 0:
+                continue
+            rows = np.flatnonzero(group == number)
+            view: NDArray[np.void] = np.ndarray(
+                (len(target) - count + 1,), f"V{count}", buffer=target, strides=(1,)
+            )
+            view[offset[rows]] = self._gather(f"V{count}", count, start[rows], 0)
+        return target
+
+    def numbers(self, data: NDArray[np.uint8], kind: Primitive) -> NDArray[np.generic]:
+        """Gathered bytes as aligned numbers of native byte order."""
+        if kind.dtype.kind == "b":
+            return data.astype(np.bool_)
+        values = data.view(kind.dtype.newbyteorder(self.order))
+        return values.astype(kind.dtype, copy=not values.flags.aligned)
+
+    def instants(self, data: NDArray[np.uint8], kind: Instant) -> NDArray[np.int64]:
+        """Gathered bytes as nanoseconds."""
+        signed = data.view(f"{self.order}i4").reshape(-1, 2)
+        unsigned = data.view(f"{self.order}u4").reshape(-1, 2)
+        seconds = (signed if kind.signed_seconds else unsigned)[:, 0].astype(np.int64)
+        seconds *= 1_000_000_000
+        seconds += (signed if kind.signed_nanoseconds else unsigned)[:, 1]
+        return seconds
+
+    def fixed(self, item: Fixed, base: NDArray[np.int64], delta: int) -> Column:
+        """The column of a field of fixed size at each `base + delta`."""
+        kind = item.kind
+        if isinstance(kind, Instant):
+            times = self.instants(self.block(base, delta, item.size), kind)
+            column = Scalars(times, kind.kind)
+        else:
+            assert kind is not None
+            column = Scalars(self._primitive(item, kind, base, delta))
+        if item.width is None:
+            return column
+        return Arrays(column, even_offsets(len(base), item.width), item.width)
+
+    def _primitive(
+        self, item: Fixed, kind: Primitive, base: NDArray[np.int64], delta: int
+    ) -> NDArray[np.generic]:
+        if item.width is not None:
+            return self.numbers(self.block(base, delta, item.size), kind)
+        if kind.dtype.kind == "b":
+            return self.u1(base, delta).astype(np.bool_)
+        values = self._gather(kind.dtype.newbyteorder(self.order), item.size, base, delta)
+        return values.astype(kind.dtype, copy=False)
+
+
+def empty_fixed(item: Fixed) -> Column:
+    """The column of a field of fixed size for no rows."""
+    if isinstance(item.kind, Instant):
+        column = Scalars(np.empty(0, np.int64), item.kind.kind)
+    else:
+        assert item.kind is not None
+        column = Scalars(np.empty(0, item.kind.dtype))
+    if item.width is None:
+        return column
+    return Arrays(column, np.zeros(1, np.int64), item.width)
+
+
+def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
+    """Offsets of rows of `width` elements each: int64[rows + 1]."""
+    return np.arange(rows + 1, dtype=np.int64) * width
+
+
+def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Offsets of rows of so many elements each: int64[n + 1], starting with 0."""
+    result = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=result[1:])
+    return result
+
+
+def within(counts: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of each element within its row: 0, 1, ..., counts[0] - 1, 0, 1, ..."""
+    index = np.arange(int(offset[-1]), dtype=np.int64)
+    index -= np.repeat(offset[:-1], counts)
+    return index
+
+
+_AnyColumn = TypeVar("_AnyColumn", bound=Column)
+
+
+def take(column: Column, rows: NDArray[np.int64]) -> Column:
+    """The chosen rows of a column, in the order chosen."""
+    if isinstance(column, Scalars):
+        return Scalars(column.values[rows], column.kind)
+    if isinstance(column, Records):
+        return Records(
+            {name: take(inner, rows) for name, inner in column.fields.items()}, len(rows)
+        )
+    counts = np.diff(column.offset)[rows]
+    offset = offsets(counts)
+    chosen = within(counts, offset)
+    chosen += np.repeat(column.offset[:-1][rows], counts)
+    if isinstance(column, Strings):
+        return Strings(column.data[chosen], offset)
+    return Arrays(take(column.values, chosen), offset, column.width)
+
+
+def concatenate(first: _AnyColumn, second: _AnyColumn) -> _AnyColumn:
+    """The rows of one column, then those of another of the same type."""
+    result: Column
+    if isinstance(first, Scalars) and isinstance(second, Scalars):
+        result = Scalars(np.concatenate([first.values, second.values]), first.kind)
+    elif isinstance(first, Strings) and isinstance(second, Strings):
+        result = Strings(
+            np.concatenate([first.data, second.data]), _join_offsets(first.offset, second.offset)
+        )
+    elif isinstance(first, Arrays) and isinstance(second, Arrays):
+        result = Arrays(
+            concatenate(first.values, second.values),
+            _join_offsets(first.offset, second.offset),
+            first.width,
+        )
+    else:
+        assert isinstance(first, Records)
+        assert isinstance(second, Records)
+        result = Records(
+            {name: concatenate(first.fields[name], second.fields[name]) for name in first.fields},
+            first.rows + second.rows,
+        )
+    return cast("_AnyColumn", result)
+
+
+def _join_offsets(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.concatenate([first, second[1:] + first[-1]])

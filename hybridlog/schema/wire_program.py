@@ -1,0 +1,382 @@
+"""Message types compiled into the steps that a reader of their wire form takes.
+
+Nested messages disappear here: a program is a flat list of steps. Neighbouring fields
+of fixed size form one run, whose layout (offsets from where it starts, alignment
+included) is worked out once for each phase at which it can start. Wherever a wanted
+field ends up, its column goes to a numbered slot; a tree of names puts the slots
+together again.
+
+Phases: CDR aligns numbers to their size, counted from the end of the encapsulation
+header. The phase of a position is its distance from there modulo 8. ROS 1 does not
+align; there every alignment is 1 and the phase is always 0.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from hybridlog.schema.column import Column, Records
+from hybridlog.schema.definition import ArrayOf, FieldType, Instant, MessageType, Primitive, Text
+from hybridlog_storage.errors import DefinitionError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+Wire: TypeAlias = Literal["ros1", "cdr"]
+Wanted: TypeAlias = "bool | dict[str, Wanted]"
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A wanted field that is a column.
+
+    Attributes:
+        slot: Where the column is put.
+    """
+
+    slot: int
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """A message: its wanted fields in the order of the definition."""
+
+    fields: tuple[tuple[str, Node], ...]
+
+
+Node: TypeAlias = Leaf | Branch
+
+
+def assemble(node: Node, slots: list[Column | None], rows: int) -> Column:
+    """The column of a tree of names from its filled slots.
+
+    Args:
+        node: The tree.
+        slots: Columns, each of `rows` rows.
+        rows: Number of rows, which a message without fields cannot tell.
+    """
+    if isinstance(node, Leaf):
+        column = slots[node.slot]
+        assert column is not None
+        return column
+    return Records({name: assemble(inner, slots, rows) for name, inner in node.fields}, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A field that always takes the same number of bytes.
+
+    Attributes:
+        path: Dotted path, for messages.
+        align: Alignment in bytes.
+        size: Bytes.
+        slot: Where its column goes, None when it is not wanted.
+        kind: What it is; None for bytes that mean nothing.
+        width: Number of elements of a fixed array, None for a single value.
+    """
+
+    path: str
+    align: int
+    size: int
+    slot: int | None
+    kind: Primitive | Instant | None
+    width: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the fields of a part of a run lie, from a start of known phase.
+
+    Attributes:
+        stop: Index of the first field that is not part of it.
+        size: Bytes from the start to the end of the last field.
+        wanted: Distance from the start and field, for the wanted ones.
+    """
+
+    stop: int
+    size: int
+    wanted: tuple[tuple[int, Fixed], ...]
+
+
+@dataclass(slots=True)
+class Run:
+    """Neighbouring fields of fixed size."""
+
+    fields: tuple[Fixed, ...]
+    _layouts: dict[tuple[int, int, int], Layout] = field(default_factory=dict)
+    _sizes: list[int | None] = field(default_factory=lambda: [None] * 8)
+
+    def layout(self, first: int, phase: int, modulus: int) -> Layout:
+        """Layout from field `first` on, as far as the known phase reaches.
+
+        Args:
+            first: Index of a field. When its alignment is larger than `modulus`, the
+                layout is empty.
+            phase: Phase of the start, modulo `modulus`.
+            modulus: 1, 2, 4 or 8. Fields of larger alignment cannot be placed.
+        """
+        key = (first, phase, modulus)
+        found = self._layouts.get(key)
+        if found is None:
+            found = self._layouts[key] = self._place(first, phase, modulus)
+        return found
+
+    def _place(self, first: int, phase: int, modulus: int) -> Layout:
+        at = phase
+        stop = first
+        wanted = []
+        for item in self.fields[first:]:
+            if item.align > modulus:
+                break
+            at += -at & (item.align - 1)
+            if item.slot is not None:
+                wanted.append((at - phase, item))
+            at += item.size
+            stop += 1
+        return Layout(stop, at - phase, tuple(wanted))
+
+    def size(self, phase: int) -> int:
+        """Bytes of the whole run from a start of that phase (0 to 7)."""
+        size = self._sizes[phase]
+        if size is None:
+            size = self._sizes[phase] = self.layout(0, phase, 8).size
+        return size
+
+    def cut(self, phase: int, room: int) -> str:
+        """Path of the first field that does not fit into `room` bytes."""
+        ends = []
+        at = phase
+        for item in self.fields:
+            at += (-at & (item.align - 1)) + item.size
+            ends.append(at - phase)
+        return self.fields[bisect_right(ends, room)].path
+
+
+@dataclass(frozen=True, slots=True)
+class TextStep:
+    """A string: its length in 32 bits, then its bytes (in CDR with a final NUL)."""
+
+    path: str
+    slot: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class NumbersStep:
+    """A sequence of numbers: their count in 32 bits, then the numbers."""
+
+    path: str
+    slot: int | None
+    kind: Primitive
+    align: int
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayStep:
+    """An array or a sequence of anything else.
+
+    Attributes:
+        path: Dotted path, for messages.
+        slot: Where its column goes, None when nothing of it is wanted.
+        width: Number of elements; None when the count is on the wire.
+        element: Reads one element.
+    """
+
+    path: str
+    slot: int | None
+    width: int | None
+    element: Program
+
+
+Step: TypeAlias = Run | TextStep | NumbersStep | ArrayStep
+
+
+@dataclass(slots=True)
+class Program:
+    """Steps that read one message, or one element of an array.
+
+    Attributes:
+        steps: In wire order.
+        slots: Number of slots.
+        root: Puts the slots together; None when nothing is wanted.
+        least: Bytes that it takes at the least.
+        align: Largest alignment of the fields of fixed size in it.
+        fixed: True when it takes the same number of bytes from starts of the same phase.
+    """
+
+    steps: tuple[Step, ...]
+    slots: int
+    root: Node | None
+    least: int = field(init=False)
+    align: int = field(init=False)
+    fixed: bool = field(init=False)
+    _sizes: list[int | None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._sizes = [None] * 8
+        self.least = sum(_least(step) for step in self.steps)
+        self.align = max((_align(step) for step in self.steps), default=1)
+        self.fixed = all(_is_fixed(step) for step in self.steps)
+
+    def size(self, phase: int) -> int:
+        """Bytes from a start of that phase (0 to 7). Only for fixed programs."""
+        size = self._sizes[phase]
+        if size is None:
+            at = phase
+            for step in self.steps:
+                if isinstance(step, Run):
+                    at += step.size(at & 7)
+                elif isinstance(step, ArrayStep) and step.width is not None:
+                    at += step.element.span(at & 7, step.width)
+            size = self._sizes[phase] = at - phase
+        return size
+
+    def span(self, phase: int, count: int) -> int:
+        """Bytes of `count` elements one after the other. Only for fixed programs.
+
+        From the second element on all start at the same phase modulo `align`: a member
+        of that alignment comes before each of them, always at the same distance.
+        """
+        if count == 0:
+            return 0
+        first = self.size(phase)
+        return first + (count - 1) * self.size((phase + first) & 7)
+
+
+def _least(step: Step) -> int:
+    if isinstance(step, Run):
+        return sum(item.size for item in step.fields)
+    if isinstance(step, ArrayStep) and step.width is not None:
+        return step.width * step.element.least
+    return 4
+
+
+def _align(step: Step) -> int:
+    if isinstance(step, Run):
+        return max(item.align for item in step.fields)
+    return step.element.align if isinstance(step, ArrayStep) else 1
+
+
+def _is_fixed(step: Step) -> bool:
+    if isinstance(step, ArrayStep):
+        return step.width is not None and step.element.fixed
+    return isinstance(step, Run)
+
+
+def wanted_tree(fields: Collection[str] | None) -> Wanted:
+    """Paths as a tree of names; True stands for everything below.
+
+    Args:
+        fields: Dotted paths, `[]` after array names optional. None is everything.
+    """
+    if fields is None:
+        return True
+    tree: dict[str, Wanted] = {}
+    for path in sorted(fields):
+        *parents, last = path.replace("[]", "").split(".")
+        node = tree
+        for name in parents:
+            inner = node.setdefault(name, {})
+            if not isinstance(inner, dict):
+                break
+            node = inner
+        else:
+            node[last] = True
+    return tree
+
+
+class _Compiler:
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._steps: list[Step] = []
+        self._run: list[Fixed] = []
+        self._slots = 0
+
+    def program(self, field_type: FieldType, path: str, wanted: Wanted) -> Program:
+        root = self._add(field_type, path, wanted)
+        self._flush()
+        return Program(tuple(self._steps), self._slots, root)
+
+    def _flush(self) -> None:
+        if self._run:
+            self._steps.append(Run(tuple(self._run)))
+            self._run = []
+
+    def _leaf(self, wanted: Wanted) -> Leaf | None:
+        # A path that goes on below a leaf leads nowhere.
+        if wanted is not True:
+            return None
+        self._slots += 1
+        return Leaf(self._slots - 1)
+
+    def _align(self, size: int) -> int:
+        return size if self._wire == "cdr" else 1
+
+    def _add(self, field_type: FieldType, path: str, wanted: Wanted) -> Node | None:
+        if isinstance(field_type, MessageType):
+            return self._message(field_type, path, wanted)
+        if isinstance(field_type, ArrayOf):
+            return self._array(field_type, path, wanted)
+        leaf = self._leaf(wanted)
+        slot = leaf.slot if leaf is not None else None
+        if isinstance(field_type, Text):
+            self._flush()
+            self._steps.append(TextStep(path, slot))
+        else:
+            self._fixed(field_type, path, slot, None)
+        return leaf
+
+    def _fixed(
+        self, kind: Primitive | Instant, path: str, slot: int | None, width: int | None
+    ) -> None:
+        size, align = (8, 4) if isinstance(kind, Instant) else (kind.dtype.itemsize,) * 2
+        total = size * (1 if width is None else width)
+        self._run.append(Fixed(path, self._align(align), total, slot, kind, width))
+
+    def _message(self, message: MessageType, path: str, wanted: Wanted) -> Branch | None:
+        if not message.fields and self._wire == "cdr":
+            # IDL knows no empty struct, so ROS 2 sends one byte in its place.
+            self._run.append(Fixed(path or message.name, 1, 1, None, None, None))
+        found: list[tuple[str, Node]] = []
+        for name, field_type in message.fields:
+            below = wanted if isinstance(wanted, bool) else wanted.get(name, False)
+            node = self._add(field_type, f"{path}.{name}" if path else name, below)
+            if node is not None:
+                found.append((name, node))
+        return Branch(tuple(found)) if found or wanted is True else None
+
+    def _array(self, array: ArrayOf, path: str, wanted: Wanted) -> Leaf | None:
+        element = array.element
+        if isinstance(element, Primitive | Instant) and array.width is not None:
+            leaf = self._leaf(wanted)
+            self._fixed(element, path, leaf.slot if leaf is not None else None, array.width)
+            return leaf
+        self._flush()
+        if isinstance(element, Primitive):
+            leaf = self._leaf(wanted)
+            slot = leaf.slot if leaf is not None else None
+            align = self._align(element.dtype.itemsize)
+            self._steps.append(NumbersStep(path, slot, element, align))
+            return leaf
+        inner = _Compiler(self._wire).program(element, f"{path}[]", wanted)
+        if inner.least == 0 and inner.steps:
+            raise DefinitionError(f"not indexed: {path} nests arrays of messages without fields")
+        leaf = self._leaf(inner.root is not None)
+        slot = leaf.slot if leaf is not None else None
+        self._steps.append(ArrayStep(path, slot, array.width, inner))
+        return leaf
+
+
+def compile_type(message_type: MessageType, wire: Wire, fields: Collection[str] | None) -> Program:
+    """Compile a message type.
+
+    Args:
+        message_type: The type.
+        wire: Wire format.
+        fields: Dotted paths of the fields to gather, None for all. Unknown ones are ignored.
+
+    Raises:
+        DefinitionError: Elements that take no bytes hold arrays themselves.
+    """
+    return _Compiler(wire).program(message_type, "", wanted_tree(fields))

@@ -1,0 +1,144 @@
+"""Walking over one payload, value by value, to check it or to measure it.
+
+This is the slow twin of the column reader. It says what is wrong with a payload and
+where, and it finds the elements of an array when there are too few rows for arithmetic
+on whole columns to pay. Nothing is allocated, and a claimed length is believed only
+when that many bytes are left.
+"""
+
+from __future__ import annotations
+
+from struct import Struct
+from typing import TYPE_CHECKING
+
+from hybridlog.schema.wire_program import ArrayStep, NumbersStep, Run, TextStep
+
+if TYPE_CHECKING:
+    from hybridlog.schema.wire_gather import Source
+    from hybridlog.schema.wire_program import Program, Step, Wire
+
+MAX_EMPTY_ELEMENTS = 1_000_000
+"""Most elements of an array whose elements take no bytes."""
+MAX_TRAILING = {"ros1": 0, "cdr": 7}
+"""Most bytes that may follow the message in its payload."""
+
+_U4 = {"<": Struct("<I"), ">": Struct(">I")}
+
+
+class MisfitError(Exception):
+    """A payload does not fit its definition; the message says where."""
+
+
+class Scanner:
+    """Walks over payloads of one buffer."""
+
+    def __init__(self, source: Source, wire: Wire) -> None:
+        self._buffer = source.buffer
+        self._u4 = _U4[source.order].unpack_from
+        self._cdr = wire == "cdr"
+        self._mask = 7 if self._cdr else 0
+        self._trailing = MAX_TRAILING[wire]
+
+    def check(self, program: Program, start: int, end: int) -> None:
+        """Walk over a whole message.
+
+        Args:
+            program: The message.
+            start: First byte; in CDR the one after the encapsulation header.
+            end: End of the payload.
+
+        Raises:
+            MisfitError: The payload does not fit.
+        """
+        rest = end - self.walk(program, start, end, start)
+        if rest > self._trailing:
+            raise MisfitError(f"{rest} bytes left over: the definition does not fit")
+
+    def walk(self, program: Program, at: int, end: int, origin: int) -> int:
+        """The position after one message or element.
+
+        Args:
+            program: What stands there.
+            at: Where it starts.
+            end: End of the payload.
+            origin: Where alignment counts from.
+
+        Raises:
+            MisfitError: The payload does not fit.
+        """
+        for step in program.steps:
+            if isinstance(step, Run):
+                size = step.size((at - origin) & self._mask)
+                if size > end - at:
+                    path = step.cut((at - origin) & self._mask, end - at)
+                    raise MisfitError(f"ends in the middle of field {path}")
+                at += size
+            elif isinstance(step, TextStep):
+                at = self._text(step, at, end, origin)
+            elif isinstance(step, NumbersStep):
+                at = self._numbers(step, at, end, origin)
+            else:
+                at = self._array(step, at, end, origin)
+        return at
+
+    def _count(self, step: Step, at: int, end: int, origin: int) -> tuple[int, int]:
+        """A length in 32 bits, and the position after it."""
+        assert not isinstance(step, Run)
+        at += (origin - at) & self._mask & 3
+        if end - at < 4:
+            raise MisfitError(f"ends in the middle of field {step.path}")
+        return self._u4(self._buffer, at)[0], at + 4
+
+    def _text(self, step: TextStep, at: int, end: int, origin: int) -> int:
+        size, at = self._count(step, at, end, origin)
+        if size > end - at:
+            raise MisfitError(f"{step.path} claims {size} bytes, {end - at} bytes remain")
+        at += size
+        if self._cdr and size and self._buffer[at - 1]:
+            raise MisfitError(f"{step.path} does not end with NUL")
+        return at
+
+    def _numbers(self, step: NumbersStep, at: int, end: int, origin: int) -> int:
+        count, at = self._count(step, at, end, origin)
+        if count == 0:
+            return at
+        room = end - at
+        at += (origin - at) & (step.align - 1)
+        size = count * step.kind.dtype.itemsize
+        if size > end - at:
+            raise MisfitError(f"{step.path} claims {count} elements, {room} bytes remain")
+        return at + size
+
+    def _array(self, step: ArrayStep, at: int, end: int, origin: int) -> int:
+        count = step.width
+        if count is None:
+            count, at = self._count(step, at, end, origin)
+        element = step.element
+        if element.least == 0:
+            if count > MAX_EMPTY_ELEMENTS:
+                raise MisfitError(f"{step.path} claims {count} elements that take no bytes")
+            return at
+        if count * element.least > end - at:
+            raise MisfitError(f"{step.path} claims {count} elements, {end - at} bytes remain")
+        if element.fixed:
+            size = element.span((at - origin) & self._mask, count)
+            if size > end - at:
+                raise MisfitError(f"{step.path} claims {count} elements, {end - at} bytes remain")
+            return at + size
+        for _ in range(count):
+            at = self.walk(element, at, end, origin)
+        return at
+
+    def elements(
+        self, program: Program, at: int, end: int, origin: int, count: int
+    ) -> tuple[list[int], int]:
+        """Where each of `count` elements starts, and the position after the last.
+
+        Raises:
+            MisfitError: The payload does not fit.
+        """
+        starts = []
+        for _ in range(count):
+            starts.append(at)
+            at = self.walk(program, at, end, origin)
+        return starts, at

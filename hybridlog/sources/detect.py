@@ -1,0 +1,256 @@
+"""Opens any log by what it contains; names and extensions decide nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from hybridlog.sources import spool
+from hybridlog.sources.base import Damage, Source, cannot_open
+from hybridlog.sources.joined import JoinedSource, Part
+from hybridlog.sources.rosbag2 import locate, read_metadata
+from hybridlog.sources.rosbag2_metadata import NAME, BagMetadata
+from hybridlog_storage.errors import SourceError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_BAG = b"#ROSBAG V"
+_OLD_BAG = b"#ROSRECORD V"
+_SQLITE = b"SQLite format 3\x00"
+_MCAP = b"\x89MCAP"
+
+_KINDS = (
+    "ROS 1 bags (.bag, .bag.active), ROS 2 bags (directories, .db3, .mcap, also with .zstd) "
+    "and MCAP files"
+)
+
+
+class Format(Enum):
+    """What the content of a file says it is; the value is for people."""
+
+    BAG = "ROS 1 bag"
+    SQLITE = "ROS 2 bag (sqlite3)"
+    MCAP = "MCAP"
+    OTHER = "unknown"
+
+
+def open_source(path: Path) -> Source:
+    """Opens a log: a file, or the directory of a ROS 2 bag or of a split log.
+
+    A directory without `metadata.yaml` is read when it holds exactly one log, or the
+    parts of one log that was split.
+
+    Raises:
+        SourceError: There is nothing to read: the path is missing, may not be read, is
+            empty, of no known kind, encrypted or of an old version, or a directory
+            without a log. The message says which and what to do.
+    """
+    try:
+        if path.is_dir():
+            return _open_directory(path)
+        path.stat()
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    if path.name == NAME:
+        return _open_directory(path.parent)
+    if not path.is_file():
+        raise SourceError(f"{path}: neither a file nor a directory; give the path of a log")
+    metadata = read_metadata(path.parent)
+    if isinstance(metadata, BagMetadata) and path.name in metadata.files:
+        found = sniff(path)
+        if found[0] in {Format.SQLITE, Format.MCAP}:
+            return _join(path, [path], metadata)
+    return _open_file(path)
+
+
+def sniff(path: Path) -> tuple[Format, bool]:
+    """Tells what a file is from its first bytes.
+
+    Returns:
+        The format, and whether the file is a zstd file that holds it.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_SQLITE))
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    is_packed = head.startswith(spool.ZSTD_MAGIC)
+    if is_packed:
+        head = spool.peek(path, len(_SQLITE))
+    if head.startswith((_BAG, _OLD_BAG)):
+        return Format.BAG, is_packed
+    if head.startswith(_SQLITE):
+        return Format.SQLITE, is_packed
+    if head.startswith(_MCAP):
+        return Format.MCAP, is_packed
+    return Format.OTHER, is_packed
+
+
+def _open_file(path: Path) -> Source:
+    """Opens one file on its own."""
+    found, is_packed = sniff(path)
+    if found is Format.OTHER:
+        raise _unknown(path, is_packed=is_packed)
+    if is_packed:
+        return _join(path, [path], None)
+    source = _open_plain(path)
+    if not getattr(source, "packed_messages", False):
+        return source
+    source.close()
+    return _join(path, [path], None)
+
+
+def _open_plain(path: Path) -> Source:
+    """Opens one uncompressed file with the reader of its format."""
+    # Each reader brings libraries of its own; only the one that is needed is loaded.
+    found, _ = sniff(path)
+    if found is Format.BAG:
+        from hybridlog.sources.rosbag1 import Rosbag1Source  # noqa: PLC0415
+
+        return Rosbag1Source(path)
+    if found is Format.SQLITE:
+        from hybridlog.sources.rosbag2_sqlite import SqliteSource  # noqa: PLC0415
+
+        return SqliteSource(path)
+    if found is Format.MCAP:
+        from hybridlog.sources.mcap import McapSource  # noqa: PLC0415
+
+        return McapSource(path)
+    raise _unknown(path, is_packed=False)
+
+
+def _unknown(path: Path, *, is_packed: bool) -> SourceError:
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        return cannot_open(path, error)
+    if size == 0:
+        return SourceError(
+            f"{path}: the file is empty; record or copy it again, there is nothing in it"
+        )
+    if is_packed:
+        return SourceError(
+            f"{path}: a zstd file that holds no log, or a damaged one; check it with `zstd -t`"
+        )
+    return SourceError(f"{path}: not a log of a known kind; hybridlog reads {_KINDS}")
+
+
+def _open_directory(folder: Path) -> Source:
+    metadata = read_metadata(folder)
+    if isinstance(metadata, BagMetadata):
+        files, missing = locate(folder, metadata)
+        return _join(folder, files, metadata, missing)
+    damage = [metadata] if isinstance(metadata, Damage) else []
+    logs = _logs_in(folder)
+    if not logs:
+        raise SourceError(
+            f"{folder}: a directory without a log; give one that holds {_KINDS}, or the path "
+            "of a log itself"
+        )
+    if len(logs) > 1 and not _is_split(logs):
+        names = ", ".join(path.name for path in logs[:5]) + (", ..." if len(logs) > 5 else "")
+        raise SourceError(
+            f"{folder}: {len(logs)} logs that are not parts of one ({names}); give the path of "
+            "one of them"
+        )
+    return _join(folder, logs, None, damage)
+
+
+def _join(
+    path: Path,
+    files: Sequence[Path],
+    metadata: BagMetadata | None,
+    damage: Sequence[Damage] = (),
+) -> Source:
+    """One source of several files, or of one that needs more than its plain reader.
+
+    Raises:
+        SourceError: None of the files is a log.
+    """
+    parts: list[Part] = []
+    formats: list[Format] = []
+    for file in files:
+        try:
+            found, is_packed = sniff(file)
+        except SourceError:
+            # Reading reports it as damage; another file may be readable.
+            found, is_packed = Format.OTHER, False
+        count = None if metadata is None else _listed(metadata, file)
+        has_packed = metadata is not None and metadata.packed_messages
+        parts.append(Part(file, count, is_packed, has_packed))
+        formats.append(found)
+    known = [found for found in formats if found is not Format.OTHER]
+    if not known:
+        sniff(files[0])
+        raise _unknown(files[0], is_packed=parts[0].packed)
+    is_ros1 = known[0] is Format.BAG
+    is_mcap = known[0] is Format.MCAP
+    is_rosbag2 = is_mcap and (metadata is not None or len(parts) > 1)
+    source = JoinedSource(
+        path,
+        kind="ROS 2 bag (mcap)" if is_rosbag2 else known[0].value,
+        profile="ros1" if is_ros1 else "ros2" if not is_mcap or metadata is not None else "",
+        parts=parts,
+        opener=_open_plain,
+        damage=damage,
+    )
+    whole = metadata is not None and path.is_dir() and metadata.message_count is not None
+    if metadata is not None and whole:
+        source.message_count = metadata.message_count
+        source.time_range = metadata.time_range
+    else:
+        source.look()
+    return source
+
+
+def _listed(metadata: BagMetadata, file: Path) -> int | None:
+    """Messages that the metadata gives a file, by its name with or without `.zstd`."""
+    names = (file.name, file.name + ".zstd", file.name.removesuffix(".zstd"))
+    return next((metadata.counts[name] for name in names if name in metadata.counts), None)
+
+
+def _logs_in(folder: Path) -> list[Path]:
+    """The logs that lie directly in a folder, in natural order of their names."""
+    try:
+        names = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        files = [path for path in names if path.is_file() and path.stat().st_size]
+    except OSError as error:
+        raise cannot_open(folder, error) from error
+    refused: SourceError | None = None
+    logs = []
+    for path in files:
+        try:
+            if sniff(path)[0] is not Format.OTHER:
+                logs.append(path)
+        except SourceError as error:
+            refused = error
+    if refused is not None and not logs:
+        raise refused
+    return sorted(logs, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [
+        (int(piece), "") if piece.isdecimal() else (-1, piece)
+        for piece in re.split(r"([0-9]{1,18})", path.name)
+    ]
+
+
+# What recorders name the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`.
+_PART = re.compile(r"(?P<stem>.*)_(?P<number>[0-9]{1,9})(?P<end>\.[A-Za-z0-9.]*)")
+_DATE = re.compile(r"[0-9]{4}(?:[-_][0-9]{2}){5}")
+
+
+def _is_split(logs: Sequence[Path]) -> bool:
+    """Whether files are the parts of one log, by their names and formats."""
+    found = [_PART.fullmatch(path.name) for path in logs]
+    series = {(_DATE.sub("", each["stem"]), each["end"]) for each in found if each is not None}
+    numbers = {int(each["number"]) for each in found if each is not None}
+    formats = {sniff(path) for path in logs}
+    return None not in found and len(series) == len(formats) == 1 and len(numbers) == len(logs)

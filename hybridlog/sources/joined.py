@@ -1,0 +1,276 @@
+"""Several files of one log, read as one, and files that are compressed as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zstandard
+
+from hybridlog.sources.base import BATCH_BYTES, MAX_CHUNK, Damage, Source, regroup
+from hybridlog.sources.spool import ZSTD_MAGIC, spool
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Batch, Channel
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file of a log.
+
+    Attributes:
+        path: The file.
+        message_count: Messages that something else says it has, None when nothing does.
+        packed: The file is a zstd file.
+        packed_messages: Each payload is a zstd frame of its own.
+    """
+
+    path: Path
+    message_count: int | None = None
+    packed: bool = False
+    packed_messages: bool = False
+
+
+class JoinedSource(Source):
+    """Files of one log, one after the other; only one of them is open at a time.
+
+    Channels that are alike in all files become one channel. A file that cannot be read
+    is damage, unless none can.
+
+    Args:
+        path: What was opened.
+        kind: See `Source`.
+        profile: See `Source`.
+        parts: The files in order, at least one.
+        opener: Opens one uncompressed file by its content.
+        damage: What is known to be wrong already (files that are missing).
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        kind: str,
+        profile: str,
+        parts: Sequence[Part],
+        opener: Callable[[Path], Source],
+        damage: Sequence[Damage] = (),
+    ) -> None:
+        super().__init__(path, kind=kind, profile=profile, files=[part.path for part in parts])
+        self._parts = list(parts)
+        self._opener = opener
+        self.damage.extend(damage)
+        self._numbers: dict[tuple[object, ...], int] = {}
+        self._inner: Source | None = None
+        self._kept: Source | None = None
+        if len(self._parts) == 1:
+            # With one file, what is wrong with it should be said at once.
+            self._kept = self._open(self._parts[0])
+            self.profile = self._kept.profile or profile
+            self.message_count = self._kept.message_count
+            self.time_range = self._kept.time_range
+
+    def look(self) -> None:
+        """Asks each file that is not compressed what it says of itself, and adds it up."""
+        if self._kept is not None or any(part.packed for part in self._parts):
+            return
+        counts: list[int | None] = []
+        ranges: list[tuple[int, int]] = []
+        for part in self._parts:
+            try:
+                with self._opener(part.path) as inner:
+                    self.profile = self.profile or inner.profile
+                    counts.append(inner.message_count)
+                    if inner.time_range is not None:
+                        ranges.append(inner.time_range)
+                    elif inner.message_count != 0:
+                        return
+            except SourceError:
+                return
+        known = [count for count in counts if count is not None]
+        if len(known) == len(counts):
+            self.message_count = sum(known)
+        if ranges:
+            self.time_range = (min(low for low, _ in ranges), max(high for _, high in ranges))
+
+    def close(self) -> None:
+        """Closes the file that is open."""
+        for source in (self._inner, self._kept):
+            if source is not None:
+                source.close()
+        self._inner = self._kept = None
+
+    def batches(self) -> Iterator[Batch]:
+        """Yields the messages of each file in turn."""
+        done = failed = 0
+        first: SourceError | None = None
+        for part, size in zip(self._parts, self._sizes(), strict=True):
+            try:
+                inner = self._inner = self._kept or self._open(part)
+            except SourceError as error:
+                failed += 1
+                first = first or error
+                reason = _without_path(error, part.path)
+                self.damage.append(Damage(part.path, 0, size, reason, part.message_count))
+            else:
+                with inner:
+                    self._kept = None
+                    yield from self._read(part, inner, done, size)
+                self._inner = None
+            done += size
+            self.bytes_read = done
+        if first is not None and failed == len(self._parts):
+            raise first
+
+    def _sizes(self) -> list[int]:
+        sizes = []
+        for part in self._parts:
+            try:
+                sizes.append(part.path.stat().st_size)
+            except OSError:
+                sizes.append(0)
+        return sizes
+
+    def _open(self, part: Part) -> Source:
+        if not part.packed:
+            return self._opener(part.path)
+        spooled = spool(part.path)
+        try:
+            inner = self._opener(spooled.path)
+        except SourceError as error:
+            reason = spooled.problem or _without_path(error, spooled.path)
+            raise SourceError(
+                f"{part.path}: {reason}; try to unpack it with `zstd -d` and use what comes out"
+            ) from error
+        finally:
+            spooled.remove()
+        if spooled.problem is not None:
+            self.damage.append(Damage(part.path, None, None, spooled.problem, None))
+        return inner
+
+    def _read(self, part: Part, inner: Source, done: int, size: int) -> Iterator[Batch]:
+        """Yields the messages of one open file, over the channels of this source."""
+        numbers = np.empty(0, np.int32)
+        got = 0
+        found_before = len(self.damage)
+        batches = inner.batches()
+        if part.packed_messages or getattr(inner, "packed_messages", False):
+            batches = regroup(self._unpacked(part, batches))
+        for batch in batches:
+            got += len(batch)
+            if len(numbers) < len(inner.channels):
+                numbers = np.array([self._number(each) for each in inner.channels], np.int32)
+            share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
+            self.bytes_read = done + int(size * min(share, 1.0))
+            self._take_extras(inner)
+            yield Batch(
+                batch.buffer,
+                batch.offset,
+                batch.length,
+                numbers[batch.channel],
+                batch.log_time,
+                batch.publish_time,
+                batch.sequence,
+            )
+        self._take_extras(inner)
+        for channel in inner.channels:
+            self._number(channel)
+        self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
+        self._check_count(part, got, found_before)
+
+    def _check_count(self, part: Part, got: int, found_before: int) -> None:
+        """Compares with the number of messages that the log's metadata gives the file."""
+        found = self.damage[found_before:]
+        if part.message_count is None or got >= part.message_count:
+            return
+        missing = part.message_count - got - sum(damage.messages_lost or 0 for damage in found)
+        unknown = [row for row, damage in enumerate(found) if damage.messages_lost is None]
+        if len(unknown) == 1:
+            row = found_before + unknown[0]
+            self.damage[row] = replace(self.damage[row], messages_lost=max(0, missing))
+        elif not unknown and missing > 0:
+            reason = f"the log's metadata lists {part.message_count} messages, {got} are there"
+            self.damage.append(Damage(part.path, None, None, reason, missing))
+
+    def _take_extras(self, inner: Source) -> None:
+        self.extras.extend(inner.extras)
+        inner.extras.clear()
+
+    def _number(self, channel: Channel) -> int:
+        """Number of a channel in this source."""
+        schema = channel.schema
+        key = (
+            channel.topic,
+            channel.message_encoding,
+            None if schema is None else (schema.name, schema.encoding, schema.data),
+            tuple(sorted(channel.metadata.items())),
+            channel.has_publish_time,
+        )
+        number = self._numbers.get(key)
+        if number is None:
+            number = self._numbers[key] = len(self.channels)
+            self.channels.append(channel)
+        return number
+
+    def _unpacked(self, part: Part, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """Unpacks payloads that are zstd frames; leaves out those that are damaged."""
+        unpacker = zstandard.ZstdDecompressor()
+        broken = plain = 0
+        for batch in batches:
+            start = 0
+            while start < len(batch):
+                payloads: list[bytes] = []
+                kept: list[int] = []
+                size = 0
+                row = start
+                while row < len(batch) and size < BATCH_BYTES:
+                    payload = bytes(batch.payload(row))
+                    is_packed = payload.startswith(ZSTD_MAGIC)
+                    plain += not is_packed
+                    data = _unpack_payload(unpacker, payload) if is_packed else payload
+                    if data is None:
+                        broken += 1
+                    else:
+                        payloads.append(data)
+                        kept.append(row)
+                        size += len(data)
+                    row += 1
+                rows = batch.take(np.array(kept, np.intp))
+                rows.buffer = b"".join(payloads)
+                rows.length = np.fromiter(map(len, payloads), np.int64, len(payloads))
+                rows.offset = np.cumsum(rows.length) - rows.length
+                yield rows
+                start = row
+        if broken:
+            reason = "payloads that do not unpack, although the bag says they are compressed"
+            self.damage.append(Damage(part.path, None, None, reason, broken))
+        if plain:
+            reason = (
+                f"{plain} payloads are not compressed, although the bag says so; they are "
+                "taken as they are"
+            )
+            self.damage.append(Damage(part.path, None, None, reason, 0))
+
+
+def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes | None:
+    """The content of a zstd frame, None when it is damaged or too large."""
+    try:
+        size = zstandard.frame_content_size(payload)
+        if size > MAX_CHUNK:
+            return None
+        if size >= 0:
+            return unpacker.decompress(payload)
+        with unpacker.stream_reader(payload) as reader:
+            data = reader.read(MAX_CHUNK + 1)
+    except zstandard.ZstdError:
+        return None
+    return data if len(data) <= MAX_CHUNK else None
+
+
+def _without_path(error: SourceError, path: Path) -> str:
+    return str(error).removeprefix(f"{path}: ")

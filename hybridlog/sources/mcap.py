@@ -1,0 +1,368 @@
+"""Foreign MCAP files, of ROS 2 (rosbag2), ROS 1 or anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+
+from hybridlog.sources.base import (
+    BATCH_BYTES,
+    BATCH_MESSAGES,
+    MAX_CHUNK,
+    Damage,
+    Source,
+    cannot_open,
+)
+from hybridlog_storage.errors import SegmentError, SourceError
+from hybridlog_storage.mcap_scan import (
+    MAGIC,
+    ChunkContent,
+    End,
+    Item,
+    Loose,
+    ScanDamage,
+    ScannedChunk,
+    parse_content,
+    read_summary,
+    scan,
+)
+from hybridlog_storage.messages import Channel, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from mcap.summary import Summary
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Batch
+
+_UNDEFINED = -1
+_IDS = 1 << 16
+
+
+@dataclass(slots=True)
+class _Open:
+    """Damage whose message count may still turn up behind it.
+
+    Attributes:
+        offset: Where it starts.
+        length: Bytes of it, None when not known.
+        reason: What is wrong.
+        chunk: A whole chunk is lost, so message indexes that follow tell what was in it.
+        counted: Messages listed by the message indexes behind it, None before the first.
+    """
+
+    offset: int
+    length: int | None
+    reason: str
+    chunk: bool
+    counted: int | None = None
+
+
+class McapSource(Source):
+    """One MCAP file, read forward.
+
+    Definitions come from the data; the summary's stand in for those that were lost with
+    a damaged chunk. A channel id that is defined anew with other content is another
+    channel from there on. Messages on a channel whose schema is defined nowhere are
+    kept, without a schema, and the fact is noted in `damage`.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SourceError: It cannot be opened, or is no MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, kind="MCAP", profile="", files=[path])
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise cannot_open(path, error) from error
+        try:
+            self._summary = self._open()
+        except OSError as error:
+            self._file.close()
+            raise cannot_open(path, error) from error
+        except BaseException:
+            self._file.close()
+            raise
+        self._definitions = _Definitions(self.channels, self._summary)
+        self._given = 0
+        self._lost = 0
+        self._pending: _Open | None = None
+        self._uncounted: list[_Open] = []
+        self._end_is_noted = False
+
+    def _open(self) -> Summary | None:
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise SourceError(
+                f"{self.path}: not an MCAP file, it does not start with the bytes of one; "
+                "check that the file was copied whole"
+            )
+        summary = read_summary(self._file, self.size_bytes)
+        # With the summary at hand, this reads no more than the first record.
+        first = next(scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=summary), None)
+        if first is not None and isinstance(first[1], records.Header):
+            self.profile = first[1].profile
+            if self.profile == "ros2":
+                self.kind = "ROS 2 bag (mcap)"
+        statistics = summary.statistics if summary is not None else None
+        if statistics is not None:
+            self.message_count = statistics.message_count
+            start, last = statistics.message_start_time, statistics.message_end_time
+            if statistics.message_count and start <= last < (1 << 63) - 1:
+                self.time_range = start, last + 1
+        return summary
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def batches(self) -> Iterator[Batch]:
+        """Yields all messages that can be read, once, in file order.
+
+        Raises:
+            SourceError: The file cannot be read any more at all.
+        """
+        scanned = scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=self._summary)
+        try:
+            for offset, item in scanned:
+                self.bytes_read = max(self.bytes_read, offset)
+                yield from self._take(offset, item)
+        except OSError as error:
+            raise cannot_open(self.path, error) from error
+
+    def _take(self, offset: int, item: Item) -> Iterator[Batch]:
+        if isinstance(item, records.MessageIndex):
+            if self._pending is not None and self._pending.chunk:
+                self._pending.counted = (self._pending.counted or 0) + len(item.records)
+            return
+        self._settle()
+        if isinstance(item, ScannedChunk):
+            yield from self._chunk(item)
+        elif isinstance(item, Loose):
+            yield from self._content(item.content, offset, relative=True)
+        elif isinstance(item, ScanDamage):
+            yield from self._damaged(item)
+        elif isinstance(item, records.Schema | records.Channel):
+            self._define(offset, item)
+        elif isinstance(item, records.Metadata | records.Attachment):
+            self.extras.append(item)
+        elif isinstance(item, End):
+            self._end(item)
+
+    def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
+        try:
+            content = parse_content(chunk.content_bytes())
+        except SegmentError as error:
+            reason = f"a chunk is damaged: {error}"
+            self._pending = _Open(chunk.offset, chunk.length, reason, chunk=True)
+            return
+        yield from self._content(content, chunk.offset)
+
+    def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
+        reason = item.reason
+        if item.torn is not None:
+            content = item.torn.content()
+            before = self._given
+            yield from self._content(content, item.offset)
+            reason += f"; {self._given - before} messages of its beginning were read"
+        if item.length is not None and item.offset + item.length >= self.size_bytes:
+            self._end_is_noted = True
+        if item.messages is None:
+            self._pending = _Open(
+                item.offset, item.length, reason, chunk=item.opcode == Opcode.CHUNK
+            )
+        else:
+            self._note(item.offset, item.length, reason, item.messages)
+
+    def _content(
+        self, content: ChunkContent, offset: int, *, relative: bool = False
+    ) -> Iterator[Batch]:
+        """The messages of one chunk or run, split where a definition changes."""
+        for damage in content.damage:
+            self._note(offset, None, damage.reason, damage.messages)
+        if len(content.invalid):
+            first = int(content.invalid[0])
+            self._note(
+                offset + first if relative else offset,
+                None,
+                f"{len(content.invalid)} messages have a time beyond 2^63 - 1 ns or no head "
+                f"(the first at byte {first} of the content)",
+                len(content.invalid),
+            )
+        row = 0
+        for definition in content.definitions:
+            if definition.row > row and self._definitions.changes(definition.record):
+                yield from self._rows(content.batch, row, definition.row, offset)
+                row = definition.row
+            self._definitions.add(definition.record)
+        yield from self._rows(content.batch, row, len(content.batch), offset)
+
+    def _rows(self, batch: Batch, start: int, end: int, offset: int) -> Iterator[Batch]:
+        """Rows `[start, end)` in batches of bounded size, their channels looked up."""
+        rows = batch if (start, end) == (0, len(batch)) else batch.take(slice(start, end))
+        for channel in np.flatnonzero(np.bincount(rows.channel)).tolist():
+            reason = self._definitions.use(channel)
+            if reason:
+                self._note(offset, None, reason, 0)
+        found = self._definitions.table[rows.channel]
+        known = found != _UNDEFINED
+        if not known.all():
+            lost = len(found) - int(known.sum())
+            names = ", ".join(map(str, np.unique(rows.channel[~known]).tolist()[:5]))
+            self._note(
+                offset, None, f"{lost} messages on channels that are not defined ({names})", lost
+            )
+            rows, found = rows.take(known), found[known]
+        if not len(rows):
+            return
+        self._given += len(rows)
+        for part in _parts(rows.length):
+            piece = rows.take(part)
+            piece.channel = found[part]
+            yield piece
+
+    def _define(self, offset: int, record: records.Schema | records.Channel) -> None:
+        self._definitions.add(record)
+        self.bytes_read = max(self.bytes_read, offset)
+
+    def _note(self, offset: int | None, length: int | None, reason: str, lost: int | None) -> None:
+        self.damage.append(Damage(self.path, offset, length, reason, lost))
+        self._lost += lost or 0
+
+    def _settle(self) -> None:
+        """No message index follows any more: note the pending damage, or keep it for later."""
+        pending, self._pending = self._pending, None
+        if pending is None:
+            return
+        if pending.counted is None and self.message_count is not None:
+            self._uncounted.append(pending)  # the totals may tell, at the end
+        else:
+            self._note_open(pending, pending.counted)
+
+    def _note_open(self, pending: _Open, lost: int | None) -> None:
+        self._note(pending.offset, pending.length, pending.reason, lost)
+
+    def _end(self, end: End) -> None:
+        self.bytes_read = self.size_bytes
+        missing = None
+        if self.message_count is not None:
+            missing = max(self.message_count - self._given - self._lost, 0)
+        if len(self._uncounted) == 1:
+            self._note_open(self._uncounted[0], missing)
+            missing = 0
+        else:
+            for pending in self._uncounted:
+                self._note_open(pending, None)
+        self._uncounted.clear()
+        if missing:
+            self._note(
+                None,
+                None,
+                f"{missing} more messages are counted in the summary than found",
+                missing,
+            )
+        if not end.clean and not self._end_is_noted:
+            reason = "the file was not closed: its end is missing; all before it was read"
+            self._note(end.offset, 0, reason, 0)
+
+
+def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
+    """Rows in runs of at most `BATCH_MESSAGES`, closed once they hold `BATCH_BYTES`."""
+    count = len(length)
+    total = np.cumsum(length)
+    start, before = 0, 0
+    while start < count:
+        full = int(np.searchsorted(total, before + BATCH_BYTES)) + 1
+        end = min(full, start + BATCH_MESSAGES, count)
+        yield slice(start, end)
+        start, before = end, int(total[end - 1])
+
+
+class _Definitions:
+    """Which channel each MCAP channel id stands for at the moment.
+
+    Attributes:
+        table: int32[65536], index in the source's channels by channel id, -1 when the id
+            is not defined or was not used yet.
+    """
+
+    def __init__(self, channels: list[Channel], summary: Summary | None) -> None:
+        self.table = np.full(_IDS, _UNDEFINED, np.int32)
+        self._channels = channels
+        # The summary repeats all definitions, also of chunks that cannot be read.
+        self._schemas: dict[int, records.Schema] = dict(summary.schemas) if summary else {}
+        self._records: dict[int, records.Channel] = dict(summary.channels) if summary else {}
+        self._made: dict[int, list[tuple[records.Channel, records.Schema | None, int]]] = {}
+        self._shared: dict[tuple[str, str, bytes], Schema] = {}
+
+    def changes(self, record: records.Schema | records.Channel) -> bool:
+        """Whether this definition gives an id another meaning."""
+        known: records.Schema | records.Channel | None
+        if isinstance(record, records.Schema):
+            known = self._schemas.get(record.id)
+        else:
+            known = self._records.get(record.id)
+        return known is None or known != record
+
+    def add(self, record: records.Schema | records.Channel) -> None:
+        """Let this definition hold from now on."""
+        if not self.changes(record):
+            return
+        if isinstance(record, records.Schema):
+            if record.id == 0:  # MCAP: to be ignored
+                return
+            self._schemas[record.id] = record
+            for channel in self._records.values():
+                if channel.schema_id == record.id:
+                    self.table[channel.id] = _UNDEFINED
+        else:
+            self._records[record.id] = record
+            self.table[record.id] = _UNDEFINED
+
+    def use(self, channel_id: int) -> str:
+        """Make sure that the table has this id, if it is defined.
+
+        Returns:
+            What is wrong with its definition, empty when nothing is or was said before.
+        """
+        record = self._records.get(channel_id)
+        if record is None or self.table[channel_id] != _UNDEFINED:
+            return ""
+        schema = self._schemas.get(record.schema_id)
+        made = self._made.setdefault(channel_id, [])
+        for known, with_schema, index in made:
+            if (known, with_schema) == (record, schema):
+                self.table[channel_id] = index
+                return ""
+        self.table[channel_id] = len(self._channels)
+        made.append((record, schema, len(self._channels)))
+        self._channels.append(
+            Channel(
+                topic=record.topic,
+                message_encoding=record.message_encoding,
+                schema=self._share(schema),
+                metadata=record.metadata,
+            )
+        )
+        if schema is None and record.schema_id:
+            return (
+                f"schema {record.schema_id} of channel {channel_id} ({record.topic}) is not "
+                "defined; its messages are kept without one"
+            )
+        return ""
+
+    def _share(self, record: records.Schema | None) -> Schema | None:
+        if record is None:
+            return None
+        key = (record.name, record.encoding, record.data)
+        return self._shared.setdefault(key, Schema(*key))

@@ -1,0 +1,123 @@
+"""The tour as data, and its behaviour when a command fails or answers wrongly."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybridlog.demo import tour
+from hybridlog_storage.errors import UsageError
+
+# Stands in for each command: answers as told, so that the tour alone is under test.
+FAKE = """\
+import json, pathlib, sys
+verb = sys.argv[1]
+if verb == 'robot.bag':
+    pathlib.Path('robot.bag').write_bytes(b'x')
+    truth = {'gripper_closings': 3, 'near_scans': 7, 'errors': 2}
+    pathlib.Path('truth.json').write_text(json.dumps(truth))
+elif verb == FAIL:
+    sys.exit(6)
+elif '--count' in sys.argv:
+    print(GRIPPER if 'position == 0' in sys.argv else 7)
+elif 'jsonl' in sys.argv:
+    print('{}'); print('{}')
+elif '-o' in sys.argv:
+    pathlib.Path('scan.npz').write_bytes(b'x')
+elif verb == 'record':
+    pathlib.Path('robot-logs').mkdir()
+    print('recorded')
+"""
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, *, fail: str = "", gripper: str = "3") -> None:
+    code = FAKE.replace("FAIL", repr(fail)).replace("GRIPPER", repr(gripper))
+    monkeypatch.setattr(
+        tour.Step, "argv", property(lambda step: [sys.executable, "-c", code, *step.arguments])
+    )
+
+
+def test_every_command_is_whole() -> None:
+    assert len(tour.COMMANDS) == len(tour.steps())
+    for step in tour.steps():
+        if step.program == "python":
+            compile(step.arguments[0], "<snippet>", "exec")
+            continue
+        words = shlex.split(step.shown)
+        assert tuple(words[-len(step.arguments) :]) == step.arguments
+        assert step.argv[0] == sys.executable
+    verbs = [step.arguments[0] for step in tour.steps() if step.program == "hybridlog"]
+    assert verbs[:3] == ["record", "ls", "info"]
+    assert sum(step.check is not None for step in tour.steps()) == 3
+
+
+def test_the_slice_lies_within_a_short_recording() -> None:
+    (step,) = [s for s in tour.steps(4.0) if s.makes == tour.SLICE]
+    at = step.arguments.index("--between")
+    assert step.arguments[at + 1 : at + 3] == ("+2s", "+3s")
+
+
+def test_a_good_tour_confirms_each_answer_and_cleans_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pretend(monkeypatch)
+    assert tour.run(tmp_path / "new", 60, 1, keep=False) == 0
+    out, err = capfd.readouterr()
+    assert err == ""
+    for command in tour.COMMANDS:
+        assert f"$ {command}" in out
+    assert out.count("(right:") == 3
+    assert "closed the gripper 3 times" in out
+    # What a command prints stands below the command.
+    assert out.index("$ hybridlog record") < out.index("recorded") < out.index("$ hybridlog ls")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_kept_tour_leaves_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch)
+    assert tour.run(tmp_path, keep=True) == 0
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["robot-logs", "robot.bag", "scan.npz", "truth.json"]
+    with pytest.raises(UsageError, match="exists already"):
+        tour.run(tmp_path, keep=True)
+
+
+def test_foreign_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch)
+    (tmp_path / "mine").write_text("x")
+    assert tour.run(tmp_path) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_failing_command_ends_the_tour_with_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pretend(monkeypatch, fail="ls")
+    assert tour.run(tmp_path) == 6
+    out, err = capfd.readouterr()
+    assert "hybridlog ls --store robot-logs` failed with exit code 6" in err
+    assert "hybridlog info" not in out
+    assert (tmp_path / "robot.bag").exists()
+
+
+@pytest.mark.parametrize("answer", ["4", "", "three", "-3", "3 messages"])
+def test_a_wrong_answer_is_an_error(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    answer: str,
+) -> None:
+    pretend(monkeypatch, gripper=answer)
+    assert tour.run(tmp_path) == 1
+    _, err = capfd.readouterr()
+    assert "wrong answer" in err
+    assert "closed the gripper 3 times" in err
+
+
+def test_an_unusable_directory_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UsageError, match="cannot make"):
+        tour.run(tmp_path / "file" / "below")

@@ -1,0 +1,341 @@
+"""Bodies of index documents against `bson.encode` of the dictionary a row stands for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import bson
+import numpy as np
+import pytest
+from bson.int64 import Int64
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridlog.schema import document
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.document import Bodies, TooLarge, bodies, take, top_level_names
+
+LIMIT = 4
+DTYPES = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]
+DOUBLES = [0.0, -0.0, 1.5, math.nan, math.inf, -math.inf, 1e300, 5e-324]
+
+
+# A type here is a tuple: ("number", dtype), ("string",), ("list", type) or
+# ("message", {name: type}). Values are plain Python.
+
+
+def value_of(kind: tuple[Any, ...]) -> st.SearchStrategy[Any]:
+    if kind[0] == "number":
+        dtype = np.dtype(kind[1])
+        if dtype.kind == "b":
+            return st.booleans()
+        if dtype.kind == "f":
+            return st.floats(width=8 * dtype.itemsize) | st.sampled_from([math.nan, -0.0, math.inf])
+        info = np.iinfo(dtype)
+        return st.integers(int(info.min), int(info.max))
+    if kind[0] == "string":
+        text = st.text(max_size=4).map(str.encode)
+        return st.sampled_from([b"base_link", b"a\0b"]) | text | st.binary(max_size=6)
+    if kind[0] == "list":
+        return st.lists(value_of(kind[1]), max_size=LIMIT + 2)
+    return st.fixed_dictionaries({k: value_of(v) for k, v in kind[1].items()})
+
+
+types = st.recursive(
+    st.sampled_from([("number", d) for d in DTYPES] + [("string",)] * 4),
+    lambda inner: st.one_of(
+        inner.filter(lambda kind: kind[0] != "list").map(lambda kind: ("list", kind)),
+        st.dictionaries(st.sampled_from("abcdefg"), inner, max_size=4).map(
+            lambda fields: ("message", fields)
+        ),
+    ),
+    max_leaves=8,
+)
+
+
+def column_of(kind: tuple[Any, ...], values: list[Any]) -> Column:
+    if kind[0] == "number":
+        return Scalars(np.array(values, kind[1]))
+    if kind[0] == "string":
+        offset = np.cumsum([0] + [len(v) for v in values])
+        return Strings(np.frombuffer(b"".join(values), np.uint8), offset)
+    if kind[0] == "list":
+        offset = np.cumsum([0] + [len(v) for v in values])
+        return Arrays(column_of(kind[1], [e for v in values for e in v]), offset)
+    fields = {k: column_of(t, [v[k] for v in values]) for k, t in kind[1].items()}
+    return Records(fields, len(values))
+
+
+def summary_of(kind: tuple[Any, ...], values: list[Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {"n": Int64(len(values))}
+    if kind[0] != "number":
+        return found
+    real = np.dtype(kind[1]).kind == "f"
+    finite = [float(v) if real else int(v) for v in values if math.isfinite(v)]
+    if not finite:
+        return found | {"min": None, "max": None, "mean": None}
+    scalar = ("number", "f8" if real else "u8" if kind[1] == "u8" else "i8")
+    for name, value in (("min", min(finite)), ("max", max(finite))):
+        found[name] = reference(scalar, value + 0.0 if real else value)
+    # The mean of a few numbers: any order gives the same up to rounding; compared apart.
+    found["mean"] = math.fsum(v / len(finite) for v in finite)
+    return found
+
+
+def reference(kind: tuple[Any, ...], value: Any) -> Any:
+    if kind[0] == "number":
+        if kind[1] in {"u4", "i8"}:
+            return Int64(value)
+        if kind[1] == "u8":
+            return Int64(value) if value < 1 << 63 else float(value)
+        return value
+    if kind[0] == "string":
+        return value.decode(errors="replace")
+    if kind[0] == "list":
+        if len(value) > LIMIT:
+            return summary_of(kind[1], value)
+        return [reference(kind[1], v) for v in value]
+    return {k: reference(t, value[k]) for k, t in kind[1].items()}
+
+
+def made(records: Records, **options: int) -> list[bytes]:
+    """The body of each row; every row must be there exactly once."""
+    found: list[bytes | None] = [None] * len(records)
+    for group in bodies(records, **{"array_limit": LIMIT} | options):
+        assert isinstance(group, Bodies)
+        assert group.body.dtype == np.uint8
+        assert len(group.body) == len(group.rows)
+        for row, body in zip(group.rows.tolist(), group.body, strict=True):
+            assert found[row] is None
+            found[row] = body.tobytes()
+    assert None not in found
+    return found  # type: ignore[return-value]
+
+
+def document_of(body: bytes) -> bytes:
+    return (len(body) + 5).to_bytes(4, "little") + body + b"\0"
+
+
+def without_means(value: Any) -> tuple[Any, list[float]]:
+    """The value without the means of its summaries, and these."""
+    means: list[float] = []
+    if isinstance(value, dict):
+        out = {}
+        for k, v in value.items():
+            if k == "mean" and v is not None and "n" in value:
+                means.append(v)
+                continue
+            out[k], more = without_means(v)
+            means += more
+        return out, means
+    if isinstance(value, list):
+        parts = [without_means(v) for v in value]
+        return [p[0] for p in parts], [m for p in parts for m in p[1]]
+    return value, means
+
+
+def check(kind: tuple[Any, ...], rows: list[Any], **options: int) -> None:
+    records = column_of(kind, rows)
+    assert isinstance(records, Records)
+    for row, body in zip(rows, made(records, **options), strict=True):
+        expected = reference(kind, row)
+        found = document_of(body)
+        if found == bson.encode(expected):
+            continue
+        # Only means may differ from the reference, and by rounding alone. Decoding and
+        # encoding again loses no type: int64 decodes as Int64.
+        theirs, their_means = without_means(expected)
+        ours, our_means = without_means(bson.decode(found))
+        assert bson.encode(ours) == bson.encode(theirs)
+        assert our_means == pytest.approx(their_means, rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_any_type_any_values(data: st.DataObject) -> None:
+    fields = data.draw(st.dictionaries(st.sampled_from("stuvwxyz"), types, max_size=5))
+    kind = ("message", fields)
+    check(kind, data.draw(st.lists(value_of(kind), min_size=1, max_size=8)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data())
+def test_a_body_does_not_depend_on_the_batch(data: st.DataObject) -> None:
+    kind = ("message", data.draw(st.dictionaries(st.sampled_from("stuvwxyz"), types, max_size=5)))
+    rows = data.draw(st.lists(value_of(kind), min_size=1, max_size=8))
+    records = column_of(kind, rows * 20)
+    assert isinstance(records, Records)
+    together = made(records)
+    for i in range(len(rows)):
+        assert made(take(records, np.array([i]))) == [together[i]]
+        assert together[i :: len(rows)] == [together[i]] * 20
+
+
+def test_rows_of_one_layout_are_one_group() -> None:
+    kind = (
+        "message",
+        {
+            "header": ("message", {"stamp": ("number", "i8"), "frame_id": ("string",)}),
+            "covariance": ("list", ("number", "f8")),
+            "names": ("list", ("string",)),
+            "points": ("list", ("message", {"x": ("number", "f4"), "tags": ("list", ("string",))})),
+        },
+    )
+    row = {
+        "header": {"stamp": 5, "frame_id": b"odom"},
+        "covariance": DOUBLES[:4],
+        "names": [b"left", b"", b"right_wheel"],
+        "points": [{"x": 0.5, "tags": [b"a"]}, {"x": -0.0, "tags": [b"b"]}],
+    }
+    check(kind, [row] * 200)
+    records = column_of(kind, [row] * 200)
+    assert isinstance(records, Records)
+    assert [len(g.rows) for g in bodies(records, array_limit=LIMIT)] == [200]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_numbers_at_their_limits(dtype: str) -> None:
+    kind = ("message", {"v": ("number", dtype), "l": ("list", ("number", dtype))})
+    if dtype == "?":
+        values: list[Any] = [False, True]
+    elif dtype[0] == "f":
+        values = [float(np.dtype(dtype).type(v)) for v in DOUBLES if dtype == "f8" or v < 1e30]
+    else:
+        info = np.iinfo(dtype)
+        middle = int(info.max) // 2
+        values = [int(info.min), int(info.max), 0, middle, middle + 1, middle + 2]
+    rows = [{"v": v, "l": [v] * n} for v in values for n in (0, 1, LIMIT, LIMIT + 1)]
+    check(kind, rows)
+    for row in rows:
+        check(kind, [row])
+
+
+def test_uint64_past_int64_is_a_double_in_its_place() -> None:
+    kind = ("message", {"v": ("number", "u8"), "l": ("list", ("number", "u8"))})
+    top = (1 << 64) - 1
+    check(kind, [{"v": v, "l": [1, v]} for v in (0, (1 << 63) - 1, 1 << 63, top)])
+    body = made(column_of(kind, [{"v": top, "l": []}, {"v": 3, "l": []}]))  # type: ignore[arg-type]
+    assert type(bson.decode(document_of(body[0]))["v"]) is float
+    assert type(bson.decode(document_of(body[1]))["v"]) is Int64
+
+
+def test_signalling_nan_is_no_warning() -> None:
+    snan = np.array([0x7FA00001], np.uint32).view(np.float32)
+    body = made(Records({"v": Scalars(snan)}, 1))[0]
+    assert math.isnan(bson.decode(document_of(body))["v"])
+
+
+@pytest.mark.parametrize("limit", [0, 1, 9, 10, 11, 32, 99, 100, 101, 1001])
+@pytest.mark.parametrize("regular", [True, False])
+def test_keys_of_long_lists(limit: int, regular: bool) -> None:
+    counts = [limit, limit] if regular else [limit, limit - 1 if limit else 0, 0, 1]
+    for kind, value in ((("number", "i2"), -7), (("string",), b"xy"), (("message", {}), {})):
+        whole = ("message", {"l": ("list", kind)})
+        rows = [{"l": [value] * min(n, limit)} for n in counts]
+        records = column_of(whole, rows)
+        assert isinstance(records, Records)
+        for row, body in zip(rows, made(records, array_limit=limit), strict=True):
+            listed = [reference(kind, v) for v in row["l"]]
+            assert document_of(body) == bson.encode({"l": listed})
+
+
+def test_32_and_33_elements() -> None:
+    values = np.arange(65, dtype=np.float32)
+    records = Records({"l": Arrays(Scalars(values), np.array([0, 32, 65]))}, 2)
+    found = [bson.decode(document_of(b))["l"] for b in made(records, array_limit=32)]
+    assert found[0] == values[:32].tolist()
+    assert found[1] == {"n": 33, "min": 32.0, "max": 64.0, "mean": 48.0}
+    assert type(found[1]["n"]) is Int64
+
+
+def test_summary_without_a_finite_element_is_null() -> None:
+    rows = [{"l": [math.nan] * 6}, {"l": [math.nan, 2.0, math.inf, 4.0, -math.inf]}]
+    kind = ("message", {"l": ("list", ("number", "f4")), "z": ("number", "u1")})
+    rows = [row | {"z": 3} for row in rows]
+    check(kind, rows)
+    check(kind, rows[:1] * 3)
+    found = bson.decode(document_of(made(column_of(kind, rows[:1]))[0]))  # type: ignore[arg-type]
+    assert found == {"l": {"n": 6, "min": None, "max": None, "mean": None}, "z": 3}
+
+
+def test_message_without_fields() -> None:
+    assert made(Records({}, 3)) == [b""] * 3
+    groups = list(bodies(Records({}, 3)))
+    assert len(groups) == 1
+    check(("message", {"e": ("message", {})}), [{"e": {}}])
+
+
+def test_no_rows() -> None:
+    assert list(bodies(Records({}, 0))) == []
+    kind = ("message", {"s": ("string",), "l": ("list", ("message", {"x": ("number", "f8")}))})
+    assert list(bodies(column_of(kind, []))) == []  # type: ignore[arg-type]
+
+
+def test_names_that_the_index_uses_itself() -> None:
+    assert top_level_names(["_id", "x", "_meta"]) == ["_id_", "x", "_meta_"]
+    assert top_level_names(["_id", "_id_"]) == ["_id__", "_id_"]
+    one = Scalars(np.array([1], np.int32))
+    inner = Records({"_id": one}, 1)
+    assert document_of(made(Records({"_id": one, "m": inner}, 1))[0]) == bson.encode(
+        {"_id_": 1, "m": {"_id": 1}}
+    )
+
+
+def test_invalid_utf8_is_mended_in_its_row_only() -> None:
+    texts = [b"plain", "süß".encode(), b"\xff\xfeab", b"cut \xc3", b"\xa9 and on", b"\xed\xa0\x80"]
+    check(("message", {"s": ("string",), "z": ("number", "i4")}), [{"s": s, "z": 1} for s in texts])
+
+
+def test_long_and_short_strings_together() -> None:
+    texts = [b"", b"x" * 100_000, "ü".encode() * 5_000, b"\xff" * 300, b"y"]
+    kind = ("message", {"s": ("string",), "l": ("list", ("string",))})
+    check(kind, [{"s": s, "l": [s, b"-"]} for s in texts])
+
+
+def test_too_large_rows_are_named_and_the_others_are_made() -> None:
+    kind = ("message", {"s": ("string",), "z": ("number", "i4")})
+    texts = [b"a", b"b" * 2000, b"c", b"d" * 1000, b"e" * 5000]
+    records = column_of(kind, [{"s": s, "z": 1} for s in texts])
+    assert isinstance(records, Records)
+    width = {len(s): len(bson.encode({"s": s.decode(), "z": 1})) - 5 for s in texts}
+    groups = list(bodies(records, max_bytes=width[1000]))
+    large = [g.rows.tolist() for g in groups if isinstance(g, TooLarge)]
+    assert large == [[1, 4]]
+    kept = [(r, b.tobytes()) for g in groups if isinstance(g, Bodies) for r, b in zip(*g)]  # noqa: B905
+    assert sorted(r for r, _ in kept) == [0, 2, 3]
+    for row, body in kept:
+        assert document_of(body) == bson.encode({"s": texts[row].decode(), "z": 1})
+    only = list(bodies(records, max_bytes=4))
+    assert [type(g) for g in only] == [TooLarge]
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_bodies_are_made_in_slabs(monkeypatch: pytest.MonkeyPatch, regular: bool) -> None:
+    monkeypatch.setattr(document, "_SLAB", 1000)
+    kind = (
+        "message",
+        {"s": ("string",), "u": ("list", ("number", "u1")), "m": ("list", ("message", {}))},
+    )
+    rows = [
+        {"s": b"x" * (5 if regular else i % 7), "u": [1] * (i % 8), "m": [{}] * (i % 3)}
+        for i in range(200)
+    ]
+    check(kind, rows)
+    sizes = [
+        g.body.size
+        for g in bodies(column_of(kind, rows), array_limit=LIMIT)  # type: ignore[arg-type]
+        if isinstance(g, Bodies)
+    ]
+    assert max(sizes) <= 1200
+
+
+def test_columns_may_be_parts_of_larger_ones() -> None:
+    data = np.frombuffer(b"....onetwo!!!!", np.uint8)
+    strings = Strings(data, np.array([4, 7, 10]))
+    numbers = Scalars(np.arange(10, dtype=np.float64)[::5])
+    found = made(Records({"s": strings, "v": numbers}, 2))
+    assert [bson.decode(document_of(b)) for b in found] == [
+        {"s": "one", "v": 0.0},
+        {"s": "two", "v": 5.0},
+    ]

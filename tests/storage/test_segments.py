@@ -1,0 +1,212 @@
+"""Segments: what is written is what any MCAP reader reads, and what a crash leaves is kept."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.recovery import recover_segment
+from hybridlog_storage.segment_format import END_METADATA, json_metadata
+from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings, StoredChunk
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+RECORDING = {
+    "id": "r",
+    "key": 7,
+    "name": "r",
+    "tags": {"a": "b"},
+    "source": {},
+    "created": 1,
+}
+SCHEMA = Schema("std_msgs/String", "ros1msg", b"string data")
+CHANNELS = [
+    Channel("/small", "ros1", SCHEMA, {"callerid": "/n"}, has_publish_time=False),
+    Channel("/large", "cdr", Schema("a/msg/B", "ros2msg", b"uint8[] data")),
+    Channel("/json", "json", None),
+]
+Row = tuple[int, bytes, int, int, int]
+
+
+def batch_of(rows: Sequence[Row]) -> Batch:
+    """A batch with junk between the payloads."""
+    buffer = bytearray(b"junk")
+    offsets = []
+    for _, payload, *_ in rows:
+        offsets.append(len(buffer))
+        buffer += payload + b"??"
+    return Batch(
+        bytes(buffer),
+        np.array(offsets, np.int64),
+        np.array([len(r[1]) for r in rows], np.int64),
+        np.array([r[0] for r in rows], np.int32),
+        np.array([r[2] for r in rows], np.int64),
+        np.array([r[3] for r in rows], np.int64),
+        np.array([r[4] for r in rows], np.uint32),
+    )
+
+
+def write(
+    directory: Path, batches: Sequence[Sequence[Row]], setup: SegmentSettings | None = None
+) -> tuple[list[Path], list[StoredChunk]]:
+    directory.mkdir(exist_ok=True)
+    chunks: list[StoredChunk] = []
+    writer = RecordingWriter(directory, RECORDING, lambda c, _: chunks.append(c), setup)
+    for rows in batches:
+        writer.append(batch_of(rows), CHANNELS)
+    return writer.close(json_metadata(END_METADATA, {"status": "complete"})), chunks
+
+
+def expected(batches: Sequence[Sequence[Row]]) -> list[tuple[str, bytes, int, int, int]]:
+    return sorted((CHANNELS[c].topic, p, t, pub, s) for rows in batches for c, p, t, pub, s in rows)
+
+
+rows_of = st.lists(
+    st.tuples(
+        st.integers(0, 2),
+        st.binary(max_size=80) | st.integers(0, 3000).map(lambda n: bytes(n)),
+        st.integers(0, 2**62),
+        st.integers(0, 2**62),
+        st.integers(0, 2**32 - 1),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(batches=st.lists(rows_of, max_size=4), size=st.sampled_from([1024, 4096, 1 << 20]))
+def test_official_readers_see_every_message(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[Row]], size: int
+) -> None:
+    paths, _ = write(
+        tmp_path_factory.mktemp("r"),
+        batches,
+        SegmentSettings(chunk_size=size, large_payload=64, segment_size=6000),
+    )
+    seen = []
+    counted = 0
+    for path in paths:
+        data = path.read_bytes()
+        reader = make_reader(io.BytesIO(data), validate_crcs=True)
+        for _, channel, m in reader.iter_messages():
+            seen.append((channel.topic, m.data, m.log_time, m.publish_time, m.sequence))
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        counted += summary.statistics.message_count
+        list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
+    assert sorted(seen) == expected(batches)
+    assert counted == len(seen)
+
+
+@settings(max_examples=30, deadline=None)
+@given(batches=st.lists(rows_of, max_size=4))
+def test_reader_gives_the_chunks_that_were_written(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[Row]]
+) -> None:
+    paths, chunks = write(
+        tmp_path_factory.mktemp("r"), batches, SegmentSettings(chunk_size=2048, large_payload=64)
+    )
+    (path,) = paths
+    with SegmentReader(path, 0) as reader:
+        summary = reader.summary()
+        assert summary.recording["key"] == 7
+        assert summary.end == {"status": "complete"}
+        assert [p.offset for p in summary.chunks] == [c.offset for c in chunks]
+        for place, chunk in zip(summary.chunks, chunks, strict=True):
+            read = reader.read_chunk(place)
+            assert (read.length, read.trailer) == (chunk.length, chunk.trailer)
+            assert read.seq.tolist() == chunk.seq.tolist()
+            assert read.batch.channel.tolist() == chunk.batch.channel.tolist()
+            assert read.batch.offset.tolist() == chunk.batch.offset.tolist()
+            assert [bytes(read.batch.payload(i)) for i in range(len(read.batch))] == [
+                bytes(chunk.batch.payload(i)) for i in range(len(chunk.batch))
+            ]
+    seqs = sorted(s for c in chunks for s in c.seq.tolist())
+    assert seqs == list(range(sum(map(len, batches))))
+
+
+def many(count: int, channel: int = 0, size: int = 100, step: int = 10**7) -> list[Row]:
+    return [(channel, bytes([i % 251]) * size, i * step, i * step, i) for i in range(count)]
+
+
+def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
+    rows = [row for pair in zip(many(200), many(200, 1, 5000), strict=True) for row in pair]
+    _, chunks = write(tmp_path, [rows])
+    for chunk in chunks:
+        assert len(set(chunk.batch.channel.tolist())) == 1
+        if int(chunk.batch.length[0]) == 5000:
+            span = int(chunk.batch.log_time.max() - chunk.batch.log_time.min())
+            assert span < SegmentSettings().chunk_span_ns
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.5, 0.8, 0.95, 0.999, 1.0])
+def test_a_cut_segment_is_recovered(tmp_path: Path, keep: float) -> None:
+    setup = SegmentSettings(chunk_size=4096)
+    (path,), chunks = write(tmp_path / "a", [many(500)], setup)
+    data = path.read_bytes()
+    last = chunks[-1].offset + chunks[-1].length + chunks[-1].trailer
+    cut = int(last * keep)
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(data[:cut])
+    whole = [c for c in chunks if c.offset + c.length <= cut]
+    recovered = recover_segment(opened)
+    assert not opened.exists()
+    if recovered.path is None:
+        assert not whole
+        return
+    with SegmentReader(recovered.path, 0) as reader:
+        summary = reader.summary()
+        seqs = [s for p in summary.chunks for s in reader.read_chunk(p).seq.tolist()]
+    assert seqs == [s for c in whole for s in c.seq.tolist()]
+    assert recovered.messages == len(seqs)
+    official = make_reader(io.BytesIO(recovered.path.read_bytes()), validate_crcs=True)
+    assert len(list(official.iter_messages())) == len(seqs)
+
+
+def test_every_cut_of_a_small_segment_recovers(tmp_path: Path) -> None:
+    (path,), chunks = write(tmp_path / "a", [many(30)], SegmentSettings(chunk_size=1024))
+    data = path.read_bytes()
+    end = chunks[-1].offset + chunks[-1].length + chunks[-1].trailer
+    for cut in range(0, end, 7):
+        opened = tmp_path / "000000.mcap.open"
+        opened.write_bytes(data[:cut])
+        recovered = recover_segment(opened)
+        whole = sum(len(c.batch) for c in chunks if c.offset + c.length <= cut)
+        assert recovered.messages == whole, cut
+        (tmp_path / "000000.mcap").unlink(missing_ok=True)
+
+
+def test_a_flipped_bit_is_found_and_named(tmp_path: Path) -> None:
+    (path,), chunks = write(tmp_path, [many(500)], SegmentSettings(chunk_size=4096))
+    data = bytearray(path.read_bytes())
+    data[chunks[2].offset + chunks[2].length - 5] ^= 0x10
+    path.write_bytes(data)
+    with SegmentReader(path, 0) as reader:
+        places = reader.summary().chunks
+        reader.read_chunk(places[1])
+        with pytest.raises(SegmentError, match=f"byte {chunks[2].offset} of .*damaged"):
+            reader.read_chunk(places[2])
+
+
+def test_a_full_disk_is_said_to_be_full() -> None:
+    from hybridlog_storage.durability import explain, write_all
+
+    with Path("/dev/full").open("wb", buffering=0) as file, pytest.raises(OSError) as caught:
+        write_all(file.fileno(), [b"x"])
+    assert explain(caught.value, Path("f"), "writing").exit_code == 7
+
+
+def test_zero_messages_make_a_valid_segment(tmp_path: Path) -> None:
+    (path,), _ = write(tmp_path, [])
+    assert list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages()) == []
+    shutil.rmtree(tmp_path)
