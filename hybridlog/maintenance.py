@@ -6,14 +6,14 @@ mends the database, never the other way round.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.index_documents import key_bound, recording_key
 from hybridlog_storage.recovery import Recovered, recover_segment
 from hybridlog_storage.segment_reader import SegmentReader
 
@@ -227,11 +227,11 @@ def _verify_recording(
                 if progress is not None:
                     progress(recording_id, place.offset + place.length, reader.size)
                 documents, entry = indexer.documents_of(chunk, summary.channels)
-                for part in documents:
-                    expected[part.collection] = expected.get(part.collection, 0) + len(part.lengths)
-                    problem = _compare(database, base.key, chunk, part)
+                for collection, want in _by_collection(documents).items():
+                    expected[collection] = expected.get(collection, 0) + len(want)
+                    problem = _compare(database, base.key, chunk, collection, want)
                     if problem:
-                        found(f"{where}, collection {part.collection}", problem)
+                        found(f"{where}, collection {collection}", problem)
                 if entries.pop((number, place.offset), None) != entry:
                     found(where, "its catalog entry is missing or differs")
             result.messages += messages
@@ -249,27 +249,33 @@ def _verify_recording(
             )
 
 
+def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
+    """Single documents; several channels of a chunk may share a topic."""
+    found: dict[str, list[bytes]] = {}
+    for part in documents:
+        found.setdefault(part.collection, []).extend(_split(part.data))
+    return found
+
+
 def _compare(
-    database: Database, key: int, chunk: StoredChunk, part: Documents
+    database: Database, key: int, chunk: StoredChunk, collection: str, want: list[bytes]
 ) -> str | None:
     """What is wrong with the documents of a chunk in one collection."""
-    batch = chunk.batch
-    low = key_bound(int(batch.log_time.min()))
-    high = key_bound(int(batch.log_time.max()) + 1)
-    want = sorted(_split(part.data))
-    have: list[bytes] = []
+    times = chunk.batch.log_time
     query = {
-        "_id": {"$gte": low, "$lt": high},
+        "_id": {"$gte": key_bound(int(times.min())), "$lt": key_bound(int(times.max()) + 1)},
         "_meta.ref.chunk": chunk.offset,
         "_meta.ref.seg": chunk.segment,
     }
-    for raw in database.find_raw(part.collection, query):
-        have.extend(d for d in _split(raw) if d[22:26] == key.to_bytes(4, "big"))
-    have.sort()
-    if have == want:
+    have = {
+        document
+        for raw in database.find_raw(collection, query)
+        for document in _split(raw)
+        if recording_key(document) == key
+    }
+    if have == set(want):
         return None
-    missing = len(set(want) - set(have))
-    extra = len(set(have) - set(want))
+    missing, extra = len(set(want) - have), len(have - set(want))
     return f"{missing} index documents are missing or differ, {extra} are not of this chunk"
 
 

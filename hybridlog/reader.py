@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec
     from hybridlog.store import Store
 
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
@@ -310,9 +309,41 @@ class Query:
 
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked when all are alike."""
-        arrays = [message.to_numpy() for message in self]
+        arrays: list[NDArray[Any]] = [message.to_numpy() for message in self]
         alike = {(a.shape, a.dtype) for a in arrays}
         return np.stack(arrays) if len(alike) == 1 else arrays
+
+    # What was asked, for those who answer.
+
+    @property
+    def selected_fields(self) -> tuple[str, ...] | None:
+        """Paths given to `fields`, None for all."""
+        return self._fields
+
+    @property
+    def step(self) -> int:
+        """What was given to `every`."""
+        return self._every
+
+    @property
+    def is_unthinned(self) -> bool:
+        """Whether every message that fits is wanted: neither `limit` nor `every`."""
+        return self._limit is None and self._every == 1
+
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether all times are wanted."""
+        return self._bounds is None
+
+    def lanes(self) -> list[Lane]:
+        """Every channel that the question is about."""
+        wanted = set(self.topics)
+        return [
+            lane
+            for r in self._recordings()
+            for lane in self.store.lanes(r)
+            if lane.channel.topic in wanted
+        ]
 
     # How.
 
@@ -328,26 +359,14 @@ class Query:
     def _recordings(self) -> list[RecordingEntry]:
         return [r for r in self.store.recordings() if r.id in self.recording_ids]
 
-    def _codecs(self) -> dict[str, list[Codec]]:
-        return {
-            topic: [
-                lane.codec
-                for r in self._recordings()
-                for lane in self.store.lanes(r)
-                if lane.channel.topic == topic
-            ]
-            for topic in self.topics
-        }
-
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
         types: dict[str, str] = {}
-        for codecs in self._codecs().values():
-            for codec in codecs:
-                paths = codec.paths()
-                if not paths:
-                    return None
-                types.update({path.path: path.type for path in paths})
+        for lane in self.lanes():
+            paths = lane.codec.paths()
+            if not paths:
+                return None
+            types.update({path.path: path.type for path in paths})
         return types or None
 
     def _bounds_in(self, recording: RecordingEntry) -> tuple[int, int] | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import Batch
 
 from hybridlog.frames import TableBuilder
 from hybridlog.indexing import rows_by_channel
@@ -14,8 +15,6 @@ from hybridlog.query.plan import Lane, Piece, Sweep
 from hybridlog.schema.column import Records, Strings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.reader import Query
 
 
@@ -35,12 +34,13 @@ def collect(query: Query) -> TableBuilder:
     builder = TableBuilder(expected_rows=expected if query.is_unbounded else None)
     several = len(query.topics) > 1
     for lane in plan.lanes:
-        _append(builder, lane, _EMPTY, query.selected_fields, several=several)
+        # Columns exist even when no message does.
+        _append(builder, lane, _nothing(), query.selected_fields, several=several)
     sweep = Sweep(plan, query.store.segment)
     for piece in sweep.unordered() if plain else query.pieces(plan):
-        for lane, rows in rows_by_channel(piece.batch.channel):
+        for number, rows in rows_by_channel(piece.batch.channel):
             part = Piece(piece.batch.take(rows), piece.seq[rows])
-            _append(builder, plan.lanes[lane], part, query.selected_fields, several=several)
+            _append(builder, plan.lanes[number], part, query.selected_fields, several=several)
     return builder
 
 
@@ -128,5 +128,7 @@ def _from_index(query: Query, types: Mapping[str, str]) -> TableBuilder:
     return builder
 
 
-_EMPTY_INT: NDArray[np.int64] = np.empty(0, np.int64)
-INDEX_TYPES: Mapping[str, np.dtype[np.generic]] = {}
+def _nothing() -> Piece:
+    none = np.empty(0, np.int64)
+    batch = Batch(b"", none, none, none.astype(np.int32), none, none, none.astype(np.uint32))
+    return Piece(batch, none)

@@ -174,7 +174,7 @@ def run(
     duration_s: float = DEFAULT_DURATION_S,
     seed: int = DEFAULT_SEED,
     *,
-    keep: bool = False,
+    keep: bool = True,
 ) -> int:
     """Take the tour.
 
@@ -182,8 +182,8 @@ def run(
         directory: Where the bag, the store and the slice are made; created if needed.
         duration_s: Seconds of the robot's life.
         seed: Of the simulation.
-        keep: Leave everything there. Without it, what the tour made is removed at the
-            end, but not after a failure.
+        keep: Leave everything there, to ask more of it. Without it, what the tour made
+            is removed at the end, but not after a failure.
 
     Returns:
         0, or the exit code of the step that failed; 1 when an answer is not what the
@@ -211,7 +211,7 @@ def run(
             _say(f"The tour stops here; what it made is left in {directory}\n")
             return code
     if keep:
-        _say(f"\nEverything is left in {directory}; ask it more with --store {STORE}\n")
+        _say(f"\nEverything is left in {directory}; ask more with --store {directory / STORE}\n")
         return 0
     for path in made:
         if path.is_dir():

@@ -44,8 +44,8 @@ class JoinedSource(Source):
 
     Args:
         path: What was opened.
-        kind: See `Source`.
-        profile: See `Source`.
+        kind: See `Source`; empty to take it from the files.
+        profile: See `Source`; empty to take it from the files.
         parts: The files in order, at least one.
         opener: Opens one uncompressed file by its content.
         damage: What is known to be wrong already (files that are missing).
@@ -72,6 +72,7 @@ class JoinedSource(Source):
             # With one file, what is wrong with it should be said at once.
             self._kept = self._open(self._parts[0])
             self.profile = self._kept.profile or profile
+            self.kind = kind or self._kept.kind
             self.message_count = self._kept.message_count
             self.time_range = self._kept.time_range
 
@@ -85,6 +86,7 @@ class JoinedSource(Source):
             try:
                 with self._opener(part.path) as inner:
                     self.profile = self.profile or inner.profile
+                    self.kind = self.kind or inner.kind
                     counts.append(inner.message_count)
                     if inner.time_range is not None:
                         ranges.append(inner.time_range)

@@ -170,6 +170,8 @@ class McapSource(Source):
 
     def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
         reason = item.reason
+        if item.opcode == Opcode.DATA_END and (self.damage or self._uncounted):
+            return  # the checksum of all data only repeats what is known
         if item.torn is not None:
             content = item.torn.content()
             before = self._given
@@ -306,28 +308,29 @@ class _Definitions:
         self._shared: dict[tuple[str, str, bytes], Schema] = {}
 
     def changes(self, record: records.Schema | records.Channel) -> bool:
-        """Whether this definition gives an id another meaning."""
-        known: records.Schema | records.Channel | None
-        if isinstance(record, records.Schema):
-            known = self._schemas.get(record.id)
-        else:
-            known = self._records.get(record.id)
-        return known is None or known != record
+        """Whether this definition gives an id that has a meaning another one."""
+        known = self._known(record)
+        return known is not None and known != record
 
     def add(self, record: records.Schema | records.Channel) -> None:
         """Let this definition hold from now on."""
-        if not self.changes(record):
+        if self._known(record) == record:
             return
-        if isinstance(record, records.Schema):
-            if record.id == 0:  # MCAP: to be ignored
-                return
+        if isinstance(record, records.Channel):
+            self._records[record.id] = record
+            self.table[record.id] = _UNDEFINED
+        elif record.id:  # MCAP: a schema with id 0 is to be ignored
             self._schemas[record.id] = record
             for channel in self._records.values():
                 if channel.schema_id == record.id:
                     self.table[channel.id] = _UNDEFINED
-        else:
-            self._records[record.id] = record
-            self.table[record.id] = _UNDEFINED
+
+    def _known(
+        self, record: records.Schema | records.Channel
+    ) -> records.Schema | records.Channel | None:
+        if isinstance(record, records.Schema):
+            return self._schemas.get(record.id)
+        return self._records.get(record.id)
 
     def use(self, channel_id: int) -> str:
         """Make sure that the table has this id, if it is defined.

@@ -89,6 +89,7 @@ class _Place:
         got: Messages that were read in it.
         indexed: Messages that its index records list, None before the first one.
         reasons: What is wrong with it.
+        broken: Messages may be missing from what was read of it.
         torn_index: Some of its index records could not be read.
         cut: The file ends in it.
     """
@@ -98,8 +99,19 @@ class _Place:
     got: int = 0
     indexed: int | None = None
     reasons: list[str] = field(default_factory=list)
+    broken: bool = False
     torn_index: bool = False
     cut: bool = False
+
+    def blame(self, reason: str) -> None:
+        """Notes damage that may have cost messages."""
+        self.reasons.append(reason)
+        self.broken = True
+
+    @property
+    def is_complete(self) -> bool:
+        """Its index records account for all its messages: what follows is another place."""
+        return self.indexed is not None and self.indexed >= self.got
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +271,7 @@ class Rosbag1Source(Source):
                 self.bytes_read = min(self._pos, self.size_bytes)
         except OSError as error:
             place = self._place_at(self._pos)
-            place.reasons.append(f"the system cannot read on: {error.strerror or error}")
+            place.blame(f"the system cannot read on: {error.strerror or error}")
             place.end = self.size_bytes
         self.bytes_read = self.size_bytes
         was_cut = self._place is not None and self._place.cut
@@ -307,13 +319,12 @@ class Rosbag1Source(Source):
     def _skip_damage(self, pos: int, start: int) -> None:
         """Nothing sound at `pos`: goes to the first place from `start` on that is."""
         place = self._place_at(pos)
+        place.torn_index = place.start < pos
+        place.broken |= place.indexed is None
         found = self._search(self._space, start)
-        place.torn_index = True
         if found is None:
             place.cut = True
             place.reasons.append(f"the file ends in a record that starts at byte {pos}")
-            if 0 < self._index_pos <= pos:
-                place.indexed = place.got
             self._pos = place.end = self.size_bytes
             return
         place.reasons.append(f"bytes that are no record at byte {pos}")
@@ -339,26 +350,17 @@ class Rosbag1Source(Source):
         place = self._place = _Place(pos, min(record.end, self.size_bytes))
         compression = record.header.raw(record.raw, b"compression")
         size = record.header.u32(record.raw, b"size")
-        if compression == b"none":
-            if size != record.end - record.start:
-                place.reasons.append(
-                    f"the chunk's header says {size} bytes, its record {record.end - record.start}"
-                )
-            yield from self._run(self._space, record.start, record.end)
-            return
         if compression not in _UNPACKERS:
-            name = compression.decode(errors="replace")
-            place.reasons.append(f"the chunk's compression {name!r} is not known")
-            self._after_broken_chunk(record)
+            yield from self._plain_chunk(place, record, compression, size)
             return
         unpacked = self._unpack(record, compression, size)
         if unpacked.state == "broken":
-            place.reasons.append(unpacked.reason)
+            place.blame(unpacked.reason)
             self._after_broken_chunk(record)
             return
         end = record.start + unpacked.used
         if unpacked.state == "short":
-            place.reasons.append("the file ends in a chunk")
+            place.blame("the file ends in a chunk")
             place.cut = True
             end = self.size_bytes
         elif end != record.end:
@@ -372,6 +374,24 @@ class Rosbag1Source(Source):
             )
         yield from self._packed_messages(unpacked)
         self._pos = place.end = end
+
+    def _plain_chunk(
+        self, place: _Place, record: _Record, compression: bytes, size: int
+    ) -> Iterator[Batch]:
+        """Reads a chunk without compression, or with one that is not known."""
+        if compression != b"none":
+            name = compression.decode(errors="replace")
+            first = self._record(record.start)
+            if first is None or first.header.op not in {OP_MESSAGE, OP_CONNECTION}:
+                place.blame(f"the chunk's compression {name!r} is not known")
+                self._after_broken_chunk(record)
+                return
+            place.reasons.append(f"the chunk's compression {name!r} is not known; it has none")
+        if size != record.end - record.start:
+            place.reasons.append(
+                f"the chunk's header says {size} bytes, its record {record.end - record.start}"
+            )
+        yield from self._run(self._space, record.start, record.end)
 
     def _packed_messages(self, unpacked: _Unpacked) -> Iterator[Batch]:
         data = unpacked.data
@@ -457,7 +477,7 @@ class Rosbag1Source(Source):
         if run.why is Stop.FOREIGN and not space.packed:
             if soft_end is not None:
                 reason = "a record that does not belong into a chunk"
-                self._place_at(end).reasons.append(f"{reason} at byte {end}")
+                self._place_at(end).blame(f"{reason} at byte {end}")
             return None, 0
         if run.why is Stop.CUT:
             need = self._need(space, run, end, soft_end)
@@ -491,7 +511,7 @@ class Rosbag1Source(Source):
             self._place_at(end).end = found
             return found
         place = self._place_at(end)
-        place.reasons.append(f"the file ends in a record that starts at byte {end}")
+        place.blame(f"the file ends in a record that starts at byte {end}")
         place.cut = True
         place.end = space.size
         return space.size
@@ -514,7 +534,7 @@ class Rosbag1Source(Source):
         place = self._place_at(pos) if not space.packed else self._place
         assert place is not None
         where = f"at byte {pos}" + (" of the unpacked chunk" if space.packed else "")
-        place.reasons.append(f"{reason} {where}")
+        place.blame(f"{reason} {where}")
 
     def _batch(self, space: _Space, data: bytes, run: Run, pos: int) -> Batch:
         """Gives the messages of a run their channels; counts those that have none."""
@@ -583,7 +603,7 @@ class Rosbag1Source(Source):
     def _place_at(self, pos: int, *, has_index: bool = False) -> _Place:
         """The place that `pos` belongs to: the current one unless that is complete."""
         place = self._place
-        if place is None or (not has_index and place.indexed is not None):
+        if place is None or (not has_index and place.is_complete):
             self._finish_place()
             place = self._place = _Place(pos, pos)
         return place
@@ -594,22 +614,19 @@ class Rosbag1Source(Source):
         if place is None:
             return
         expected = self._listed(place)
-        if expected is None and not (place.torn_index and place.reasons):
+        if expected is None and not place.torn_index:
             expected = place.indexed
         lost = None if expected is None else max(0, expected - place.got)
         if not place.reasons:
             if not lost:
                 return
             place.reasons.append(f"its index lists {expected} messages, {place.got} are there")
-        elif lost is None and not place.cut and self._is_harmless(place):
+        if lost is None and not place.broken:
             lost = 0
-        self._report(
-            place.start, max(place.end, place.start) - place.start, "; ".join(place.reasons), lost
-        )
-
-    def _is_harmless(self, place: _Place) -> bool:
-        """Nothing but size fields was wrong, and the messages themselves were whole."""
-        return all(reason.startswith("the chunk's header says") for reason in place.reasons)
+        if place.cut and not 0 < self._index_pos <= self.size_bytes:
+            # Nobody knows what stood after the end.
+            lost = None
+        self._report(place.start, max(place.end - place.start, 0), "; ".join(place.reasons), lost)
 
     def _listed(self, place: _Place) -> int | None:
         """Messages that the chunk list at the end of the bag has in a place."""
@@ -617,8 +634,6 @@ class Rosbag1Source(Source):
             return None
         first = bisect_left(self._chunk_positions, place.start)
         stop = bisect_left(self._chunk_positions, max(place.end, place.start + 1))
-        if first == stop and 0 < self._index_pos <= place.start:
-            return place.got
         return sum(self._chunk_counts[first:stop])
 
     def _report(self, offset: int, length: int | None, reason: str, lost: int | None) -> None:

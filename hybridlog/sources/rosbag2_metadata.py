@@ -14,6 +14,8 @@ NAME = "metadata.yaml"
 
 MAX_BYTES = 16 << 20
 
+_NO_FILES = {"", ".", ".."}
+
 
 @dataclass(frozen=True, slots=True)
 class BagMetadata:
@@ -71,7 +73,7 @@ def parse_metadata(text: str) -> BagMetadata | None:
     mode = bag.get("compression_mode")
     distro = bag.get("ros_distro")
     return BagMetadata(
-        files=list(dict.fromkeys(name for name in files if name)),
+        files=list(dict.fromkeys(name for name in files if name not in _NO_FILES)),
         counts=counts,
         message_count=total,
         time_range=_time_range(bag, total),

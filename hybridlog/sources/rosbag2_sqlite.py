@@ -30,7 +30,7 @@ from hybridlog_storage.messages import Batch, Channel, Schema
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-    from typing import Any
+    from typing import Any, Literal
 
     from rosbags.typesys.store import Typestore
 
@@ -39,6 +39,7 @@ MAGIC = b"SQLite format 3\x00"
 # Without an index on time, counting reads the whole file: only small ones are counted.
 _COUNT_BYTES = 64 << 20
 
+_MIN_ROWID = -(2**63)
 _MAX_ROWID = 2**63 - 1
 
 
@@ -121,7 +122,8 @@ class SqliteSource(Source):
             "ifnull(CAST(data AS BLOB), x'')",
         )
         chosen = ", ".join(columns)
-        self._select = f"SELECT {chosen} FROM messages WHERE rowid > ? ORDER BY rowid"  # noqa: S608
+        self._select = f"SELECT {chosen} FROM messages WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
+        self._db.execute(f"{self._select} LIMIT 0", (0,)).fetchall()
         self._has_publish_time = has_publish_time
         distro = self._read_metadata(tables)
         self._read_topics(topics, tables, distro)
@@ -224,19 +226,19 @@ class SqliteSource(Source):
 
     def batches(self) -> Iterator[Batch]:
         """Yields all messages that SQLite gives, in the order of their row ids."""
-        after = -(2**63)
+        start = _MIN_ROWID
         regions = 0
-        while True:
+        while start <= _MAX_ROWID:
             rows: list[_Row] = []
             size = 0
             problem = ""
             try:
-                for row in self._db.execute(self._select, (after,)):
-                    if row[0] <= after:
+                for row in self._db.execute(self._select, (start,)):
+                    if row[0] < start:
                         problem = "rows out of order"
                         break
                     rows.append(row)
-                    after = row[0]
+                    start = row[0] + 1
                     size += len(row[4])
                     if size >= BATCH_BYTES or len(rows) >= BATCH_MESSAGES:
                         yield from self._batch(rows, size)
@@ -246,12 +248,18 @@ class SqliteSource(Source):
             yield from self._batch(rows, size)
             if not problem:
                 break
+            # The driver reads one row ahead: the last sound one was lost with the error.
+            row = self._one(start)
+            if row:
+                yield from self._batch([row], len(row[4]))
+                start = row[0] + 1
+                continue
             regions += 1
-            found = self._next_sound(after) if regions <= _MAX_REGIONS else None
-            self._report_gap(after, found, problem)
+            found = self._next_sound(start) if regions <= _MAX_REGIONS else None
+            self._report_gap(start, found, problem)
             if found is None:
                 break
-            after = found
+            start = found
         self.bytes_read = self.size_bytes
         self._report_undefined()
 
@@ -279,18 +287,22 @@ class SqliteSource(Source):
         if len(batch):
             yield batch
 
-    def _is_sound(self, after: int) -> bool:
-        """Whether the first row past `after` can be read, or there is none."""
+    def _one(self, start: int) -> _Row | None | Literal[False]:
+        """The first row from an id on; None when there is none, False when it is bad."""
         try:
-            row = self._db.execute(f"{self._select} LIMIT 1", (after,)).fetchone()
+            row: _Row | None = self._db.execute(f"{self._select} LIMIT 1", (start,)).fetchone()
         except (sqlite3.Error, OverflowError):
             return False
-        return row is None or row[0] > after
+        return row if row is None or row[0] >= start else False
 
-    def _next_sound(self, after: int) -> int | None:
-        """Smallest id found past which rows can be read again, None when there is none."""
-        bad, step = max(after, 0), 1
-        while not self._is_sound(bad + step):
+    def _next_sound(self, bad: int) -> int | None:
+        """Smallest id found from which rows can be read again, None when there is none.
+
+        Args:
+            bad: Id from which they cannot.
+        """
+        bad, step = max(bad, 0), 1
+        while self._one(bad + step) is False:
             step *= 2
             if bad + step > _MAX_ROWID:
                 return None
@@ -298,24 +310,26 @@ class SqliteSource(Source):
         bad += step // 2
         while good - bad > 1:
             middle = (good + bad) // 2
-            if self._is_sound(middle):
-                good = middle
-            else:
+            if self._one(middle) is False:
                 bad = middle
+            else:
+                good = middle
         return good
 
-    def _report_gap(self, after: int, found: int | None, problem: str) -> None:
+    def _report_gap(self, start: int, found: int | None, problem: str) -> None:
         """Reports rows that SQLite does not give; row ids of rosbag2 have no gaps."""
-        first = max(after, 0) + 1
+        first = max(start, 1)
+        # Past the last row nothing is lost that ids could count.
+        is_last = found is None or self._one(found) is None
         lost: int | None = None
-        if found is None:
+        if not is_last and found is not None:
+            lost = found - first
+            where = f"row {first}" if lost == 1 else f"rows {first} to {found - 1}"
+        else:
+            where = f"rows from id {first} on"
             if self.message_count is not None:
                 known = sum(damage.messages_lost or 0 for damage in self.damage)
                 lost = max(0, self.message_count - self._got - known)
-            where = f"rows from id {first} on"
-        else:
-            lost = found - first + 1
-            where = f"row {first}" if lost == 1 else f"rows {first} to {found}"
         self.damage.append(
             Damage(self.path, None, None, f"{where} cannot be read: SQLite says {problem}", lost)
         )

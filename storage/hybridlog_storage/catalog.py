@@ -271,7 +271,8 @@ def _chunk_entry(document: Mapping[str, Any]) -> ChunkEntry:
     stats = {}
     for item in document["ch"]:
         values = dict(item)
-        stats[cast(int, values.pop("c"))] = ChannelStats(**values)
+        channel = cast(int, values.pop("c"))
+        stats[channel] = ChannelStats(**values)
     return ChunkEntry(
         document["rec"],
         document["seg"],

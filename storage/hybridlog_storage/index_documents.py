@@ -29,6 +29,11 @@ def key_bound(log_time: int) -> bytes:
     return struct.pack(">QIQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
 
 
+def recording_key(document: bytes) -> int:
+    """Number of the recording that an index document belongs to, from its key."""
+    return int.from_bytes(document[_KEY_AT + 8 : _KEY_AT + 12], "big")
+
+
 @dataclass(frozen=True, slots=True)
 class Origin:
     """What all documents of one channel of one recording share.

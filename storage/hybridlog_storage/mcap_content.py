@@ -269,12 +269,16 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
 
 
 class _Fields(ReadDataStream):
-    """Reads fields of one record and never beyond it."""
+    """Reads the fields of one record and never beyond it."""
+
+    def __init__(self, content: Buffer) -> None:
+        super().__init__(BytesIO(content))
+        self._size = len(content)
 
     def read(self, length: int) -> bytes:
-        data: bytes = super().read(length)
-        if len(data) != length:
+        if length > self._size - self.count:
             raise SegmentError("a field runs over the end of the record")
+        data: bytes = super().read(length)
         return data
 
 
@@ -324,7 +328,7 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         reader = _READERS.get(opcode)
         if reader is None:
             return None, 0
-        stream = _Fields(BytesIO(content))
+        stream = _Fields(content)
         record = reader(stream)
     except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error

@@ -602,7 +602,7 @@ class _Scanner:
         self._in_data = False
         if self._crc is not None and record.data_section_crc not in {0, self._crc}:
             reason = "the checksum of all data differs: some bytes before this one have changed"
-            yield at, ScanDamage(0, at, reason)
+            yield at, ScanDamage(0, at, reason, opcode=Opcode.DATA_END)
         self._crc = None
         yield at, record
 
@@ -631,7 +631,7 @@ class _Scanner:
     # Damage
 
     def _too_large(self, at: int, end: int, opcode: int) -> ScanDamage:
-        messages = {Opcode.CHUNK: None, Opcode.MESSAGE: 1}.get(opcode, 0)
+        messages = None if opcode == Opcode.CHUNK else int(opcode == Opcode.MESSAGE)
         reason = f"a record of {end - at} bytes is above the limit of {self._limit}"
         return ScanDamage(at, end - at, reason, messages, opcode=opcode)
 

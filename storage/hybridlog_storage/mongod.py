@@ -25,6 +25,7 @@ import importlib.util
 import json
 import math
 import os
+import secrets
 import shutil
 import socket
 import stat
@@ -163,6 +164,8 @@ class EmbeddedMongod:
         with self._mutex:
             entered = self._users is None
             try:
+                if self._users is not None and os.fstat(self._users).st_nlink == 0:
+                    self._leave()  # the store was removed, and may have been made anew
                 if self._users is None:
                     self._users = self._enter()
                 return _uri(self._find_or_launch())
@@ -259,18 +262,32 @@ class EmbeddedMongod:
                 self._end_orphan()
                 return None
             program = find_mongod()
-            path = _socket_directory(self._directory) / "mongod.sock"
-            with contextlib.suppress(FileNotFoundError):
-                path.unlink()
-            self._record_path.unlink(missing_ok=True)
+            self._remove_stale()
+            path = _make_socket_directory(self._directory) / "mongod.sock"
             before = self.log.stat().st_size if self.log.exists() else 0
-            self._spawn(program, path, keeper, alive)
+            try:
+                self._spawn(program, path, keeper, alive)
+            except HybridlogError:
+                with contextlib.suppress(OSError):
+                    path.parent.rmdir()
+                raise
             # A log that is put aside at the start begins anew.
             return min(before, self.log.stat().st_size if self.log.exists() else 0)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         finally:
             os.close(alive)
+
+    def _remove_stale(self) -> None:
+        """Remove what a killed keeper left. Needs `keeper.lock` and `alive.lock`."""
+        record = self._read_record()
+        # A record came with the store, wherever that is from; it names a directory to
+        # remove only where such directories are made.
+        if record and Path(record.socket).parent.parent == _socket_base():
+            with contextlib.suppress(OSError):
+                Path(record.socket).unlink()
+                Path(record.socket).parent.rmdir()
+        self._record_path.unlink(missing_ok=True)
 
     def _spawn(self, program: Path, path: Path, keeper: int, alive: int) -> None:
         if not sys.executable:
@@ -471,35 +488,44 @@ def _directory_error(directory: Path, error: OSError) -> HybridlogError:
     )
 
 
-def _socket_directory(directory: Path) -> Path:
-    """Make the private directory of the socket of the store's mongod.
+def _socket_base() -> Path:
+    """The directory of this user's sockets.
 
     Not the store's directory, whose path may be too long for a socket, and not
     XDG_RUNTIME_DIR, which is removed when its user logs out, while a recording may go on.
     HYBRIDLOG_RUNTIME_DIR overrides `/tmp`.
+    """
+    base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
+    return base / f"hybridlog-{os.geteuid()}"
+
+
+def _make_socket_directory(directory: Path) -> Path:
+    """Make a new private directory for the socket of the store's mongod.
+
+    New for every mongod, so that the end of one can never remove the socket of the next.
 
     Raises:
         DatabaseError: The path is too long, or the directory is not private to this user.
     """
-    base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
-    own = base / f"hybridlog-{os.geteuid()}"
-    # The inode as well, as containers may have other directories under the same path.
-    about = directory.stat()
-    identity = f"{about.st_dev}:{about.st_ino}:".encode() + os.fsencode(directory)
-    result = own / hashlib.sha256(identity).hexdigest()[:16]
+    own = _socket_base()
+    # The store's part is for whoever looks around in /tmp.
+    part = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
+    result = own / f"{part}-{secrets.token_hex(4)}"
     if len(os.fsencode(result / "mongod.sock")) > MAX_SOCKET_PATH:
         raise DatabaseError(
-            f"{base} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short one."
+            f"{own.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
+            f"one."
         )
     for path in (own, result):
         try:
-            path.mkdir(mode=0o700, exist_ok=True)
+            path.mkdir(mode=0o700)
+        except FileExistsError:
+            pass
         except OSError as error:
-            if not isinstance(error, FileExistsError):
-                raise DatabaseError(
-                    f"{path} cannot be made for mongod's socket: {error.strerror}. Set "
-                    f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
-                ) from error
+            raise DatabaseError(
+                f"{path} cannot be made for mongod's socket: {error.strerror}. Set "
+                f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
+            ) from error
         if not _is_private(path):
             raise DatabaseError(
                 f"{path} has to be a directory of this user that nobody else can open, and is "

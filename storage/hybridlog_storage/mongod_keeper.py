@@ -76,15 +76,16 @@ def main(job: Job) -> int:
         _clean(job)
         return 1
     users = os.open(job["users_lock"], os.O_RDWR | os.O_CLOEXEC)
+    is_removed = False
     try:
         _write_record(job, mongod.pid)
-        _wait(job, mongod, users, asked_to_end)
+        is_removed = _wait(job, mongod, users, asked_to_end)
     except OSError as error:  # a disk that is full cannot take the record
         _say(job, f"the keeper of mongod failed: {error}")
     finally:
         status = mongod.poll()
         if status is None:
-            _end(mongod)
+            _end(mongod, at_once=is_removed)
         else:
             _say(job, f"mongod ended by itself, {describe_status(status)}")
         _clean(job)
@@ -137,19 +138,25 @@ def _raise_open_files() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: list[int]) -> None:
-    """Return when mongod has ended, when told to end, or, with `users` locked, when idle."""
+def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: list[int]) -> bool:
+    """Return when mongod has ended, when told to end, or, with `users` locked, when idle.
+
+    Returns:
+        Whether the store was removed, and mongod's data with it.
+    """
     born = time.monotonic()
     checked_log = born
     idle_since: float | None = None
     while mongod.poll() is None and not asked_to_end:
         now = time.monotonic()
+        if os.fstat(users).st_nlink == 0:
+            return True
         if _lock(users):
             idle_since = now if idle_since is None else idle_since
             if now - idle_since >= job["linger_s"]:
                 # Kept locked: whoever comes now waits until mongod has ended and this
                 # process with it, and then starts anew.
-                return
+                return False
             fcntl.flock(users, fcntl.LOCK_UN)
         else:
             idle_since = None
@@ -157,6 +164,7 @@ def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: l
             checked_log = now
             _put_log_aside(job)
         time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
+    return False
 
 
 def _lock(users: int) -> bool:
@@ -167,7 +175,9 @@ def _lock(users: int) -> bool:
     return True
 
 
-def _end(mongod: subprocess.Popen[bytes]) -> None:
+def _end(mongod: subprocess.Popen[bytes], *, at_once: bool) -> None:
+    if at_once:
+        mongod.kill()
     mongod.terminate()
     try:
         mongod.wait(END_LIMIT_S)
@@ -184,10 +194,13 @@ def _write_record(job: Job, pid: int) -> None:
 
 
 def _clean(job: Job) -> None:
-    socket = Path(job["socket"])
-    for path in (Path(job["record"]), socket):
-        with contextlib.suppress(OSError):
-            path.unlink()
+    record, socket = Path(job["record"]), Path(job["socket"])
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        # Another store, with another keeper, may stand in the place of a removed one.
+        if json.loads(record.read_text())["keeper"] == os.getpid():
+            record.unlink()
+    with contextlib.suppress(OSError):
+        socket.unlink()
     with contextlib.suppress(OSError):
         socket.parent.rmdir()
 

@@ -204,9 +204,11 @@ class SegmentReader:
 
     def _metadata(self, offset: int, length: int) -> Metadata:
         try:
-            return Metadata.read(ReadDataStream(BytesIO(self._read(offset, length)[9:])))
+            body = ReadDataStream(BytesIO(self._read(offset, length)[9:]))
+            record: Metadata = Metadata.read(body)
         except (ValueError, struct.error, EOFError) as error:
             raise SegmentError(f"Metadata at byte {offset} of {self.path} is damaged.") from error
+        return record
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:

@@ -343,7 +343,7 @@ class SegmentFile:
         offset_start = start + builder.count
         for offset in offsets:
             offset.write(builder)
-        summary = bytes(builder.end())
+        summary: bytes = builder.end()  # type: ignore[no-untyped-call]
         footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0)
         # The footer's checksum covers the summary and the footer up to the checksum itself.
         covered = record_bytes(footer)[:-4]

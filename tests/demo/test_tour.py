@@ -78,17 +78,17 @@ def test_a_good_tour_confirms_each_answer_and_cleans_up(
 
 def test_a_kept_tour_leaves_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch)
-    assert tour.run(tmp_path, keep=True) == 0
+    assert tour.run(tmp_path) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["robot-logs", "robot.bag", "scan.npz", "truth.json"]
     with pytest.raises(UsageError, match="exists already"):
-        tour.run(tmp_path, keep=True)
+        tour.run(tmp_path)
 
 
 def test_foreign_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch)
     (tmp_path / "mine").write_text("x")
-    assert tour.run(tmp_path) == 0
+    assert tour.run(tmp_path, keep=False) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 

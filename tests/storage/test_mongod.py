@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -316,6 +317,40 @@ def test_everything_killed_and_a_stale_socket_and_record(directory: Path) -> Non
         stale.bind(str(path))
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert ping(user.start())
+        assert not path.exists()
+
+
+def test_a_store_removed_and_made_anew_under_a_running_mongod(directory: Path) -> None:
+    user = EmbeddedMongod(directory, linger_s=0.5)
+    with MongoClient(user.start()) as client:
+        client.test.kept.insert_one({"_id": 1})
+    first = pids(directory)
+    shutil.rmtree(directory)
+    with MongoClient(user.start()) as client:
+        assert client.test.kept.count_documents({}) == 0
+        second = pids(directory)
+        assert not set(first) & set(second)
+        gone(*first)
+        assert pids(directory) == second, "the first keeper leaves the second's record alone"
+        assert ping(user.start())
+    user.stop()
+    gone(*second)
+
+
+def test_a_stale_record_names_nothing_else_to_remove(
+    directory: Path, tmp_path: Path, runtime: Path
+) -> None:
+    directory.mkdir()
+    foreign = runtime / "foreign"
+    foreign.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(foreign / "agent.sock"))
+    (directory / "mongod.json").write_text(
+        json.dumps({"socket": str(foreign / "agent.sock"), "mongod": 1})
+    )
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert ping(user.start())
+    assert (foreign / "agent.sock").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"socket": 3, "mongod": "x"}', b"\xff"])

@@ -1,0 +1,294 @@
+"""What all writers share: where bytes go, and that nothing half-made stays behind.
+
+A file appears under its name only when it is complete: it is written beside the target,
+synced, and renamed on `close`. `abort` removes it. Devices, pipes and streams are
+written as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
+
+from hybridlog_storage.durability import sync_directory
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    import pyarrow as pa
+
+    from hybridlog_storage.messages import Batch, Buffer, Channel
+
+Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
+"""Where a writer writes: a path, or a binary stream, which is left open."""
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_WRONG_PLACE = {
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.EEXIST,
+    errno.ENOTEMPTY,
+    errno.EINVAL,
+}
+_BUFFER = 1 << 20
+
+
+class Writer(Protocol):
+    """Something that ends well or not at all.
+
+    As a context manager it closes at the end of the block, and aborts when the block
+    raises.
+    """
+
+    def close(self) -> None:
+        """Complete the output; it then stands under its name."""
+
+    def abort(self) -> None:
+        """Leave nothing behind. Does nothing after `close`."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+
+class BatchWriter(Writer, Protocol):
+    """A format that carries payloads as they came."""
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages.
+
+        Args:
+            batch: Rows in the order wanted.
+            channels: `batch.channel` indexes these. Channels of equal content, in one
+                call or several, become one.
+        """
+
+
+class TableWriter(Writer, Protocol):
+    """A format of columns."""
+
+    def write(self, table: pa.Table) -> None:
+        """Append rows."""
+
+
+class RowWriter(Writer, Protocol):
+    """A format of one object a message."""
+
+    def write(self, rows: Iterable[Mapping[str, object]]) -> None:
+        """Append objects."""
+
+
+class FileWriter:
+    """The life of a writer: subclasses say how to finish and how to let go.
+
+    `close` and `abort` may be called again; whichever came first counts.
+    """
+
+    def __init__(self) -> None:
+        self._over = False
+
+    def close(self) -> None:
+        """Complete the output; it then stands under its name.
+
+        Raises:
+            DiskFullError: No space; nothing is left behind.
+            UsageError: The place cannot be written.
+        """
+        if self._over:
+            return
+        try:
+            self._finish()
+        except BaseException:
+            self.abort()
+            raise
+        self._over = True
+
+    def abort(self) -> None:
+        """Leave nothing behind. Does nothing after `close`."""
+        if not self._over:
+            self._over = True
+            self._discard()
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close, or abort when the block has raised."""
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _finish(self) -> None:
+        raise NotImplementedError
+
+    def _discard(self) -> None:
+        raise NotImplementedError
+
+
+class Sink:
+    """A binary output that appears on `commit`.
+
+    It has what pyarrow, zipfile and the mcap writer ask of a file that cannot seek.
+
+    Args:
+        target: Path or stream.
+
+    Raises:
+        UsageError: A directory, or a place that does not exist or cannot be written.
+    """
+
+    def __init__(self, target: Target) -> None:
+        self._position = 0
+        self._temporary: Path | None = None
+        self._final: Path | None = None
+        self._own = True
+        self._over = False
+        if not isinstance(target, str | os.PathLike):
+            self.name = str(getattr(target, "name", "the output"))
+            self._file, self._own = target, False
+            return
+        self.name = os.fspath(target)
+        with failures(self.name):
+            self._final, atomic = destination(target)
+            if atomic:
+                self._temporary = beside(self._final)
+            # A text that is a path is never opened for reading here, nor followed again.
+            path = self._temporary or self._final
+            self._file = path.open("xb" if atomic else "wb", buffering=_BUFFER)
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is committed or aborted."""
+        return self._over
+
+    def write(self, data: Buffer) -> int:
+        """Append bytes; returns how many.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        with failures(self.name):
+            self._file.write(data)
+        size = memoryview(data).nbytes
+        self._position += size
+        return size
+
+    def tell(self) -> int:
+        """Bytes written so far."""
+        return self._position
+
+    def flush(self) -> None:
+        """Hand what is buffered to the system."""
+        with failures(self.name):
+            self._file.flush()
+
+    def close(self) -> None:
+        """Nothing: libraries close what they are given, `commit` is for its owner."""
+
+    def readable(self) -> bool:
+        """False."""
+        return False
+
+    def writable(self) -> bool:
+        """True."""
+        return True
+
+    def seekable(self) -> bool:
+        """False."""
+        return False
+
+    def commit(self) -> None:
+        """Sync, and give the file its name."""
+        with failures(self.name):
+            self._file.flush()
+            if self._temporary is not None and self._final is not None:
+                os.fsync(self._file.fileno())
+            if self._own:
+                self._file.close()
+            if self._temporary is not None and self._final is not None:
+                self._temporary.replace(self._final)
+                sync_directory(self._final.parent)
+        self._over = True
+
+    def abort(self) -> None:
+        """Remove what was written; a stream keeps what it has taken."""
+        if self._over:
+            return
+        self._over = True
+        if self._own:
+            # Closing flushes, and on a full disk that fails again.
+            with contextlib.suppress(OSError):
+                self._file.close()
+        if self._temporary is not None:
+            with contextlib.suppress(OSError):
+                self._temporary.unlink(missing_ok=True)
+
+
+def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
+    """The path to write, links followed, and whether it can be replaced by a rename.
+
+    Devices and pipes cannot.
+
+    Raises:
+        UsageError: A directory, or in a directory that does not exist.
+    """
+    if "\0" in os.fspath(target):
+        raise UsageError("the output's name has a NUL character")
+    path = Path(os.path.realpath(target))
+    if path.is_dir():
+        raise UsageError(f"{target} is a directory; name a file in it")
+    if not path.parent.is_dir():
+        raise UsageError(f"cannot write {target}: there is no directory {path.parent}")
+    return path, path.is_file() or not path.exists()
+
+
+def beside(final: Path) -> Path:
+    """A name in the same directory that is not in use."""
+    return final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial")
+
+
+@contextlib.contextmanager
+def failures(name: str) -> Iterator[None]:
+    """Map the system's errors in writing `name` to ours; a broken pipe stays what it is."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise explain(error, name) from error
+
+
+def explain(error: OSError, name: str) -> HybridlogError:
+    """The error of our tree for a failure in writing an output."""
+    reason = error.strerror or str(error)
+    if error.errno in _FULL:
+        return DiskFullError(
+            f"no space left for {name}: {reason}; free some, or write to another place with -o"
+        )
+    if error.errno in _WRONG_PLACE:
+        return UsageError(f"cannot write {name}: {reason}")
+    return HybridlogError(f"writing {name} failed: {reason}")

@@ -1,0 +1,97 @@
+"""Arrow columns as JSON text, whole columns at a time.
+
+JSON has no NaN and no infinities: they become null. Integers keep all their digits.
+Times and durations are integer nanoseconds, binary values their length: `{"n": 1024}`.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+
+def json_column(array: pa.Array) -> pa.Array:
+    """The values of an array as JSON, one string a row.
+
+    Args:
+        array: Of any type; at most 2**31 bytes of text may come out of it.
+
+    Returns:
+        `pa.string()`, without nulls (a null is the text `null`).
+
+    Raises:
+        pa.ArrowNotImplementedError: A type that has no JSON form here (a map, a union).
+    """
+    text = _values(array)
+    return pc.fill_null(text, "null") if text.null_count else text
+
+
+def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
+    kind = array.type
+    if isinstance(array, pa.ExtensionArray):
+        return _values(array.storage)
+    if pa.types.is_null(kind):
+        return array.cast(pa.string())
+    if pa.types.is_dictionary(kind):
+        return _values(array.dictionary_decode())
+    if pa.types.is_boolean(kind) or pa.types.is_integer(kind):
+        return array.cast(pa.string())
+    if pa.types.is_floating(kind):
+        return pc.if_else(pc.is_finite(array), array.cast(pa.string()), "null")
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
+        return array.cast(unit).cast(pa.int64()).cast(pa.string())
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        # Few different strings are the rule: each is quoted once.
+        words = array.dictionary_encode()
+        quoted = [json.dumps(word) for word in words.dictionary.to_pylist()]
+        return pa.array(quoted, pa.string()).take(words.indices)
+    if pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or _is_fixed_binary(kind):
+        length = pc.binary_length(array).cast(pa.string())
+        return pc.binary_join_element_wise('{"n": ', length, "}", "")
+    if _is_list(kind):
+        return _lists(array)
+    if pa.types.is_struct(kind):
+        return _structs(array)
+    raise pa.ArrowNotImplementedError(f"no JSON form of {kind}")
+
+
+def _lists(array: pa.Array) -> pa.Array:
+    # `flatten` leaves out what null lists and slices hide, so offsets are made anew.
+    items = json_column(array.flatten())
+    lengths = np.asarray(pc.fill_null(pc.list_value_length(array), 0), dtype=np.int64)
+    offsets = np.zeros(len(array) + 1, dtype=np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    lists = pa.LargeListArray.from_arrays(pa.array(offsets), items)
+    text = pc.binary_join_element_wise("[", pc.binary_join(lists, ", "), "]", "")
+    return _with_nulls(text, array)
+
+
+def _structs(array: pa.Array) -> pa.Array:
+    count = array.type.num_fields
+    if count == 0:
+        return _with_nulls(pa.repeat("{}", len(array)), array)
+    parts: list[pa.Array | str] = []
+    for index, name in enumerate(array.type.field(i).name for i in range(count)):
+        parts.append(f"{', ' if index else '{'}{json.dumps(name)}: ")
+        parts.append(json_column(array.field(index)))
+    return _with_nulls(pc.binary_join_element_wise(*parts, "}", ""), array)
+
+
+def _with_nulls(text: pa.Array, array: pa.Array) -> pa.Array:
+    if not array.null_count:
+        return text
+    return pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string()))
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(
+        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    )
+
+
+def _is_fixed_binary(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_fixed_size_binary(kind))

@@ -1,0 +1,113 @@
+"""MCAP files: every message, schema and channel as it came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import IO, TYPE_CHECKING, Any, Literal, cast
+
+from mcap.writer import CompressionType, Writer
+
+from hybridlog.export.base import FileWriter, Sink, Target
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Batch, Channel, Schema
+
+OWN_METADATA = "hybridlog."
+"""Channel metadata keys of the store, which do not leave it."""
+
+_ChannelKey = tuple[str, str, int, tuple[tuple[str, str], ...]]
+
+
+def source_metadata(channel: Channel) -> dict[str, str]:
+    """A channel's metadata without what the store has added."""
+    return {
+        key: value for key, value in channel.metadata.items() if not key.startswith(OWN_METADATA)
+    }
+
+
+class McapWriter(FileWriter):
+    """Writes one MCAP file with a complete summary.
+
+    Args:
+        target: Path or binary stream.
+        profile: MCAP profile: `ros1`, `ros2` or empty.
+        compression: Of chunks.
+        chunk_size: Uncompressed bytes at which a chunk ends.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        profile: str = "",
+        compression: Literal["zstd", "lz4", "none"] = "zstd",
+        chunk_size: int = 4 << 20,
+    ) -> None:
+        super().__init__()
+        self._sink = Sink(target)
+        self._schemas: dict[Schema, int] = {}
+        self._ids: dict[_ChannelKey, int] = {}
+        self._known: dict[Channel, int] = {}
+        try:
+            self._writer = Writer(
+                cast("IO[Any]", self._sink),
+                chunk_size=chunk_size,
+                compression=CompressionType[compression.upper()],
+            )
+            self._writer.start(profile=profile, library="hybridlog")
+        except BaseException:
+            self._sink.abort()
+            raise
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages in the order of the rows.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        view = memoryview(batch.buffer)
+        add = self._writer.add_message
+        ids = {number: self._channel(channels[number]) for number in set(batch.channel.tolist())}
+        for channel, start, length, log_time, publish_time, sequence in zip(
+            batch.channel.tolist(),
+            batch.offset.tolist(),
+            batch.length.tolist(),
+            batch.log_time.tolist(),
+            batch.publish_time.tolist(),
+            batch.sequence.tolist(),
+            strict=True,
+        ):
+            # The writer copies the bytes into its chunk at once.
+            payload = cast("bytes", view[start : start + length])
+            add(ids[channel], log_time, payload, publish_time, sequence)
+
+    def _channel(self, channel: Channel) -> int:
+        number = self._known.get(channel)
+        if number is None:
+            number = self._known[channel] = self._register(channel)
+        return number
+
+    def _register(self, channel: Channel) -> int:
+        metadata = source_metadata(channel)
+        schema = self._schema(channel.schema)
+        key = (channel.topic, channel.message_encoding, schema, tuple(sorted(metadata.items())))
+        if key not in self._ids:
+            self._ids[key] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, schema, metadata
+            )
+        return self._ids[key]
+
+    def _schema(self, schema: Schema | None) -> int:
+        if schema is None:
+            return 0
+        if schema not in self._schemas:
+            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[schema] = int(number)
+        return self._schemas[schema]
+
+    def _finish(self) -> None:
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._sink.abort()

@@ -1,0 +1,426 @@
+"""numpy's .npz: one array a column, readable without pickle.
+
+| column | arrays |
+|---|---|
+| numbers, booleans | `name` |
+| times, durations | `name`, datetime64[ns] (UTC) or timedelta64[ns] |
+| strings up to 256 characters | `name`, fixed-width Unicode |
+| longer strings, or with NUL, and binary values | `name.values` (uint8), `name.offsets` |
+| lists of fixed size | `name`, one row a message |
+| lists | `name.values`, `name.offsets`: row i is `values[offsets[i]:offsets[i + 1]]` |
+| structures | `name.field` |
+
+Where a column has nulls, `name.valid` tells which rows have a value; the others are NaN,
+NaT, zero or empty. Columns are spooled to temporary files, so memory stays bounded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from typing import IO, TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.export.base import FileWriter, Sink, Target, failures
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_LONGEST_STRING = 256
+_STRINGS_AT_ONCE = 1 << 14
+_COPY = 1 << 20
+_OPEN_FILES = 2_000
+
+
+class NpzWriter(FileWriter):
+    """Writes one .npz file.
+
+    Args:
+        target: Path or binary stream.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self._columns: dict[str, _Column] = {}
+        self._sink = Sink(target)
+        self._rows = 0
+        try:
+            with failures(self._sink.name):
+                self._spools = _Spools()
+        except BaseException:
+            self._sink.abort()
+            raise
+
+    def write(self, table: pa.Table) -> None:
+        """Append rows; columns are matched by name. A missing column is null.
+
+        Raises:
+            UsageError: A column that changes its type, or has a type that numpy has not.
+            DiskFullError: No space left.
+        """
+        with failures(self._sink.name):
+            for batch in table.combine_chunks().to_batches():
+                self._write_batch(batch)
+
+    def _write_batch(self, batch: pa.RecordBatch) -> None:
+        names = batch.schema.names
+        if len(set(names)) != len(names):
+            raise UsageError("two columns have the same name; leave one out with --fields")
+        for name, array in zip(names, batch.columns, strict=True):
+            column = self._columns.get(name)
+            if column is None:
+                if pa.types.is_null(array.type):
+                    continue  # its type is not known yet; nulls are filled in then
+                column = self._columns[name] = _column(_array_name(name), array.type, self._spools)
+                column.append_nulls(self._rows)
+            column.append(array)
+        self._rows += batch.num_rows
+        for name, column in self._columns.items():
+            if name not in names:
+                column.append_nulls(batch.num_rows)
+
+    def _finish(self) -> None:
+        written: set[str] = set()
+        with (
+            failures(self._sink.name),
+            zipfile.ZipFile(cast("IO[bytes]", self._sink), "w", zipfile.ZIP_STORED) as archive,
+        ):
+            for column in self._columns.values():
+                for name, dtype, shape, chunks in column.arrays():
+                    unique = name
+                    while unique in written:
+                        unique += "_"
+                    written.add(unique)
+                    # A fixed date makes equal content an equal file.
+                    entry = zipfile.ZipInfo(f"{unique}.npy", (1980, 1, 1, 0, 0, 0))
+                    with archive.open(entry, "w", force_zip64=True) as file:
+                        file.write(_npy_header(dtype, shape))
+                        for chunk in chunks:
+                            file.write(chunk)
+        self._sink.commit()
+        self._spools.close()
+
+    def _discard(self) -> None:
+        self._sink.abort()
+        self._spools.close()
+
+
+class _Spools:
+    """Temporary files of one writer; all are gone when it is."""
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+        self._directory = tempfile.TemporaryDirectory(prefix="hybridlog-")
+        self._stack.enter_context(self._directory)
+        self._count = 0
+
+    def new(self) -> IO[bytes]:
+        """A file that holds an array's bytes."""
+        self._count += 1
+        if self._count > _OPEN_FILES:
+            raise UsageError("more columns than files can be open; choose some with --fields")
+        return self._stack.enter_context(
+            tempfile.SpooledTemporaryFile(max_size=1 << 16, dir=self._directory.name)
+        )
+
+    def close(self) -> None:
+        """Remove all files."""
+        with contextlib.suppress(OSError):
+            self._stack.close()
+
+
+_Array = tuple[str, "np.dtype[Any]", tuple[int, ...], Iterator[bytes]]
+
+
+class _Spool:
+    """The bytes of one array of a known dtype."""
+
+    def __init__(self, name: str, dtype: np.dtype[Any], spools: _Spools) -> None:
+        self.name = name
+        self.dtype = dtype
+        self.count = 0
+        self._file = spools.new()
+
+    def append(self, values: NDArray[Any]) -> None:
+        self._file.write(np.ascontiguousarray(values, self.dtype).tobytes())
+        self.count += len(values)
+
+    def chunks(self) -> Iterator[bytes]:
+        self._file.seek(0)
+        while chunk := self._file.read(_COPY):
+            yield chunk
+
+    def array(self) -> _Array:
+        return self.name, self.dtype, (self.count,), self.chunks()
+
+
+class _Column:
+    """A column that takes pieces and, in the end, gives arrays."""
+
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        self.name = name
+        self.kind = kind
+        self._valid = _Spool(f"{name}.valid", np.dtype(bool), spools)
+        self._has_nulls = False
+
+    def append(self, array: pa.Array) -> None:
+        """Append values.
+
+        Raises:
+            UsageError: Of another type than before.
+        """
+        if array.type != self.kind:
+            try:
+                array = array.cast(self.kind)
+            except pa.ArrowException as error:
+                raise UsageError(
+                    f"column {self.name!r} is {self.kind} at first and {array.type} later, which "
+                    f"does not fit ({error}); leave it out with --fields"
+                ) from error
+        self._valid.append(array.is_valid().to_numpy(zero_copy_only=False))
+        self._has_nulls = self._has_nulls or array.null_count > 0
+        self._append(array)
+
+    def append_nulls(self, count: int) -> None:
+        """Append rows without a value."""
+        if count:
+            self.append(pa.nulls(count, self.kind))
+
+    def arrays(self) -> Iterator[_Array]:
+        """Name, dtype, shape and bytes of each array of the column."""
+        yield from self._arrays()
+        if self._has_nulls:
+            yield self._valid.array()
+
+    def _append(self, array: pa.Array) -> None:
+        raise NotImplementedError
+
+    def _arrays(self) -> Iterator[_Array]:
+        raise NotImplementedError
+
+
+class _Numbers(_Column):
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._spool = _Spool(name, _dtype(kind), spools)
+
+    def _append(self, array: pa.Array) -> None:
+        if array.null_count:
+            array = pc.fill_null(array, _filler(self.kind))
+        self._spool.append(array.to_numpy(zero_copy_only=False))
+
+    def _arrays(self) -> Iterator[_Array]:
+        yield self._spool.array()
+
+
+class _Times(_Column):
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        stamp = pa.types.is_timestamp(kind)
+        self._unit = pa.timestamp("ns") if stamp else pa.duration("ns")
+        dtype = np.dtype("datetime64[ns]" if stamp else "timedelta64[ns]")
+        self._spool = _Spool(name, dtype, spools)
+
+    def _append(self, array: pa.Array) -> None:
+        plain = array.cast(self._unit).cast(pa.int64())
+        nat = int(np.iinfo(np.int64).min)
+        values = pc.fill_null(plain, nat).to_numpy(zero_copy_only=False)
+        self._spool.append(values.view(self._spool.dtype))
+
+    def _arrays(self) -> Iterator[_Array]:
+        yield self._spool.array()
+
+
+class _Texts(_Column):
+    """Strings and binary values, as bytes and their ends."""
+
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._text = bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+        self._bytes = _Spool(f"{name}.values", np.dtype(np.uint8), spools)
+        self._offsets = _Spool(f"{name}.offsets", np.dtype(np.int64), spools)
+        self._offsets.append(np.zeros(1, np.int64))
+        self._longest = 0
+        self._has_nul = False
+
+    def _append(self, array: pa.Array) -> None:
+        if not len(array):
+            return
+        values = pc.fill_null(array.cast(pa.large_binary()), b"")
+        ends = np.cumsum(pc.binary_length(values).to_numpy(zero_copy_only=False))
+        self._offsets.append(ends + self._bytes.count)
+        # One join gives the bytes of the whole piece.
+        joined = pc.binary_join(
+            pa.LargeListArray.from_arrays(pa.array([0, len(values)], pa.int64()), values), b""
+        )
+        data = np.frombuffer(joined[0].as_py(), np.uint8)
+        self._bytes.append(data)
+        if self._text:
+            lengths = pc.utf8_length(pc.fill_null(array, ""))
+            self._longest = max(self._longest, int(pc.max(lengths).as_py()))
+            self._has_nul = self._has_nul or not bool(data.all())
+
+    def _arrays(self) -> Iterator[_Array]:
+        if not self._text or self._has_nul or self._longest > _LONGEST_STRING:
+            yield self._bytes.array()
+            yield self._offsets.array()
+            return
+        dtype = np.dtype(f"<U{max(1, self._longest)}")
+        yield self.name, dtype, (self._offsets.count - 1,), self._unicode(dtype)
+
+    def _unicode(self, dtype: np.dtype[Any]) -> Iterator[bytes]:
+        data = b"".join(self._bytes.chunks())
+        offsets = np.frombuffer(b"".join(self._offsets.chunks()), np.int64)
+        for first in range(0, len(offsets) - 1, _STRINGS_AT_ONCE):
+            bounds = offsets[first : first + _STRINGS_AT_ONCE + 1].tolist()
+            words = [data[low:high].decode() for low, high in zip(bounds, bounds[1:], strict=False)]
+            yield np.array(words, dtype).tobytes()
+
+
+class _Lists(_Column):
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._items = _column(f"{name}.values", kind.value_type, spools)
+        self._offsets = _Spool(f"{name}.offsets", np.dtype(np.int64), spools)
+        self._offsets.append(np.zeros(1, np.int64))
+        self._end = 0
+
+    def _append(self, array: pa.Array) -> None:
+        lengths = pc.fill_null(pc.list_value_length(array), 0).to_numpy(zero_copy_only=False)
+        ends = np.cumsum(lengths, dtype=np.int64) + self._end
+        self._offsets.append(ends)
+        self._end = int(ends[-1]) if len(ends) else self._end
+        self._items.append(array.flatten())
+
+    def _arrays(self) -> Iterator[_Array]:
+        yield from self._items.arrays()
+        yield self._offsets.array()
+
+
+class _FixedLists(_Column):
+    """Lists of one size of numbers: a matrix."""
+
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._size = kind.list_size
+        self._spool = _Spool(name, _dtype(kind.value_type), spools)
+        self._rows = 0
+
+    def _append(self, array: pa.Array) -> None:
+        self._rows += len(array)
+        # `values` has the elements of null rows too, which `flatten` leaves out.
+        items = array.values.slice(array.offset * self._size, len(array) * self._size)
+        if array.null_count:
+            hidden = np.repeat(array.is_null().to_numpy(zero_copy_only=False), self._size)
+            items = pc.if_else(pa.array(hidden), pa.scalar(None, items.type), items)
+        if items.null_count:
+            items = pc.fill_null(items, _filler(self.kind.value_type))
+        self._spool.append(items.to_numpy(zero_copy_only=False))
+
+    def _arrays(self) -> Iterator[_Array]:
+        yield self.name, self._spool.dtype, (self._rows, self._size), self._spool.chunks()
+
+
+class _Structs(_Column):
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._members = [
+            _column(f"{name}.{_array_name(member.name)}", member.type, spools)
+            for member in (kind.field(index) for index in range(kind.num_fields))
+        ]
+
+    def _append(self, array: pa.Array) -> None:
+        # `flatten` puts the structure's nulls into its members.
+        for member, values in zip(self._members, array.flatten(), strict=True):
+            member.append(values)
+
+    def _arrays(self) -> Iterator[_Array]:
+        for member in self._members:
+            yield from member.arrays()
+
+
+class _Decoded(_Column):
+    """A dictionary column, as the values it stands for."""
+
+    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
+        super().__init__(name, kind, spools)
+        self._inner = _column(name, kind.value_type, spools)
+
+    def append(self, array: pa.Array) -> None:
+        plain = pa.types.is_dictionary(array.type)
+        self._inner.append(array.dictionary_decode() if plain else array)
+
+    def arrays(self) -> Iterator[_Array]:
+        yield from self._inner.arrays()
+
+
+class _Nulls(_Column):
+    """A list's elements of which none was ever there."""
+
+    def _append(self, array: pa.Array) -> None:
+        pass
+
+    def _arrays(self) -> Iterator[_Array]:
+        yield from ()
+
+
+def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
+    types = pa.types
+    table: list[tuple[bool, type[_Column]]] = [
+        (types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind), _Numbers),
+        (types.is_timestamp(kind) or types.is_duration(kind), _Times),
+        (types.is_string(kind) or types.is_large_string(kind), _Texts),
+        (types.is_binary(kind) or types.is_large_binary(kind), _Texts),
+        (_is_matrix(kind), _FixedLists),
+        (
+            types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind),
+            _Lists,
+        ),
+        (types.is_struct(kind), _Structs),
+        (types.is_dictionary(kind), _Decoded),
+        (types.is_null(kind), _Nulls),
+    ]
+    for fits, make in table:
+        if fits:
+            return make(name, kind, spools)
+    raise UsageError(f"column {name!r} is {kind}, which numpy has not; leave it out with --fields")
+
+
+def _is_matrix(kind: pa.DataType) -> bool:
+    if not pa.types.is_fixed_size_list(kind):
+        return False
+    item = kind.value_type
+    numeric = pa.types.is_integer(item) or pa.types.is_floating(item) or pa.types.is_boolean(item)
+    return bool(numeric)
+
+
+def _dtype(kind: pa.DataType) -> np.dtype[Any]:
+    return np.dtype(kind.to_pandas_dtype())
+
+
+def _filler(kind: pa.DataType) -> pa.Scalar:
+    if pa.types.is_floating(kind):
+        return pa.scalar(float("nan"), kind)
+    return pa.scalar(False if pa.types.is_boolean(kind) else 0, kind)
+
+
+def _npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header,
+        {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape},
+    )
+    return header.getvalue()
+
+
+def _array_name(name: str) -> str:
+    """A name in the archive that unpacks to no other place."""
+    safe = "".join("_" if char in '/\\:\0"' or not char.isprintable() else char for char in name)
+    return safe.encode("utf-8", "replace").decode()[:200] or "_"

@@ -1,0 +1,142 @@
+"""Payloads as they came, one file each.
+
+The directory holds `index.jsonl`, a line a message (file, topic, type, times, sequence,
+length), and one directory a topic with files `<log time in ns>.bin`; a second message of
+the same nanosecond is `<log time>-1.bin`. Topic directories are named by the rule of the
+index's collections, so that no topic can name a place outside and no two topics meet.
+On a stream the payloads follow each other without anything between them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybridlog.export.base import BatchWriter, FileWriter, Sink, Target, beside, failures
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.durability import sync_directory
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Batch, Channel
+
+INDEX = "index.jsonl"
+"""The file that says which message each payload is. No topic's directory has a dot."""
+
+
+def open_raw_writer(target: Target) -> BatchWriter:
+    """A directory for a path, payloads one after the other for a stream."""
+    if isinstance(target, str | os.PathLike):
+        return RawWriter(target)
+    return RawStreamWriter(target)
+
+
+class RawWriter(FileWriter):
+    """Writes a directory of payload files.
+
+    Args:
+        target: The directory; it must not exist, or be empty.
+
+    Raises:
+        UsageError: Something is there already, or the place cannot be written.
+    """
+
+    def __init__(self, target: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self._name = os.fspath(target)
+        with failures(self._name):
+            self._final = Path(os.path.realpath(target))
+            if self._final.exists() and not self._final.is_dir():
+                raise UsageError(f"{target} is a file; payloads go into a directory")
+            if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
+                raise UsageError(f"{target} is not empty; name a directory that does not exist")
+            self._temporary = beside(self._final)
+            self._temporary.mkdir()
+            self._index = (self._temporary / INDEX).open("x", encoding="ascii")
+        self._last: dict[str, tuple[int, int]] = {}
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        with failures(self._name):
+            for row in range(len(batch)):
+                channel = channels[int(batch.channel[row])]
+                log_time = int(batch.log_time[row])
+                name = self._write_payload(channel.topic, log_time, batch.payload(row))
+                line = {
+                    "file": name,
+                    "topic": channel.topic,
+                    "type": channel.schema.name if channel.schema else "",
+                    "encoding": channel.message_encoding,
+                    "log_time_ns": log_time,
+                    "publish_time_ns": int(batch.publish_time[row]),
+                    "sequence": int(batch.sequence[row]),
+                    "length": int(batch.length[row]),
+                }
+                self._index.write(json.dumps(line) + "\n")
+
+    def _write_payload(self, topic: str, log_time: int, payload: memoryview) -> str:
+        folder = collection_of(topic)
+        last, number = self._last.get(folder, (-1, 0))
+        if folder not in self._last:
+            (self._temporary / folder).mkdir()
+        number = number + 1 if last == log_time else 0
+        while True:
+            name = f"{folder}/{log_time}{f'-{number}' if number else ''}.bin"
+            try:
+                file = (self._temporary / name).open("xb")
+            except FileExistsError:  # the same time again, after others
+                number += 1
+                continue
+            with file:
+                file.write(payload)
+            self._last[folder] = (log_time, number)
+            return name
+
+    def _finish(self) -> None:
+        with failures(self._name):
+            self._index.close()
+            # One sync for all: thousands of small ones take minutes on a slow disk.
+            os.sync()
+            self._temporary.replace(self._final)
+            sync_directory(self._final.parent)
+
+    def _discard(self) -> None:
+        with suppress(OSError):
+            self._index.close()
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+
+class RawStreamWriter(FileWriter):
+    """Writes payloads one after the other, for a pipe.
+
+    Args:
+        target: Binary stream, or the path of a file.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self._sink = Sink(target)
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append payloads.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        for row in range(len(batch)):
+            self._sink.write(batch.payload(row))
+
+    def _finish(self) -> None:
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._sink.abort()

@@ -1,0 +1,265 @@
+"""Tables as files: Parquet, Arrow IPC, CSV.
+
+Tables arrive in pieces. The first pieces, up to a bound, are held back until the columns
+are known, so that a column may appear late or be empty at first; after that a missing
+column is null, and a new one is an error, because these formats fix their columns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Protocol
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.parquet
+
+from hybridlog.export.base import FileWriter, Sink, Target
+from hybridlog.export.json_text import json_column
+from hybridlog.export.jsonl import rows_within
+from hybridlog_storage.errors import UsageError
+
+HELD_BYTES = 32 << 20
+"""Bytes of the pieces that are held back to learn the columns."""
+GROUP_BYTES = 32 << 20
+GROUP_ROWS = 1 << 17
+
+
+class _ArrowFile(Protocol):
+    def write_table(self, table: pa.Table) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class TableFileWriter(FileWriter):
+    """What the table formats share: the columns, and rows gathered into groups.
+
+    Args:
+        target: Path or binary stream.
+        schema: The columns, when they are known before; else they are learnt.
+        held_bytes: Bound of what is held back to learn them.
+    """
+
+    format_name = "table"
+
+    def __init__(
+        self, target: Target, *, schema: pa.Schema | None = None, held_bytes: int = HELD_BYTES
+    ) -> None:
+        super().__init__()
+        self._schema = schema
+        self._held_bytes = held_bytes
+        self._pieces: list[pa.Table] = []
+        self._bytes = 0
+        self._rows = 0
+        self._written = 0
+        self._file: _ArrowFile | None = None
+        self._sink = Sink(target)
+
+    def write(self, table: pa.Table) -> None:
+        """Append rows; columns are matched by name.
+
+        Raises:
+            UsageError: A column that appears too late, twice, or with a type that does
+                not fit the one it had.
+            DiskFullError: No space left.
+        """
+        with self._failures():
+            table = self._prepared(table)
+            _check_names(table.schema)
+            if self._schema is not None:
+                table = self._fitted(table)
+            self._pieces.append(table)
+            self._bytes += table.nbytes
+            self._rows += table.num_rows
+            if self._schema is None:
+                if self._bytes >= self._held_bytes:
+                    self._write_group()
+            elif self._bytes >= GROUP_BYTES or self._rows >= GROUP_ROWS:
+                self._write_group()
+
+    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
+        raise NotImplementedError
+
+    def _prepared(self, table: pa.Table) -> pa.Table:
+        """The table with columns that the format can hold."""
+        return table
+
+    def _write_group(self) -> None:
+        if self._schema is None:
+            self._schema = _unified([piece.schema for piece in self._pieces])
+            self._pieces = [self._fitted(piece) for piece in self._pieces]
+        if self._file is None:
+            self._file = self._open(self._sink, self._schema)
+        if self._pieces:
+            # More than the bound is here only if one piece was.
+            self._file.write_table(pa.concat_tables(self._pieces))
+        self._written += self._rows
+        self._pieces, self._bytes, self._rows = [], 0, 0
+
+    def _fitted(self, table: pa.Table) -> pa.Table:
+        """The table with exactly the columns of the file."""
+        assert self._schema is not None
+        if table.schema.equals(self._schema):
+            return table
+        known = set(self._schema.names)
+        for name in table.column_names:
+            if name not in known:
+                raise UsageError(
+                    f"column {name!r} first appears after {self._written + self._rows} rows, and "
+                    f"a {self.format_name} file fixes its columns before; leave it out with "
+                    "--fields, or write --format jsonl"
+                )
+        columns = []
+        for field in self._schema:
+            index = table.schema.get_field_index(field.name)
+            if index < 0:
+                columns.append(pa.nulls(table.num_rows, field.type))
+                continue
+            column = table.column(index)
+            try:
+                columns.append(column.cast(field.type) if column.type != field.type else column)
+            except pa.ArrowException as error:
+                raise UsageError(
+                    f"column {field.name!r} is {field.type} at first and {column.type} later, "
+                    f"which does not fit ({error}); leave it out with --fields, or write each "
+                    "part into a file of its own with --between"
+                ) from error
+        return pa.Table.from_arrays(columns, schema=self._schema)
+
+    @contextlib.contextmanager
+    def _failures(self) -> Iterator[None]:
+        """Map what Arrow says about a table to an error of ours."""
+        try:
+            yield
+        except pa.ArrowException as error:
+            raise UsageError(
+                f"the table cannot be written to {self._sink.name} as {self.format_name}: {error}"
+            ) from error
+
+    def _finish(self) -> None:
+        with self._failures():
+            self._write_group()
+            assert self._file is not None
+            self._file.close()
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._pieces = []
+        file, self._file = self._file, None
+        if file is not None:
+            # Arrow's writers write when they are let go; a failure there is no news.
+            with contextlib.suppress(Exception):
+                file.close()
+        self._sink.abort()
+
+
+class ParquetWriter(TableFileWriter):
+    """Writes Parquet, row groups of zstd."""
+
+    format_name = "parquet"
+
+    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
+        writer: _ArrowFile = pa.parquet.ParquetWriter(sink, schema, compression="zstd")
+        return writer
+
+    def _prepared(self, table: pa.Table) -> pa.Table:
+        # Parquet has no group without members; a message without fields says nothing.
+        for index, field in enumerate(table.schema):
+            if pa.types.is_struct(field.type) and field.type.num_fields == 0:
+                table = table.set_column(index, field.name, pa.nulls(table.num_rows))
+        return table
+
+
+class ArrowWriter(TableFileWriter):
+    """Writes an Arrow IPC file, also known as Feather version 2, with zstd buffers."""
+
+    format_name = "arrow"
+
+    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
+        options = pa.ipc.IpcWriteOptions(compression="zstd")
+        writer: _ArrowFile = pa.ipc.new_file(sink, schema, options=options)
+        return writer
+
+
+class CsvWriter(TableFileWriter):
+    """Writes CSV with a header; lists, structures and binary values are JSON text.
+
+    A null is an empty cell. Durations are integer nanoseconds.
+    """
+
+    format_name = "csv"
+
+    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
+        if not schema.names:
+            return _Nothing()
+        writer: _ArrowFile = pa.csv.CSVWriter(sink, schema)
+        return writer
+
+    def _prepared(self, table: pa.Table) -> pa.Table:
+        _check_names(table.schema)
+        for index, field in enumerate(table.schema):
+            kind = field.type
+            if pa.types.is_null(kind) or pa.types.is_dictionary(kind):
+                column = table.column(index).cast(
+                    pa.string() if pa.types.is_null(kind) else kind.value_type
+                )
+            elif pa.types.is_nested(kind) or _is_binary(kind):
+                column = _json_chunks(table.select([index]))
+            else:
+                continue
+            table = table.set_column(index, field.name, column)
+        return table
+
+
+class _Nothing:
+    """A file without columns."""
+
+    def write_table(self, table: pa.Table) -> None:
+        """Nothing to write."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def _json_chunks(column: pa.Table) -> pa.ChunkedArray:
+    chunks = []
+    for batch in column.to_batches(max_chunksize=rows_within(column)):
+        array = batch.column(0)
+        text = json_column(array)
+        chunks.append(pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string())))
+    return pa.chunked_array(chunks, pa.string())
+
+
+def _is_binary(kind: pa.DataType) -> bool:
+    return bool(
+        pa.types.is_binary(kind)
+        or pa.types.is_large_binary(kind)
+        or pa.types.is_fixed_size_binary(kind)
+    )
+
+
+def _check_names(schema: pa.Schema) -> None:
+    names = schema.names
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"there are two columns {twice!r}; leave one out with --fields")
+
+
+def _unified(schemas: list[pa.Schema]) -> pa.Schema:
+    """One schema for all, in the order in which columns appear."""
+    if not schemas:
+        return pa.schema([])
+    unified = schemas[0]
+    for schema in schemas[1:]:
+        if schema.equals(unified):
+            continue
+        try:
+            unified = pa.unify_schemas([unified, schema], promote_options="permissive")
+        except pa.ArrowException as error:
+            raise UsageError(
+                f"the type of a column changes in a way that one table cannot hold ({error}); "
+                "leave it out with --fields, or write --format jsonl"
+            ) from error
+    return unified

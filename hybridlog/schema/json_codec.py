@@ -1,0 +1,90 @@
+"""JSON messages, indexed as they stand."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, cast
+
+import bson
+
+from hybridlog.schema.object_rows import body_groups, body_of, columns_of, payloads_of
+from hybridlog_storage.errors import PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.codec import BodyGroup
+    from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.object_rows import Plain
+    from hybridlog.schema.wire import Decoded
+    from hybridlog_storage.messages import Buffer
+
+
+class JsonCodec:
+    """Messages in JSON, with or without a JSON schema, which nothing depends on.
+
+    Args:
+        array_limit: Arrays of more elements are summarised in the index.
+    """
+
+    indexed = True
+    reason: str | None = None
+
+    def __init__(self, array_limit: int) -> None:
+        self._limit = array_limit
+
+    def paths(self) -> list[FieldPath]:
+        """None are known: a message may hold anything, whatever a JSON schema promises."""
+        return []
+
+    def bodies(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> Iterator[BodyGroup]:
+        """Index bodies; see `Codec.bodies`."""
+        return body_groups(map(self._body, payloads_of(buffer, offset, length)))
+
+    def fields(self, payload: Buffer) -> dict[str, object]:
+        """What the index document holds of this message."""
+        body = self._body(memoryview(payload))
+        if isinstance(body, PayloadError):
+            return {}
+        return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
+
+    def decode(self, payload: Buffer) -> object:
+        """What the JSON text says, as Python objects.
+
+        Raises:
+            PayloadError: It is not JSON.
+        """
+        return _parsed(memoryview(payload))
+
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> Decoded:
+        """Fields as columns; see `object_rows.columns_of`."""
+        return columns_of(_parsed, payloads_of(buffer, offset, length), fields)
+
+    def _body(self, payload: memoryview) -> bytes | PayloadError:
+        try:
+            value = _parsed(payload)
+        except PayloadError as error:
+            return error
+        try:
+            return body_of(value, self._limit)
+        except PayloadError as error:
+            return PayloadError(f"the payload is JSON, but {error}")
+
+
+def _parsed(payload: memoryview) -> Plain:
+    try:
+        return cast("Plain", json.loads(bytes(payload).decode("utf-8-sig")))
+    except (ValueError, RecursionError) as error:
+        raise PayloadError(f"the payload is not JSON: {error}") from error

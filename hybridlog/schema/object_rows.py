@@ -1,0 +1,293 @@
+"""Index bodies and columns of messages that come as Python objects, one by one.
+
+JSON and protobuf have no fixed layout, so their payloads cannot be read by columns.
+Each becomes a plain object (dict, list, str, bool, int, float, None), and the rules
+that hold for the columns of `document.py` are applied to it here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import bson
+import numpy as np
+from bson.errors import BSONError
+from bson.int64 import Int64
+
+from hybridlog.schema.codec import BodyGroup, error_group, nothing_decoded
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.document import top_level_names
+from hybridlog.schema.summary import summarise
+from hybridlog.schema.wire import Decoded, Unreadable
+from hybridlog_storage.errors import PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Buffer
+
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bool | int | float | None"
+"""What a payload is made of. An `Int64` is stored as int64 whatever its value."""
+
+MAX_BYTES = 8 << 20
+MAX_DEPTH = 100
+"""Deepest nesting that MongoDB takes with certainty."""
+
+_NUMBERS = (bool, int, float)
+_INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
+
+
+class Nanoseconds(Int64):
+    """A time or a duration.
+
+    Attributes:
+        kind: Which of them.
+    """
+
+    kind: str = "time"
+
+
+class Duration(Nanoseconds):
+    """A duration."""
+
+    kind = "duration"
+
+
+def body_of(value: Plain, array_limit: int) -> bytes:
+    """The BSON elements of the index document of one message.
+
+    Raises:
+        PayloadError: It cannot be a document, and why.
+    """
+    try:
+        fields = {_key(k): _indexed(v, array_limit, 2) for k, v in _top(value).items()}
+        document = bson.encode(fields)
+    except (BSONError, OverflowError, ValueError, RecursionError) as error:
+        raise PayloadError(f"it cannot be a document: {error}") from error
+    if len(document) - 5 > MAX_BYTES:
+        raise PayloadError(f"its fields take more than {MAX_BYTES >> 20} MiB")
+    return document[4:-1]
+
+
+def _top(value: Plain) -> dict[str, Plain]:
+    """The top level of the document that a value becomes."""
+    if not isinstance(value, dict):
+        return {"value": value}
+    if "_id" in value or "_meta" in value:
+        return dict(zip(top_level_names(value), value.values(), strict=True))
+    return value
+
+
+def _indexed(value: Plain, limit: int, depth: int) -> object:
+    if isinstance(value, dict | list) and depth > MAX_DEPTH:
+        raise PayloadError(f"it is nested deeper than {MAX_DEPTH}")
+    if isinstance(value, dict):
+        return {_key(k): _indexed(v, limit, depth + 1) for k, v in value.items()}
+    if isinstance(value, list):
+        if len(value) > limit:
+            return _summary(value)
+        return [_indexed(v, limit, depth + 1) for v in value]
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
+        return _double(value)
+    return value
+
+
+def _text(text: str) -> str:
+    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
+    return text
+
+
+def _key(key: str) -> str:
+    return _text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
+
+
+def _double(value: float) -> float:
+    """The nearest double; beyond the largest, an infinity."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def _numbers(values: Sequence[Plain]) -> NDArray[Any] | None:
+    """Numbers as an array: bool, int64, uint64 or float64; None when they are not numbers."""
+    numbers = [v for v in values if isinstance(v, _NUMBERS)]
+    if len(numbers) < len(values):
+        return None
+    if numbers and all(isinstance(v, bool) for v in numbers):
+        return np.array(numbers, np.bool_)
+    if numbers and all(isinstance(v, int) for v in numbers):
+        low, high = min(numbers), max(numbers)
+        if low >= _INT64_MIN and high <= _INT64_MAX:
+            return np.array(numbers, np.int64)
+        if low >= 0 and high < 1 << 64:
+            return np.array(numbers, np.uint64)
+    return np.array([_double(v) for v in numbers], np.float64)
+
+
+def _summary(values: list[Plain]) -> dict[str, object]:
+    found: dict[str, object] = {"n": Int64(len(values))}
+    numbers = _numbers(values)
+    if numbers is None:
+        return found
+    summary = summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
+    if not summary.has[0]:
+        return found | {"min": None, "max": None, "mean": None}
+    low, high = _element(summary.min[0].item()), _element(summary.max[0].item())
+    return found | {"min": low, "max": high, "mean": summary.mean[0].item()}
+
+
+def _element(value: float) -> float:
+    if isinstance(value, int):
+        return Int64(value) if value <= _INT64_MAX else float(value)
+    return value
+
+
+def payloads_of(
+    buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+) -> Iterator[memoryview]:
+    """Each payload, without a copy."""
+    view = memoryview(buffer)
+    for start, size in zip(offset.tolist(), length.tolist(), strict=True):
+        yield view[start : start + size]
+
+
+def body_groups(bodies: Iterator[bytes | PayloadError]) -> Iterator[BodyGroup]:
+    """Groups of equal width out of bodies in the order of the rows."""
+    by_width: dict[int, tuple[list[int], list[bytes]]] = {}
+    by_error: dict[str, list[int]] = {}
+    for row, body in enumerate(bodies):
+        if isinstance(body, PayloadError):
+            by_error.setdefault(str(body), []).append(row)
+            continue
+        rows, parts = by_width.setdefault(len(body), ([], []))
+        rows.append(row)
+        parts.append(body)
+    for width, (rows, parts) in by_width.items():
+        table = np.frombuffer(b"".join(parts), np.uint8).reshape(len(rows), width)
+        yield BodyGroup(np.array(rows, np.intp), table, None)
+    for text, rows in by_error.items():
+        yield error_group(np.array(rows, np.intp), text)
+
+
+# --- columns --------------------------------------------------------------------------
+
+
+def columns_of(
+    plain: Callable[[memoryview], Plain],
+    payloads: Iterator[memoryview],
+    fields: Collection[str] | None,
+) -> Decoded:
+    """Columns of payloads that become objects one by one.
+
+    Numbers are float64 (NaN where a message lacks the field), int64 or bool; strings
+    are empty where they are lacking, lists too. What fits none of the columns (fields
+    of changing type, lists of objects) becomes a string column of JSON.
+
+    Args:
+        plain: Makes the object; raises PayloadError.
+        payloads: In the order of the rows.
+        fields: Dotted paths of those wanted, each with all below it; None for all.
+    """
+    rows: list[int] = []
+    objects: list[dict[str, Plain]] = []
+    bad: dict[str, list[int]] = {}
+    for row, payload in enumerate(payloads):
+        try:
+            value = plain(payload)
+        except PayloadError as error:
+            bad.setdefault(str(error), []).append(row)
+            continue
+        rows.append(row)
+        objects.append(_top(value))
+    unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
+    if not rows:
+        return nothing_decoded(unreadable)
+    wanted = None if fields is None else [f.replace("[]", "").split(".") for f in fields]
+    return Decoded(np.array(rows, np.intp), _records(objects, wanted, 1), unreadable)
+
+
+def _records(
+    objects: Sequence[dict[str, Plain]], wanted: list[list[str]] | None, depth: int
+) -> Records:
+    columns: dict[str, Column] = {}
+    for name in dict.fromkeys(key for each in objects for key in each):
+        below: list[list[str]] | None = None
+        if wanted is not None:
+            below = [path[1:] for path in wanted if path[0] == name]
+            if not below:
+                continue
+            if [] in below:
+                below = None
+        columns[name] = _column([each.get(name) for each in objects], below, depth)
+    return Records(columns, len(objects))
+
+
+def _column(values: list[Plain], wanted: list[list[str]] | None, depth: int) -> Column:
+    given = [v for v in values if v is not None]
+    if given and depth < MAX_DEPTH and all(isinstance(v, dict) for v in given):
+        inner = [v if isinstance(v, dict) else {} for v in values]
+        return _records(inner, wanted, depth + 1)
+    column: Column | None = None
+    if given and all(isinstance(v, _NUMBERS) for v in given):
+        column = _number_column(values, given)
+    elif given and all(isinstance(v, list) for v in given):
+        column = _list_column([v if isinstance(v, list) else [] for v in values])
+    elif given and all(isinstance(v, str) for v in given):
+        column = _strings([v if isinstance(v, str) else "" for v in values])
+    return _strings([_json(v) for v in values]) if column is None else column
+
+
+def _json(value: Plain) -> str:
+    try:
+        return json.dumps(value)
+    except RecursionError:
+        return json.dumps(f"nested deeper than {MAX_DEPTH}")
+
+
+def _number_column(values: Sequence[Plain], given: Sequence[Plain]) -> Scalars | None:
+    if all(isinstance(v, Nanoseconds) and _INT64_MIN <= v <= _INT64_MAX for v in given):
+        times = np.array([0 if v is None else v for v in values], np.int64)
+        return Scalars(times, "duration" if isinstance(given[0], Duration) else "time")
+    if len(given) < len(values):
+        if all(isinstance(v, bool) for v in given):
+            return None
+        values = [math.nan if v is None else v for v in values]
+    numbers = _numbers(values)
+    assert numbers is not None
+    return Scalars(_narrowed(numbers))
+
+
+def _narrowed(numbers: NDArray[Any]) -> NDArray[Any]:
+    """One type for all numbers that are not int64, so that columns change it rarely."""
+    return numbers.astype(np.float64) if numbers.dtype == np.uint64 else numbers
+
+
+def _list_column(lists: list[list[Plain]]) -> Arrays | None:
+    elements = [v for each in lists for v in each]
+    offset = np.zeros(len(lists) + 1, np.int64)
+    np.cumsum([len(each) for each in lists], out=offset[1:])
+    numbers = _numbers(elements)
+    if numbers is not None:
+        return Arrays(Scalars(_narrowed(numbers)), offset)
+    texts = [v for v in elements if isinstance(v, str)]
+    if len(texts) == len(elements):
+        return Arrays(_strings(texts), offset)
+    return None
+
+
+def _strings(texts: list[str]) -> Strings:
+    data = [_text(text).encode() for text in texts]
+    offset = np.zeros(len(data) + 1, np.int64)
+    np.cumsum([len(each) for each in data], out=offset[1:])
+    return Strings(np.frombuffer(b"".join(data), np.uint8), offset)

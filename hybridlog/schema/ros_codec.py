@@ -1,0 +1,260 @@
+"""ROS 1 and ROS 2 messages."""
+
+from __future__ import annotations
+
+import re
+import struct
+import threading
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal, cast
+
+import bson
+import numpy as np
+
+from hybridlog.schema.codec import BodyGroup, error_group
+from hybridlog.schema.definition import (
+    ArrayOf,
+    FieldPath,
+    FieldType,
+    Instant,
+    MessageType,
+    Primitive,
+    Text,
+    parse_definition,
+    paths,
+)
+from hybridlog.schema.document import TooLarge, bodies
+from hybridlog.schema.wire import Decoded, WireReader
+from hybridlog_storage.errors import DefinitionError, PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from numpy.typing import NDArray
+    from rosbags.interfaces.typing import FieldDesc, Typesdict
+    from rosbags.typesys.store import Typestore
+
+    from hybridlog_storage.messages import Buffer, Schema
+
+_MAX_BYTES = 8 << 20
+_MAX_UNROLLED = 10_000
+"""Elements of fixed arrays of strings and messages that rosbags writes code for."""
+
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
+
+# rosbags keeps one module of generated classes under one name while it registers them.
+_REGISTERING = threading.Lock()
+
+
+class RosCodec:
+    """Messages of one ROS type.
+
+    Args:
+        schema: Their definition.
+        wire: Their format.
+        array_limit: Arrays of more elements are summarised in the index.
+
+    Raises:
+        DefinitionError: The definition cannot be used.
+    """
+
+    indexed = True
+    reason: str | None = None
+
+    def __init__(self, schema: Schema, wire: Literal["ros1", "cdr"], array_limit: int) -> None:
+        self._name = schema.name
+        self._wire: Literal["ros1", "cdr"] = wire
+        self._limit = array_limit
+        self._type = parse_definition(schema)
+        self._reader = WireReader(self._type, wire)
+        self._selecting = lru_cache(maxsize=64)(self._reader_of)
+        self._objects: RosObjects | None = None
+
+    def paths(self) -> list[FieldPath]:
+        """Every field, in the order of the definition."""
+        return paths(self._type)
+
+    def bodies(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> Iterator[BodyGroup]:
+        """Index bodies; see `Codec.bodies`."""
+        decoded = self._reader.read(buffer, offset, length)
+        for group in bodies(decoded.records, array_limit=self._limit, max_bytes=_MAX_BYTES):
+            rows = decoded.rows[group.rows]
+            if isinstance(group, TooLarge):
+                text = f"the fields of {self._name} take more than {_MAX_BYTES >> 20} MiB"
+                yield error_group(rows, text)
+            else:
+                yield BodyGroup(rows, group.body, None)
+        for bad in decoded.unreadable:
+            text = f"the payload does not fit {self._name}: {bad.reason}"
+            yield error_group(bad.rows, text)
+
+    def fields(self, payload: Buffer) -> dict[str, object]:
+        """What the index document holds of this message."""
+        start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
+        (group,) = self.bodies(payload, start, size)
+        body = group.body.tobytes()
+        return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
+
+    def decode(self, payload: Buffer) -> object:
+        """The message as rosbags makes it: attributes, arrays as numpy views.
+
+        Raises:
+            PayloadError: The payload does not fit the definition.
+            DefinitionError: rosbags cannot make a class of the definition.
+        """
+        if self._objects is None:
+            with _REGISTERING:
+                self._objects = self._objects or RosObjects(self._type, self._wire)
+        return self._objects.decode(payload)
+
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> Decoded:
+        """Fields as columns; see `Codec.columns`."""
+        reader = self._reader if fields is None else self._selecting(frozenset(fields))
+        return reader.read(buffer, offset, length)
+
+    def _reader_of(self, fields: frozenset[str]) -> WireReader:
+        return WireReader(self._type, self._wire, fields)
+
+
+class RosObjects:
+    """Makes objects of single messages with rosbags.
+
+    rosbags runs code that it generates from type and field names, so it is given the
+    checked type and never the definition's text.
+
+    Args:
+        message_type: What the payloads hold.
+        wire: Their format.
+
+    Raises:
+        DefinitionError: rosbags cannot make a class of it.
+    """
+
+    def __init__(self, message_type: MessageType, wire: Literal["ros1", "cdr"]) -> None:
+        from rosbags.typesys import Stores, TypesysError, get_typestore  # noqa: PLC0415
+
+        self._wire = wire
+        self._label = message_type.name
+        build = _Typesdict(message_type.name)
+        self._name = build.add(message_type)
+        self._store: Typestore = get_typestore(Stores.EMPTY)
+        try:
+            self._store.register(build.types)
+            self._store.get_msgdef(self._name)
+        except (TypesysError, SyntaxError, RecursionError, MemoryError) as error:
+            raise DefinitionError(
+                f"{message_type.name}: rosbags makes no class of this definition ({error}). "
+                "`.raw` has the bytes"
+            ) from error
+
+    def decode(self, payload: Buffer) -> object:
+        """The message.
+
+        Raises:
+            PayloadError: The payload does not fit the definition.
+        """
+        view = memoryview(payload)
+        read = self._store.deserialize_ros1 if self._wire == "ros1" else self._store.deserialize_cdr
+        from rosbags.serde import SerdeError  # noqa: PLC0415
+
+        try:
+            return read(view, self._name)
+        except (
+            SerdeError,
+            struct.error,
+            ValueError,
+            IndexError,
+            OverflowError,
+            MemoryError,
+        ) as error:
+            raise PayloadError(
+                f"the payload does not fit {self._label}: {error}. `.raw` has the bytes"
+            ) from error
+
+
+class _Typesdict:
+    """A type and all types in it, in the form that rosbags registers."""
+
+    def __init__(self, owner: str) -> None:
+        self.types: Typesdict = {}
+        self._owner = owner
+        self._names: dict[MessageType | Instant, str] = {}
+        self._unrolled = 0
+
+    def add(self, message: MessageType) -> str:
+        """Adds a message; the name it goes by."""
+        if message not in self._names:
+            name = self._free(_rosbags_name(message.name))
+            self.types[name] = ([], [])
+            self._names[message] = name
+            self.types[name][1].extend((n, self._describe(t)) for n, t in message.fields)
+        return self._names[message]
+
+    def _free(self, name: str) -> str:
+        if not _TYPE_NAME.match(name):
+            raise DefinitionError(f"{self._owner}: {name[:80]!r} is no name for a type")
+        free, number = name, 2
+        while free in self.types:
+            free, number = f"{name}_{number}", number + 1
+        return free
+
+    def _instant(self, instant: Instant) -> str:
+        if instant not in self._names:
+            name = self._free(f"builtin_interfaces/msg/{instant.kind.capitalize()}")
+            seconds = "int32" if instant.signed_seconds else "uint32"
+            nanoseconds = "int32" if instant.signed_nanoseconds else "uint32"
+            self.types[name] = (
+                [],
+                [("sec", _base(seconds)), ("nanosec", _base(nanoseconds))],
+            )
+            self._names[instant] = name
+        return self._names[instant]
+
+    def _describe(self, field: FieldType) -> FieldDesc:
+        from rosbags.interfaces import Nodetype  # noqa: PLC0415
+
+        if isinstance(field, Primitive):
+            return _base(field.dtype.name)
+        if isinstance(field, Text):
+            return _base("string")
+        if isinstance(field, Instant):
+            return (Nodetype.NAME, self._instant(field))
+        if isinstance(field, MessageType):
+            return (Nodetype.NAME, self.add(field))
+        return self._describe_array(field)
+
+    def _describe_array(self, field: ArrayOf) -> FieldDesc:
+        from rosbags.interfaces import Nodetype  # noqa: PLC0415
+
+        if field.width is not None and not isinstance(field.element, Primitive):
+            self._unrolled += field.width
+            if self._unrolled > _MAX_UNROLLED:
+                raise DefinitionError(
+                    f"{self._owner}: fixed arrays of {field.width} messages or strings are not "
+                    "made objects. `.raw` has the bytes"
+                )
+        kind = Nodetype.SEQUENCE if field.width is None else Nodetype.ARRAY
+        inner = self._describe(field.element)
+        return cast("FieldDesc", (kind, (inner, field.width or 0)))
+
+
+def _base(name: str) -> FieldDesc:
+    from rosbags.interfaces import Nodetype  # noqa: PLC0415
+
+    return cast("FieldDesc", (Nodetype.BASE, (name, 0)))
+
+
+def _rosbags_name(name: str) -> str:
+    """`pkg/Name` as rosbags spells it: `pkg/msg/Name`."""
+    parts = name.strip("/").split("/")
+    if len(parts) == 2:
+        parts.insert(1, "msg")
+    return "/".join(parts)

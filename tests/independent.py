@@ -1,0 +1,57 @@
+"""Logs as other people's readers see them: the `rosbags` and `mcap` packages."""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Seen(NamedTuple):
+    """One message."""
+
+    topic: str
+    log_time: int
+    payload: bytes
+
+
+def read(path: Path) -> list[Seen]:
+    """Every message of a log, in no particular order."""
+    if path.is_dir():
+        return [
+            m for p in sorted(path.iterdir()) if p.suffix in {".db3", ".mcap"} for m in read(p)
+        ]
+    if path.suffix == ".mcap":
+        return read_mcap(path)
+    if path.suffix == ".db3":
+        return read_sqlite(path)
+    return read_bag(path)
+
+
+def read_bag(path: Path) -> list[Seen]:
+    """A ROS 1 bag; topic names as the bag spells them."""
+    from rosbags.rosbag1 import Reader
+
+    with Reader(path) as reader:
+        return [Seen(c.topic, t, bytes(data)) for c, t, data in reader.messages()]
+
+
+def read_mcap(path: Path) -> list[Seen]:
+    """An MCAP file."""
+    from mcap.reader import make_reader
+
+    reader = make_reader(io.BytesIO(path.read_bytes()))
+    return [Seen(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+
+
+def read_sqlite(path: Path) -> list[Seen]:
+    """A ROS 2 sqlite3 bag, by SQL."""
+    connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+    try:
+        rows = connection.execute(
+            "SELECT t.name, m.timestamp, m.data FROM messages m JOIN topics t ON t.id = m.topic_id"
+        ).fetchall()
+    finally:
+        connection.close()
+    return [Seen(topic, time, bytes(data)) for topic, time, data in rows]

@@ -1,0 +1,192 @@
+"""Chunks come out as they went in, lies about their size are refused before allocation."""
+
+from __future__ import annotations
+
+import os
+import threading
+import tracemalloc
+
+import lz4.frame
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridlog_storage.compression import Compressor, decompress, decompress_prefix
+from hybridlog_storage.errors import SegmentError
+
+TEXT = b"".join(b"%d: the robot is at %d\n" % (i, i * 7919) for i in range(40_000))
+NOISE = os.urandom(1 << 20)
+
+
+def packed(name: str, data: bytes) -> bytes:
+    if name == "zstd":
+        return zstandard.ZstdCompressor().compress(data)
+    if name == "lz4":
+        return lz4.frame.compress(data)
+    return data
+
+
+@given(st.binary(max_size=5000), st.sampled_from(["", "zstd", "lz4"]))
+def test_decompress_gives_what_the_codec_packed(data: bytes, name: str) -> None:
+    assert bytes(decompress(name, packed(name, data), len(data))) == data
+
+
+@given(
+    st.lists(st.binary(max_size=3000), max_size=20).map(b"".join),
+    st.sampled_from(["zstd", "lz4", "none"]),
+    st.integers(1, 9),
+)
+def test_compressor_and_decompress_are_inverse(data: bytes, name: str, level: int) -> None:
+    compression, out = Compressor(name, level).compress(data)  # type: ignore[arg-type]
+    assert bytes(decompress(compression, out, len(data))) == data
+    assert len(out) <= len(data)
+
+
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+def test_text_is_compressed_and_noise_is_stored_as_it_is(name: str) -> None:
+    compressor = Compressor(name)  # type: ignore[arg-type]
+    compression, out = compressor.compress(TEXT)
+    assert compression == name
+    assert len(out) < len(TEXT) / 2
+    compression, out = compressor.compress(NOISE)
+    assert compression == ""
+    assert out is NOISE
+
+
+def test_noise_is_never_given_to_the_codec_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    compressor = Compressor()
+    sizes: list[int] = []
+    pack = compressor._pack
+    monkeypatch.setattr(
+        compressor, "_pack", lambda data, level: (sizes.append(len(data)), pack(data, level))[1]
+    )
+    compressor.compress(NOISE)
+    assert sum(sizes) <= len(NOISE) // 16
+    sizes.clear()
+    compressor.compress(TEXT)
+    assert max(sizes) == len(TEXT)
+
+
+def test_what_gains_less_than_the_minimum_is_kept() -> None:
+    data = NOISE[:10_000] + bytes(200)  # gains about 2 %
+    assert Compressor().compress(data) == ("", data)
+    assert Compressor(min_gain=0.01).compress(data)[0] == "zstd"
+
+
+def test_none_stores_everything_as_it_is() -> None:
+    assert Compressor("none").compress(TEXT) == ("", TEXT)
+
+
+def test_a_compressor_may_be_used_by_many_threads() -> None:
+    compressor = Compressor()
+    blocks = [TEXT[i * 1000 : i * 1000 + 200_000] for i in range(16)]
+    wrong: list[int] = []
+
+    def work(start: int) -> None:
+        for i in range(start, len(blocks), 4):
+            for _ in range(5):
+                name, out = compressor.compress(blocks[i])
+                if bytes(decompress(name, out, len(blocks[i]))) != blocks[i]:
+                    wrong.append(i)
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+@pytest.mark.parametrize(("name", "level"), [("zstd", 23), ("lz4", 17), ("gzip", 1)])
+def test_settings_that_no_codec_knows_are_refused(name: str, level: int) -> None:
+    with pytest.raises(ValueError, match=r"level|not known"):
+        Compressor(name, level)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+@pytest.mark.parametrize("offset", [-1, 1, -1000, 1000])
+def test_a_size_that_is_not_what_comes_out_is_an_error(name: str, offset: int) -> None:
+    with pytest.raises(SegmentError, match="claims"):
+        decompress(name, packed(name, TEXT[:5000]), 5000 + offset)
+
+
+def test_stored_data_of_another_size_is_an_error() -> None:
+    with pytest.raises(SegmentError, match="holds 3 bytes, not 4"):
+        decompress("", b"abc", 4)
+
+
+def test_zstd_frames_without_size_and_several_frames_are_read() -> None:
+    pack = zstandard.ZstdCompressor(write_content_size=False).compress
+    assert bytes(decompress("zstd", pack(TEXT), len(TEXT))) == TEXT
+    two = pack(TEXT[:1000]) + zstandard.ZstdCompressor().compress(TEXT[1000:])
+    assert bytes(decompress("zstd", two, len(TEXT))) == TEXT
+    for size in (len(TEXT) - 1, len(TEXT) + 1):
+        with pytest.raises(SegmentError, match="decompresses to"):
+            decompress("zstd", two, size)
+
+
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+@given(data=st.data())
+def test_damaged_data_is_an_error_or_the_content(name: str, data: st.DataObject) -> None:
+    good = packed(name, TEXT[:2000])
+    at = data.draw(st.integers(0, len(good) - 1))
+    bad = bytearray(good)
+    bad[at] ^= data.draw(st.integers(1, 255))
+    try:
+        out = decompress(name, bytes(bad), 2000)
+    except SegmentError:
+        return
+    assert len(out) == 2000  # only a checksum can tell more
+
+
+@pytest.mark.parametrize("name", ["gzip", "ZSTD", "x" * 1000])
+def test_an_unknown_codec_is_an_error(name: str) -> None:
+    with pytest.raises(SegmentError, match="not known") as caught:
+        decompress(name, b"abc", 3)
+    assert len(str(caught.value)) < 200
+
+
+def bomb(size: int) -> bytes:
+    """A few KiB of zstd that become `size` bytes, without a size in the frame."""
+    compressor = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    block = bytes(1 << 20)
+    out = b"".join(compressor.compress(block) for _ in range(size >> 20))
+    return out + compressor.flush()
+
+
+def test_bombs_are_refused_without_allocation() -> None:
+    data = bomb(64 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SegmentError, match="limit"):
+            decompress("zstd", data, 2 << 30)
+        with pytest.raises(SegmentError, match="limit"):
+            decompress("zstd", data, 1 << 63, limit=1 << 62)
+        with pytest.raises(SegmentError, match="cannot hold"):
+            decompress("lz4", bytes(100), 1 << 29)
+        with pytest.raises(SegmentError, match="more bytes"):
+            decompress("zstd", data, 1 << 20)  # lies low
+        assert len(decompress_prefix("zstd", data, 1 << 62, limit=1 << 20)) == 1 << 20
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 << 20
+
+
+@pytest.mark.parametrize("name", ["", "zstd", "lz4"])
+@given(share=st.floats(0, 1))
+def test_a_prefix_gives_a_prefix(name: str, share: float) -> None:
+    good = packed(name, TEXT)
+    out = bytes(decompress_prefix(name, good[: int(len(good) * share)], len(TEXT)))
+    assert TEXT.startswith(out)
+    assert len(out) >= len(TEXT) * share - (1 << 19)  # a block at most is lost
+
+
+def test_a_prefix_stops_at_damage() -> None:
+    good = bytearray(packed("lz4", NOISE))
+    good[len(good) // 2] ^= 1
+    out = bytes(decompress_prefix("lz4", bytes(good), len(NOISE)))
+    assert len(out) <= len(NOISE)
+    assert decompress_prefix("zstd", b"nothing of the kind", 100) == b""
+    assert decompress_prefix("gzip", b"nothing of the kind", 100) == b""
