@@ -226,8 +226,12 @@ class Query:
         chosen = tuple(r.id for r in self.store.select(names))
         return self.store.query(self.topics, chosen)._like(self)
 
-    def at(self, moment: TimeLike) -> Message:
-        """The message that was current at a time: the last one not after it.
+    def only(self, topic: str) -> Query:
+        """The same question about one of its topics."""
+        return self.store.query([topic], self.recording_ids)._like(self)
+
+    def just_at(self, moment: TimeLike) -> Query:
+        """Only the message that was current at a time: the last one not after it.
 
         Raises:
             TopicError: there is none.
@@ -237,11 +241,22 @@ class Query:
             now = parse_time(moment, start=start, end=end)
             if now < start:
                 continue
-            one = replace(self, recording_ids=(recording.id,), counters=Counters())
-            query = one._with(_bounds=(start, now + 1), _clock="log", _reverse=True, _limit=1)
-            for message in query:
-                return message
+            query = replace(self, recording_ids=(recording.id,))._with(
+                _bounds=(start, now + 1), _clock="log", _reverse=True, _limit=1
+            )
+            if query.first() is not None:
+                return query
         raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+
+    def at(self, moment: TimeLike) -> Message:
+        """The message that `just_at` asks for.
+
+        Raises:
+            TopicError: there is none.
+        """
+        found = self.just_at(moment).first()
+        assert found is not None
+        return found
 
     # Answers.
 
@@ -278,15 +293,10 @@ class Query:
         """
         import bson
 
-        taken = 0
         for topic in self.topics:
-            for raw in self.raw_documents(topic, None):
-                for document in bson.decode_all(raw):
-                    if taken % self._every == 0:
-                        if self._limit is not None and taken // self._every >= self._limit:
-                            return
-                        yield document
-                    taken += 1
+            for raw, rows in self.thinned_documents(topic, None):
+                documents = bson.decode_all(raw)
+                yield from (documents[row] for row in rows.tolist())
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
@@ -334,6 +344,31 @@ class Query:
     def is_unbounded(self) -> bool:
         """Whether all times are wanted."""
         return self._bounds is None
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether the latest message comes first."""
+        return self._reverse
+
+    def beginnings(self) -> Iterator[tuple[RecordingEntry, int]]:
+        """Recordings in which the time range begins after the recording does, and when, ns."""
+        for recording in self._recordings():
+            bounds = self._bounds_in(recording) if self._clock == "log" else None
+            start, end = _span(recording)
+            if bounds is not None and start < bounds[0] < end:
+                yield recording, bounds[0]
+
+    def size_hint(self) -> int:
+        """Bytes of payload, about: what a progress bar counts up to."""
+        total = 0.0
+        for recording in self._recordings():
+            start, end = _span(recording)
+            begin, stop = self._bounds_in(recording) or (start, end)
+            share = max(min(end, stop) - max(start, begin), 0) / max(end - start, 1)
+            total += share * sum(
+                c.stats.payload_bytes for c in recording.channels if c.topic in self.topics
+            )
+        return int(total)
 
     def lanes(self) -> list[Lane]:
         """Every channel that the question is about."""
@@ -427,6 +462,7 @@ class Query:
             )
 
     def plan(self) -> Plan:
+        """What to read for this question; resets the counters."""
         lanes: list[Lane] = []
         self._reset()
         targets = self._targets(lanes)
@@ -437,6 +473,10 @@ class Query:
         fresh = Counters()
         for name in fresh.__dataclass_fields__:
             setattr(self.counters, name, getattr(fresh, name))
+
+    def empty_plan(self) -> Plan:
+        """The channels of the question, and nothing to read."""
+        return Plan(self.lanes(), [])
 
     def pieces(self, plan: Plan) -> Iterator[Piece]:
         """The plan's messages, thinned out and limited."""
@@ -528,17 +568,25 @@ class Query:
             for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()})
         )
 
-    def raw_documents(
+    def thinned_documents(
         self, topic: str, projection: Mapping[str, object] | None
-    ) -> Iterator[bytes]:
-        """The index documents of one topic, in key order, as raw batches."""
+    ) -> Iterator[tuple[bytes, NDArray[np.intp]]]:
+        """The index documents of one topic, in key order, as raw batches.
+
+        Yields:
+            BSON documents one after the other, and which of them the answer has.
+        """
+        from hybridlog_storage.bson_columns import split
+
         database = self.store.database_for("Reading index documents")
         lanes: list[Lane] = []
+        self._reset()
         targets = [t for t in self._targets(lanes) if self._has(t, lanes, topic)]
         conditions = [self._conditions(t.recording) for t in targets]
         if not conditions:
             return
         own = conditions[0] if len(conditions) == 1 else {"$or": conditions}
+        taken = given = 0
         for raw in database.find_raw(
             collection_of(topic),
             self._filter(own),
@@ -547,7 +595,15 @@ class Query:
             limit=(self._limit or 0) if self._every == 1 else 0,
             batch_size=10_000,
         ):
-            yield raw
+            count = len(split(raw))
+            rows = np.arange((-taken) % self._every, count, self._every)
+            if self._limit is not None:
+                rows = rows[: self._limit - given]
+            taken += count
+            given += len(rows)
+            yield raw, rows
+            if self._limit is not None and given >= self._limit:
+                return
 
     @staticmethod
     def _has(target: Target, lanes: list[Lane], topic: str) -> bool:

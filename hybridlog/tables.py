@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from hybridlog_storage.errors import DefinitionError
@@ -11,11 +11,36 @@ from hybridlog_storage.messages import Batch
 
 from hybridlog.frames import TableBuilder
 from hybridlog.indexing import rows_by_channel
-from hybridlog.query.plan import Lane, Piece, Sweep
+from hybridlog.query.plan import Lane, Piece, Plan, Sweep
 from hybridlog.schema.column import Records, Strings
+from hybridlog.schema.document import take
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
     from hybridlog.reader import Query
+
+_BLOCK_ROWS = 65_536
+_BLOCK_BYTES = 32 << 20
+
+
+class Block(NamedTuple):
+    """Columns of some messages.
+
+    Attributes:
+        topic: Their topic.
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers.
+        records: n rows.
+        size: Bytes of their payloads, 0 when they came out of the index.
+    """
+
+    topic: str
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    records: Records
+    size: int
 
 
 def collect(query: Query) -> TableBuilder:
@@ -24,56 +49,69 @@ def collect(query: Query) -> TableBuilder:
     Raises:
         DefinitionError: a topic has no definition to make columns from.
     """
-    types = _scalar_types(query)
+    several = len(query.topics) > 1
+    types = scalar_types(query)
     if types is not None:
-        return _from_index(query, types)
+        builder = TableBuilder()
+        for block in _from_index(query, types):
+            builder.append(block.log_time, block.seq, block.records)
+        return builder
     plan = query.plan()
     _check(plan.lanes)
-    plain = query.is_unthinned
-    expected = sum(t.messages for t in plan.tasks()) if plain and plan.chooser is None else None
-    builder = TableBuilder(expected_rows=expected if query.is_unbounded else None)
-    several = len(query.topics) > 1
-    for lane in plan.lanes:
-        # Columns exist even when no message does.
-        _append(builder, lane, _nothing(), query.selected_fields, several=several)
+    builder = TableBuilder(expected_rows=_expected(query, plan))
+    for block in _empty(plan, query):
+        _append(builder, block, several=several)
     sweep = Sweep(plan, query.store.segment)
-    for piece in sweep.unordered() if plain else query.pieces(plan):
-        for number, rows in rows_by_channel(piece.batch.channel):
-            part = Piece(piece.batch.take(rows), piece.seq[rows])
-            _append(builder, plan.lanes[number], part, query.selected_fields, several=several)
+    for piece in sweep.unordered() if query.is_unthinned else query.pieces(plan):
+        for block in _decoded(plan.lanes, piece, query.selected_fields):
+            _append(builder, block, several=several)
     return builder
 
 
-def pieces_of_table(query: Query) -> Iterator[tuple[Lane, Piece, Records]]:
-    """The answer of a query in order and in parts, for tables that are written as they come.
+def stream(query: Query) -> Iterator[pa.Table]:
+    """The answer in order, in tables of bounded size; at least one, perhaps empty."""
+    several = len(query.topics) > 1
+    types = scalar_types(query)
+    if types is not None:
+        blocks = _from_index(query, types)
+    else:
+        plan = query.plan()
+        _check(plan.lanes)
+        blocks = (
+            block
+            for piece in query.pieces(plan)
+            for block in _decoded(plan.lanes, piece, query.selected_fields)
+        )
+    yield from _tables(query, blocks, several=several)
 
-    Yields:
-        The channel, the messages that could be decoded, and their columns.
-    """
-    plan = query.plan()
-    _check(plan.lanes)
-    for piece in query.pieces(plan):
-        for number, rows in rows_by_channel(piece.batch.channel):
-            lane = plan.lanes[number]
-            batch, seq = piece.batch.take(rows), piece.seq[rows]
-            decoded = lane.codec.columns(
-                batch.buffer, batch.offset, batch.length, query.selected_fields
-            )
-            yield lane, Piece(batch.take(decoded.rows), seq[decoded.rows]), decoded.records
+
+def _tables(query: Query, blocks: Iterator[Block], *, several: bool) -> Iterator[pa.Table]:
+    builder, size = TableBuilder(), 0
+    for block in _empty(query.empty_plan(), query):
+        _append(builder, block, several=several)
+    given = False
+    for block in blocks:
+        # A full builder is handed over before, not after: blocks of one piece stay together.
+        if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
+            yield _finished(builder, query)
+            given = True
+            builder, size = TableBuilder(), 0
+        _append(builder, block, several=several)
+        size += block.size
+    if len(builder) or not given:
+        yield _finished(builder, query)
 
 
-def _append(
-    builder: TableBuilder,
-    lane: Lane,
-    piece: Piece,
-    fields: tuple[str, ...] | None,
-    *,
-    several: bool,
-) -> None:
-    batch = piece.batch
-    decoded = lane.codec.columns(batch.buffer, batch.offset, batch.length, fields)
-    records = with_topic(decoded.records, lane.channel.topic) if several else decoded.records
-    builder.append(batch.log_time[decoded.rows], piece.seq[decoded.rows], records)
+def _finished(builder: TableBuilder, query: Query) -> pa.Table:
+    table = builder.to_arrow()
+    if query.is_reversed:
+        table = table.take(np.arange(table.num_rows - 1, -1, -1))
+    return table
+
+
+def _append(builder: TableBuilder, block: Block, *, several: bool) -> None:
+    records = with_topic(block.records, block.topic) if several else block.records
+    builder.append(block.log_time, block.seq, records)
 
 
 def with_topic(records: Records, topic: str) -> Records:
@@ -84,7 +122,40 @@ def with_topic(records: Records, topic: str) -> Records:
     return Records({"topic": column, **records.fields}, rows)
 
 
-def _check(lanes: list[Lane]) -> None:
+def _decoded(
+    lanes: Sequence[Lane], piece: Piece, fields: tuple[str, ...] | None
+) -> Iterator[Block]:
+    for number, rows in rows_by_channel(piece.batch.channel):
+        lane = lanes[number]
+        batch, seq = piece.batch.take(rows), piece.seq[rows]
+        decoded = lane.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        good = decoded.rows
+        yield Block(
+            lane.channel.topic, batch.log_time[good], seq[good], decoded.records, batch.payload_bytes
+        )
+
+
+def _empty(plan: Plan, query: Query) -> Iterator[Block]:
+    """A block without rows for each channel: columns exist even when no message does."""
+    none = np.empty(0, np.int64)
+    for number, _ in enumerate(plan.lanes):
+        channel = np.empty(0, np.int32)
+        batch = Batch(b"", none, none, channel, none, none, none.astype(np.uint32))
+        lane = plan.lanes[number]
+        decoded = lane.codec.columns(
+            batch.buffer, batch.offset, batch.length, query.selected_fields
+        )
+        yield Block(lane.channel.topic, none, none, decoded.records, 0)
+
+
+def _expected(query: Query, plan: Plan) -> int | None:
+    """How many rows will come, when that is known before."""
+    if query.is_unthinned and query.is_unbounded and plan.chooser is None:
+        return sum(task.messages for task in plan.tasks())
+    return None
+
+
+def _check(lanes: Sequence[Lane]) -> None:
     for lane in lanes:
         if lane.codec.reason is not None:
             raise DefinitionError(
@@ -93,8 +164,10 @@ def _check(lanes: list[Lane]) -> None:
             )
 
 
-def _scalar_types(query: Query) -> Mapping[str, str] | None:
+def scalar_types(query: Query) -> Mapping[str, str] | None:
     """Types of the fields asked for, if the index alone can answer; None if it cannot."""
+    from hybridlog.frames.bson import INDEX_TYPES
+
     fields = query.selected_fields
     if fields is None or query.store.database is None or len(query.topics) != 1:
         return None
@@ -110,25 +183,15 @@ def _scalar_types(query: Query) -> Mapping[str, str] | None:
     return types
 
 
-def _from_index(query: Query, types: Mapping[str, str]) -> TableBuilder:
+def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[Block]:
     from hybridlog.frames.bson import index_columns
 
-    builder = TableBuilder()
     topic = query.topics[0]
     projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
-    taken = 0
-    for raw in query.raw_documents(topic, projection):
+    for raw, rows in query.thinned_documents(topic, projection):
         reference, records = index_columns(raw, types)
-        count = len(reference.t)
-        rows = np.arange((-taken) % query.step, count, query.step)
-        taken += count
-        query.counters.documents_read += count
+        query.counters.documents_read += len(reference)
         query.counters.messages += len(rows)
-        builder.append(reference.t, reference.seq, records)
-    return builder
-
-
-def _nothing() -> Piece:
-    none = np.empty(0, np.int64)
-    batch = Batch(b"", none, none, none.astype(np.int32), none, none, none.astype(np.uint32))
-    return Piece(batch, none)
+        if len(rows) < len(reference):
+            reference, records = reference.take(rows), take(records, rows)
+        yield Block(topic, reference.t, reference.seq, records, 0)

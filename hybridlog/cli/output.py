@@ -57,6 +57,21 @@ def print_table(
     console().print(table)
 
 
+def print_records(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows as a table when it fits the screen, else as one block a row."""
+    widths = [
+        max([len(name), *(len(row[i]) for row in rows)]) for i, name in enumerate(names)
+    ]
+    if not sys.stdout.isatty() or sum(widths) + 2 * len(widths) <= console().width:
+        print_table([(name, "left") for name in names], rows)
+        return
+    longest = max(map(len, names))
+    for row in rows:
+        for name, cell in zip(names, row, strict=True):
+            print(printable(f"{name:<{longest}}  {cell}"))  # noqa: T201
+        print()  # noqa: T201
+
+
 def printable(text: str) -> str:
     """Text without control characters: names in logs are untrusted."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

@@ -59,15 +59,15 @@ def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchW
         UsageError: No such format, or the target cannot be written.
     """
     if name == "mcap":
-        from hybridlog.export.mcap import McapWriter  # noqa: PLC0415
+        from hybridlog.export.mcap import McapWriter
 
         return McapWriter(target, profile=profile)
     if name == "bag":
-        from hybridlog.export.bag import BagWriter  # noqa: PLC0415
+        from hybridlog.export.bag import BagWriter
 
         return BagWriter(target)
     if name == "raw":
-        from hybridlog.export.raw import open_raw_writer  # noqa: PLC0415
+        from hybridlog.export.raw import open_raw_writer
 
         return open_raw_writer(target)
     raise _no_such_format(name, "exact")
@@ -84,19 +84,18 @@ def open_table_writer(name: str, target: Target) -> TableWriter:
         UsageError: No such format, or the target cannot be written.
     """
     if name == "npz":
-        from hybridlog.export.npz import NpzWriter  # noqa: PLC0415
+        from hybridlog.export.npz import NpzWriter
 
         return NpzWriter(target)
-    from hybridlog.export import tables  # noqa: PLC0415
+    from hybridlog.export.tables import ArrowWriter, CsvWriter, ParquetWriter
 
-    writers = {
-        "csv": tables.CsvWriter,
-        "parquet": tables.ParquetWriter,
-        "arrow": tables.ArrowWriter,
-    }
-    if name not in writers:
-        raise _no_such_format(name, "table")
-    return writers[name](target)
+    if name == "csv":
+        return CsvWriter(target)
+    if name == "parquet":
+        return ParquetWriter(target)
+    if name == "arrow":
+        return ArrowWriter(target)
+    raise _no_such_format(name, "table")
 
 
 def open_row_writer(name: str, target: Target) -> RowWriter:
@@ -106,7 +105,7 @@ def open_row_writer(name: str, target: Target) -> RowWriter:
         UsageError: No such format, or the target cannot be written.
     """
     if name == "jsonl":
-        from hybridlog.export.jsonl import JsonlWriter  # noqa: PLC0415
+        from hybridlog.export.jsonl import JsonlWriter
 
         return JsonlWriter(target)
     raise _no_such_format(name, "rows")

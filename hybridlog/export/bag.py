@@ -52,7 +52,8 @@ class BagWriter(FileWriter):
         self._known: dict[Channel, Connection] = {}
         if isinstance(target, str | os.PathLike):
             self._name = os.fspath(target)
-            self._final, self._atomic = destination(target)
+            with failures(self._name):
+                self._final, self._atomic = destination(target)
         else:
             self._name = str(getattr(target, "name", "the output"))
             self._stream, self._atomic = target, False

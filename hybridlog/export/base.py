@@ -188,9 +188,13 @@ class Sink:
     def write(self, data: Buffer) -> int:
         """Append bytes; returns how many.
 
+        After `abort` they are dropped: libraries write their ends when they are let go.
+
         Raises:
             DiskFullError: No space left.
         """
+        if self._over:
+            return memoryview(data).nbytes
         with failures(self.name):
             self._file.write(data)
         size = memoryview(data).nbytes
@@ -203,6 +207,8 @@ class Sink:
 
     def flush(self) -> None:
         """Hand what is buffered to the system."""
+        if self._over:
+            return
         with failures(self.name):
             self._file.flush()
 

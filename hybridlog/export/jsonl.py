@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -77,10 +78,10 @@ class JsonlWriter(FileWriter):
             UsageError: A column that has no JSON form.
             DiskFullError: No space left.
         """
-        import pyarrow as pa  # noqa: PLC0415
-        import pyarrow.compute as pc  # noqa: PLC0415
+        import pyarrow as pa
+        import pyarrow.compute as pc
 
-        from hybridlog.export.json_text import json_column  # noqa: PLC0415
+        from hybridlog.export.json_text import json_column
 
         for batch in table.to_batches(max_chunksize=rows_within(table)):
             try:
@@ -114,20 +115,9 @@ def _line(row: Mapping[str, object]) -> str:
 
 def _plain(value: object) -> object:
     """A value that `json` does not know."""
-    if isinstance(value, np.ndarray):
-        return {"n": value.size} if value.dtype.kind == "V" else _numbers(value)
-    if isinstance(value, np.generic):
-        return _numbers(value)
-    if isinstance(value, bytes | bytearray | memoryview):
-        return {"n": len(value)}
-    if isinstance(value, date):
-        return value.isoformat()
-    if isinstance(value, timedelta):
-        return value.total_seconds()
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, Sequence | set | frozenset):
-        return list(value)
+    for kind, make in _KINDS:
+        if isinstance(value, kind):
+            return make(value)
     raise UsageError(f"a value of type {type(value).__name__} has no JSON form")
 
 
@@ -137,6 +127,20 @@ def _numbers(value: np.ndarray[tuple[int, ...], np.dtype[np.generic]] | np.gener
         value = value.astype(unit).astype(np.int64)
     plain: object = value.tolist()
     return plain
+
+
+_KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
+    (np.ndarray, _numbers),
+    (np.generic, _numbers),
+    (bytes, lambda value: {"n": len(value)}),
+    (bytearray, lambda value: {"n": len(value)}),
+    (memoryview, lambda value: {"n": value.nbytes}),
+    (date, lambda value: value.isoformat()),
+    (timedelta, timedelta.total_seconds),
+    (Mapping, dict),
+    (Sequence, list),
+    (AbstractSet, list),
+)
 
 
 def _clean(value: object, depth: int) -> object:

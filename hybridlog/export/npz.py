@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -87,25 +88,33 @@ class NpzWriter(FileWriter):
                 column.append_nulls(batch.num_rows)
 
     def _finish(self) -> None:
-        written: set[str] = set()
         with (
             failures(self._sink.name),
             zipfile.ZipFile(cast("IO[bytes]", self._sink), "w", zipfile.ZIP_STORED) as archive,
         ):
-            for column in self._columns.values():
-                for name, dtype, shape, chunks in column.arrays():
-                    unique = name
-                    while unique in written:
-                        unique += "_"
-                    written.add(unique)
-                    # A fixed date makes equal content an equal file.
-                    entry = zipfile.ZipInfo(f"{unique}.npy", (1980, 1, 1, 0, 0, 0))
-                    with archive.open(entry, "w", force_zip64=True) as file:
-                        file.write(_npy_header(dtype, shape))
-                        for chunk in chunks:
-                            file.write(chunk)
+            try:
+                self._write_arrays(archive)
+            except BaseException:
+                # Else the archive would be ended, and a stream would look complete.
+                self._sink.abort()
+                raise
         self._sink.commit()
         self._spools.close()
+
+    def _write_arrays(self, archive: zipfile.ZipFile) -> None:
+        written: set[str] = set()
+        for column in self._columns.values():
+            for name, dtype, shape, chunks in column.arrays():
+                unique = name
+                while unique in written:
+                    unique += "_"
+                written.add(unique)
+                # A fixed date makes equal content an equal file.
+                entry = zipfile.ZipInfo(f"{unique}.npy", (1980, 1, 1, 0, 0, 0))
+                with archive.open(entry, "w", force_zip64=True) as file:
+                    file.write(_npy_header(dtype, shape))
+                    for chunk in chunks:
+                        file.write(chunk)
 
     def _discard(self) -> None:
         self._sink.abort()
@@ -254,13 +263,13 @@ class _Texts(_Column):
         if not len(array):
             return
         values = pc.fill_null(array.cast(pa.large_binary()), b"")
-        ends = np.cumsum(pc.binary_length(values).to_numpy(zero_copy_only=False))
-        self._offsets.append(ends + self._bytes.count)
-        # One join gives the bytes of the whole piece.
-        joined = pc.binary_join(
-            pa.LargeListArray.from_arrays(pa.array([0, len(values)], pa.int64()), values), b""
-        )
-        data = np.frombuffer(joined[0].as_py(), np.uint8)
+        _, offset_buffer, data_buffer = values.buffers()
+        offsets = np.frombuffer(offset_buffer, np.int64)
+        offsets = offsets[values.offset : values.offset + len(values) + 1]
+        data = np.zeros(0, np.uint8)
+        if data_buffer is not None:
+            data = np.frombuffer(data_buffer, np.uint8)[offsets[0] : offsets[-1]]
+        self._offsets.append(offsets[1:] - offsets[0] + self._bytes.count)
         self._bytes.append(data)
         if self._text:
             lengths = pc.utf8_length(pc.fill_null(array, ""))
@@ -280,7 +289,7 @@ class _Texts(_Column):
         offsets = np.frombuffer(b"".join(self._offsets.chunks()), np.int64)
         for first in range(0, len(offsets) - 1, _STRINGS_AT_ONCE):
             bounds = offsets[first : first + _STRINGS_AT_ONCE + 1].tolist()
-            words = [data[low:high].decode() for low, high in zip(bounds, bounds[1:], strict=False)]
+            words = [data[low:high].decode() for low, high in itertools.pairwise(bounds)]
             yield np.array(words, dtype).tobytes()
 
 
@@ -402,7 +411,8 @@ def _is_matrix(kind: pa.DataType) -> bool:
 
 
 def _dtype(kind: pa.DataType) -> np.dtype[Any]:
-    return np.dtype(kind.to_pandas_dtype())
+    dtype: np.dtype[Any] = np.dtype(kind.to_pandas_dtype())
+    return dtype
 
 
 def _filler(kind: pa.DataType) -> pa.Scalar:

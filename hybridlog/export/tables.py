@@ -146,13 +146,13 @@ class TableFileWriter(FileWriter):
         self._sink.commit()
 
     def _discard(self) -> None:
+        self._sink.abort()
         self._pieces = []
         file, self._file = self._file, None
         if file is not None:
-            # Arrow's writers write when they are let go; a failure there is no news.
+            # Goes nowhere now; without it Arrow's writers would close when collected.
             with contextlib.suppress(Exception):
                 file.close()
-        self._sink.abort()
 
 
 class ParquetWriter(TableFileWriter):

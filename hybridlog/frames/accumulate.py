@@ -65,7 +65,7 @@ class Lists:
 class Nested:
     """A finished column of arrays of strings or of messages, held by Arrow."""
 
-    values: pa.ChunkedArray
+    values: pa.ChunkedArray[Any]
 
 
 Finished: TypeAlias = Values | Text | Lists | Nested
@@ -125,7 +125,7 @@ def accommodate(current: Accumulator, column: Column) -> Accumulator:
     return text
 
 
-def _is_list(values: pa.ChunkedArray) -> bool:
+def _is_list(values: pa.ChunkedArray[Any]) -> bool:
     import pyarrow as pa  # noqa: PLC0415
 
     kind = values.type
@@ -258,8 +258,8 @@ def _finish(rows: RaggedBuilder, absent: _Absent) -> Ragged:
 
 
 class _Nested:
-    def __init__(self, held: pa.ChunkedArray | None = None) -> None:
-        self._pieces: list[pa.Array] = [] if held is None else list(held.chunks)
+    def __init__(self, held: pa.ChunkedArray[Any] | None = None) -> None:
+        self._pieces: list[pa.Array[Any]] = [] if held is None else list(held.chunks)
 
     def accepts(self, column: Column) -> bool:
         return isinstance(column, Arrays)

@@ -6,6 +6,7 @@ at. Rows may share elements, so that a million equal covariances take the room o
 
 from __future__ import annotations
 
+import builtins
 import operator
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -34,9 +35,8 @@ class ArrayDtype(ExtensionDtype):
         item: Type of the elements: numbers, booleans, datetime64[ns] or timedelta64[ns].
     """
 
-    type = np.ndarray
-    na_value = None  # type: ignore[assignment]
-    _metadata: ClassVar[tuple[str, ...]] = ("item",)  # type: ignore[misc]
+    na_value = None
+    _metadata: ClassVar[tuple[str, ...]] = ("item",)
 
     def __init__(self, item: DTypeLike = np.float64) -> None:
         self.item = np.dtype(item)
@@ -44,9 +44,14 @@ class ArrayDtype(ExtensionDtype):
             raise TypeError(f"arrays of {self.item} cannot be a column")
 
     @property
-    def name(self) -> str:
+    def name(self) -> str:  # type: ignore[override]
         """`array[...]`."""
         return f"array[{self.item.name}]"
+
+    @property
+    def type(self) -> builtins.type[np.ndarray[Any, Any]]:  # type: ignore[override]
+        """Class of the cells."""
+        return np.ndarray
 
     @classmethod
     def construct_from_string(cls, string: str) -> ArrayDtype:
@@ -60,11 +65,11 @@ class ArrayDtype(ExtensionDtype):
         return cls(np.dtype(string[6:-1]))
 
     @classmethod
-    def construct_array_type(cls) -> type[ArrayColumn]:
+    def construct_array_type(cls) -> builtins.type[ArrayColumn]:
         """The class of columns of this type."""
         return ArrayColumn
 
-    def __from_arrow__(self, array: pa.Array | pa.ChunkedArray) -> ArrayColumn:
+    def __from_arrow__(self, array: pa.Array[Any] | pa.ChunkedArray[Any]) -> ArrayColumn:
         """A column out of an Arrow column of lists."""
         import pyarrow.compute as pc  # noqa: PLC0415
 
@@ -78,7 +83,7 @@ class ArrayDtype(ExtensionDtype):
             np.cumsum(length, out=offset[1:])
             rows = Ragged.from_offsets(np.ascontiguousarray(values, self.item), offset)
             pieces.append(ArrayColumn(rows.without(missing)))
-        return ArrayColumn._concat_same_type(pieces) if pieces else ArrayColumn.empty(self.item)
+        return ArrayColumn.concatenated(pieces) if pieces else ArrayColumn.empty(self.item)
 
 
 class ArrayColumn(ExtensionArray):
@@ -90,12 +95,15 @@ class ArrayColumn(ExtensionArray):
 
     Args:
         rows: The cells.
+
+    Attributes:
+        rows: The cells; their elements are read-only.
     """
 
     def __init__(self, rows: Ragged) -> None:
         values = rows.values.view()
         values.flags.writeable = False
-        self._rows = Ragged(values, rows.start, rows.length)
+        self.rows = Ragged(values, rows.start, rows.length)
         self._dtype = ArrayDtype(values.dtype)
 
     @classmethod
@@ -110,7 +118,7 @@ class ArrayColumn(ExtensionArray):
         scalars: Iterable[ArrayLike | None],
         *,
         dtype: ExtensionDtype | str | None = None,
-        copy: bool = False,  # noqa: ARG003
+        copy: bool = False,
     ) -> Self:
         if isinstance(dtype, str):
             dtype = ArrayDtype.construct_from_string(dtype)
@@ -154,9 +162,14 @@ class ArrayColumn(ExtensionArray):
 
     @classmethod
     def _concat_same_type(cls, to_concat: Sequence[ArrayColumn]) -> Self:
+        return cls.concatenated(to_concat)
+
+    @classmethod
+    def concatenated(cls, to_concat: Sequence[ArrayColumn]) -> Self:
+        """Columns of one type, at least one, one after the other."""
         if len(to_concat) == 1:
-            return cls(to_concat[0]._rows)
-        parts = [column._rows for column in to_concat if len(column)]
+            return cls(to_concat[0].rows)
+        parts = [column.rows for column in to_concat if len(column)]
         if not parts:
             return cls.empty(to_concat[0].dtype.item)
         first = parts[0]
@@ -181,18 +194,18 @@ class ArrayColumn(ExtensionArray):
     @property
     def nbytes(self) -> int:
         """Bytes held; rows that are equal throughout count once."""
-        return self._rows.nbytes
+        return self.rows.nbytes
 
     @property
     def flat(self) -> NDArray[Any]:
         """All elements, row after row, read-only; a view where they lie so."""
-        values = self._rows.compact()[0].view()
+        values = self.rows.compact()[0].view()
         values.flags.writeable = False
         return values
 
     def lengths(self) -> NDArray[np.int64]:
         """Elements of each row, int64[n]; -1 for missing rows."""
-        return self._rows.length.copy()
+        return self.rows.length.copy()
 
     def stack(self) -> NDArray[Any]:
         """The rows as one array of shape (n, width), read-only; a view where possible.
@@ -200,7 +213,7 @@ class ArrayColumn(ExtensionArray):
         Raises:
             ValueError: Rows differ in length, or some are missing.
         """
-        stacked = self._rows.stacked()
+        stacked = self.rows.stacked()
         if stacked is None:
             raise ValueError("the rows differ in length or some are missing; see lengths()")
         stacked = stacked.view()
@@ -209,7 +222,7 @@ class ArrayColumn(ExtensionArray):
 
     def __len__(self) -> int:
         """Number of rows."""
-        return len(self._rows)
+        return len(self.rows)
 
     def __getitem__(self, item: Any) -> Any:
         """A cell, or the chosen rows as a column over the same elements."""
@@ -219,10 +232,10 @@ class ArrayColumn(ExtensionArray):
             index = operator.index(item)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"row {index} of {len(self)}")
-            return self._rows.row(index)
+            return self.rows.row(index)
         if not isinstance(item, slice):
             item = check_array_indexer(self, item)
-        return type(self)(self._rows.take(item))
+        return type(self)(self.rows.take(item))
 
     def __setitem__(self, key: Any, value: Any) -> None:
         """Not possible.
@@ -237,11 +250,11 @@ class ArrayColumn(ExtensionArray):
         if isinstance(other, (pd.Series, pd.Index, pd.DataFrame)):
             return NotImplemented
         if isinstance(other, ArrayColumn):
-            return _equal(self._rows, other._rows)
+            return _equal(self.rows, other.rows)
         if isinstance(other, np.ndarray) and other.ndim == 1 and other.dtype != object:
-            return _equal(self._rows, Ragged.repeated(other, len(self)))
+            return _equal(self.rows, Ragged.repeated(other, len(self)))
         if isinstance(other, (list, np.ndarray)) and len(other) == len(self):
-            return _equal(self._rows, self._from_sequence(other)._rows)
+            return _equal(self.rows, self._from_sequence(other).rows)
         return NotImplemented
 
     def __ne__(self, other: object) -> Any:
@@ -257,17 +270,15 @@ class ArrayColumn(ExtensionArray):
             return False
         if len(self) != len(other):
             return False
-        if not np.array_equal(self._rows.length, other._rows.length):
+        if not np.array_equal(self.rows.length, other.rows.length):
             return False
         return np.array_equal(self.flat, other.flat, equal_nan=self.dtype.item.kind in "fmM")
 
     def isna(self) -> NDArray[np.bool_]:
         """Which rows are missing."""
-        return self._rows.missing
+        return self.rows.missing
 
-    def take(
-        self, indices: Any, *, allow_fill: bool = False, fill_value: Any = None
-    ) -> Self:
+    def take(self, indices: Any, *, allow_fill: bool = False, fill_value: Any = None) -> Self:
         """The rows of those numbers; -1 gives a missing row with `allow_fill`.
 
         Raises:
@@ -279,7 +290,7 @@ class ArrayColumn(ExtensionArray):
         if not allow_fill:
             if len(index) and not len(self):
                 raise IndexError("cannot do a non-empty take from an empty axes.")
-            return type(self)(self._rows.take(index))
+            return type(self)(self.rows.take(index))
         if (index < -1).any():
             raise ValueError("a row number is below -1")
         if not _is_missing(fill_value):
@@ -289,18 +300,18 @@ class ArrayColumn(ExtensionArray):
             if not absent.all():
                 raise IndexError("cannot do a non-empty take from an empty axes.")
             zero = np.zeros(len(index), np.int64)
-            return type(self)(Ragged(self._rows.values, zero, zero - 1))
-        return type(self)(self._rows.take(np.where(absent, 0, index)).without(absent))
+            return type(self)(Ragged(self.rows.values, zero, zero - 1))
+        return type(self)(self.rows.take(np.where(absent, 0, index)).without(absent))
 
     def copy(self) -> Self:
         """The same cells. They are read-only, so they may be shared."""
-        return type(self)(self._rows)
+        return type(self)(self.rows)
 
     def astype(self, dtype: Any, copy: bool = True) -> Any:  # noqa: FBT001, FBT002
         """Another type: other elements (`array[float64]`), objects, strings."""
         wanted = pd.api.types.pandas_dtype(dtype)
         if isinstance(wanted, ArrayDtype):
-            rows = self._rows
+            rows = self.rows
             values = rows.values.astype(wanted.item, copy=False)
             return type(self)(Ragged(values, rows.start, rows.length))
         if wanted == np.dtype(object):
@@ -310,7 +321,7 @@ class ArrayColumn(ExtensionArray):
     def to_numpy(
         self,
         dtype: Any = None,
-        copy: bool = False,  # noqa: ARG002, FBT001, FBT002
+        copy: bool = False,  # noqa: FBT001, FBT002
         na_value: object = None,
     ) -> NDArray[Any]:
         """An object array of the cells; `stack()` gives one of numbers.
@@ -335,25 +346,25 @@ class ArrayColumn(ExtensionArray):
     def __array__(
         self,
         dtype: DTypeLike | None = None,
-        copy: bool | None = None,  # noqa: ARG002, FBT001
+        copy: bool | None = None,  # noqa: FBT001
     ) -> NDArray[Any]:
         """An object array of the cells."""
         return self.to_numpy(dtype)
 
-    def __arrow_array__(self, type: pa.DataType | None = None) -> pa.ChunkedArray:  # noqa: A002
+    def __arrow_array__(self, type: pa.DataType | None = None) -> pa.ChunkedArray[Any]:  # noqa: A002
         """An Arrow column of lists."""
         from hybridlog.frames.accumulate import Lists  # noqa: PLC0415
         from hybridlog.frames.arrow import lists  # noqa: PLC0415
 
         kinds = {"M": "time", "m": "duration"}
-        rows = self._rows
+        rows = self.rows
         kind = kinds.get(rows.values.dtype.kind, "number")
         if kind != "number":
             rows = Ragged(rows.values.view(np.int64), rows.start, rows.length)
         column = lists(Lists(rows, kind, None))  # type: ignore[arg-type]
         return column if type is None else column.cast(type)
 
-    def _formatter(self, boxed: bool = False) -> Callable[[Any], str]:  # noqa: ARG002, FBT001, FBT002
+    def _formatter(self, boxed: bool = False) -> Callable[[Any], str]:  # noqa: FBT001, FBT002
         return _shown
 
 
@@ -373,7 +384,7 @@ def _tight(rows: Ragged) -> Ragged:
 def _equal(one: Ragged, other: Ragged) -> NDArray[np.bool_]:
     if len(one) != len(other):
         raise ValueError("Lengths must match to compare")
-    same = (one.length == other.length) & (one.length >= 0)
+    same: NDArray[np.bool_] = (one.length == other.length) & (one.length >= 0)
     rows = np.flatnonzero(same)
     left, offset = one.take(rows).compact()
     right = other.take(rows).compact()[0]

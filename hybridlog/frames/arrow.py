@@ -1,5 +1,8 @@
 """Columns as Arrow arrays and tables."""
 
+# Where stubs for pyarrow are installed, they know too little of its buffers.
+# mypy: disable-error-code="no-any-return, arg-type, call-overload, return-value, assignment"
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
@@ -42,7 +45,7 @@ def table_of(columns: Iterable[tuple[str, Finished]]) -> pa.Table:
     return pa.Table.from_arrays(arrays, names=names)
 
 
-def as_chunked(column: Finished) -> pa.ChunkedArray:
+def as_chunked(column: Finished) -> pa.ChunkedArray[Any]:
     """A finished column as Arrow holds it; several pieces only past 2^31 elements."""
     if isinstance(column, Nested):
         return column.values
@@ -56,7 +59,7 @@ def as_chunked(column: Finished) -> pa.ChunkedArray:
 
 def _numbers(
     values: NDArray[Any], kind: pa.DataType, missing: NDArray[np.bool_] | None = None
-) -> pa.Array:
+) -> pa.Array[Any]:
     """Numbers as Arrow, without a copy except for booleans."""
     if pa.types.is_boolean(kind):
         return pa.array(values, kind, mask=missing)
@@ -83,7 +86,7 @@ def _pieces(
         yield *part.compact(), part.missing
 
 
-def _text_pieces(rows: Ragged) -> Iterator[pa.Array]:
+def _text_pieces(rows: Ragged) -> Iterator[pa.Array[Any]]:
     for data, offset, missing in _pieces(rows):
         yield pa.Array.from_buffers(
             pa.string(),
@@ -92,7 +95,7 @@ def _text_pieces(rows: Ragged) -> Iterator[pa.Array]:
         )
 
 
-def large_text(rows: Ragged) -> pa.ChunkedArray:
+def large_text(rows: Ragged) -> pa.ChunkedArray[Any]:
     """Strings with 64-bit offsets, in one piece."""
     data, offset = rows.compact()
     array = pa.Array.from_buffers(
@@ -107,7 +110,7 @@ def _buffer(values: NDArray[Any]) -> pa.Buffer:
     return pa.py_buffer(np.ascontiguousarray(values))
 
 
-def lists(column: Lists) -> pa.ChunkedArray:
+def lists(column: Lists) -> pa.ChunkedArray[Any]:
     """Arrays of numbers: `fixed_size_list` when the definition fixes the width."""
     item = value_type(column.rows.values.dtype, column.kind)
     width = column.width
@@ -125,19 +128,19 @@ def lists(column: Lists) -> pa.ChunkedArray:
 
 def _list(
     kind: pa.DataType,
-    values: pa.Array,
+    values: pa.Array[Any],
     offset: NDArray[np.int64],
     missing: NDArray[np.bool_] | None = None,
-) -> pa.Array:
+) -> pa.Array[Any]:
     buffers = [_validity(missing)]
     if not pa.types.is_fixed_size_list(kind):
         if pa.types.is_list(kind):
-            offset = offset.astype(np.int32)  # type: ignore[assignment]
+            offset = offset.astype(np.int32)
         buffers.append(pa.py_buffer(offset))
     return pa.Array.from_buffers(kind, len(offset) - 1, buffers, children=[values])
 
 
-def array_of(column: Column) -> pa.Array:
+def array_of(column: Column) -> pa.Array[Any]:
     """One chunk's column as an Arrow array, nested as it is.
 
     A chunk holds less than 2^31 elements, or the list gets 64-bit offsets.
@@ -147,7 +150,8 @@ def array_of(column: Column) -> pa.Array:
     if isinstance(column, Strings):
         strings = repaired(column)
         text = as_chunked(Text(Ragged.from_offsets(strings.data, strings.offset)))
-        return text.combine_chunks() if text.num_chunks != 1 else text.chunk(0)
+        whole: pa.Array[Any] = pa.concat_arrays(text.chunks)
+        return whole
     if isinstance(column, Records):
         fields = {name: array_of(inner) for name, inner in column.fields.items()}
         kind = pa.struct([pa.field(name, inner.type) for name, inner in fields.items()])
@@ -155,7 +159,7 @@ def array_of(column: Column) -> pa.Array:
     return _arrays(column)
 
 
-def _arrays(column: Arrays) -> pa.Array:
+def _arrays(column: Arrays) -> pa.Array[Any]:
     values = array_of(column.values)
     if column.width is not None and isinstance(column.values, Scalars):
         return _list(pa.list_(values.type, column.width), values, column.offset)
@@ -164,7 +168,7 @@ def _arrays(column: Arrays) -> pa.Array:
     return _list(kind, values, column.offset)
 
 
-def unified(pieces: list[pa.Array]) -> pa.ChunkedArray | None:
+def unified(pieces: list[pa.Array[Any]]) -> pa.ChunkedArray[Any] | None:
     """Arrays as one column of the narrowest type that holds them all.
 
     Returns:
@@ -186,7 +190,9 @@ def unified(pieces: list[pa.Array]) -> pa.ChunkedArray | None:
         return None
 
 
-def as_text(values: pa.Array | pa.ChunkedArray) -> tuple[Strings, NDArray[np.bool_]]:
+def as_text(
+    values: pa.Array[Any] | pa.ChunkedArray[Any],
+) -> tuple[Strings, NDArray[np.bool_]]:
     """Any Arrow column as strings: numbers as Arrow writes them, nested values as JSON.
 
     Returns:

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from hybridlog.frames.accumulate import Finished
 
 
-def frame_of(
-    log_time: NDArray[np.int64], columns: Iterable[tuple[str, Finished]]
-) -> pd.DataFrame:
+def frame_of(log_time: NDArray[np.int64], columns: Iterable[tuple[str, Finished]]) -> pd.DataFrame:
     """A frame over finished columns, without copying numbers.
 
     Args:
@@ -34,7 +32,7 @@ def frame_of(
     return pd.DataFrame(data, index=index.tz_localize("UTC"), copy=False)
 
 
-def _array(column: Finished) -> Any:  # noqa: ANN401 - numpy or any of pandas' arrays
+def _array(column: Finished) -> Any:
     if isinstance(column, Values):
         return _values(column)
     if isinstance(column, Text):
@@ -44,7 +42,7 @@ def _array(column: Finished) -> Any:  # noqa: ANN401 - numpy or any of pandas' a
     return pd.arrays.ArrowExtensionArray(column.values)
 
 
-def _values(column: Values) -> Any:  # noqa: ANN401
+def _values(column: Values) -> Any:
     values, missing = column.values, column.missing
     if column.kind == "number":
         return values if missing is None else _with_missing(values, missing)
@@ -55,7 +53,7 @@ def _values(column: Values) -> Any:  # noqa: ANN401
     return pd.DatetimeIndex(values.view("M8[ns]"), copy=False).tz_localize("UTC").array
 
 
-def _with_missing(values: NDArray[Any], missing: NDArray[np.bool_]) -> Any:  # noqa: ANN401
+def _with_missing(values: NDArray[Any], missing: NDArray[np.bool_]) -> Any:
     """Floats get NaN; integers and booleans pandas' nullable arrays, to stay exact."""
     if values.dtype.kind == "f":
         values[missing] = np.nan
@@ -73,7 +71,7 @@ def _with_unit(column: Lists) -> Ragged:
     return Ragged(rows.values.view(unit), rows.start, rows.length)
 
 
-def _string_dtype() -> Any:  # noqa: ANN401 - typed differently in every pandas
+def _string_dtype() -> Any:
     """The strings that pandas itself makes of str from version 3 on, held by Arrow."""
     if int(pd.__version__.split(".")[0]) >= 3:
         return pd.StringDtype(storage="pyarrow", na_value=np.nan)

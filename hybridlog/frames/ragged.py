@@ -31,7 +31,8 @@ class Growing:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Of the elements."""
-        return self._array.dtype
+        dtype: np.dtype[Any] = self._array.dtype
+        return dtype
 
     def reserve(self, count: int) -> NDArray[Any]:
         """Lengthen by `count` elements and return them, to be filled at once."""
@@ -140,9 +141,7 @@ class Ragged:
         """The same with some rows missing."""
         if not rows.any():
             return self
-        return Ragged(
-            self.values, np.where(rows, 0, self.start), np.where(rows, -1, self.length)
-        )
+        return Ragged(self.values, np.where(rows, 0, self.start), np.where(rows, -1, self.length))
 
     def width(self) -> int | None:
         """Elements a row when all rows have as many (0 without rows), else None."""
@@ -320,9 +319,12 @@ class RaggedBuilder:
             first = self._one
         else:
             return False
-        # By their bytes: NaN equals NaN, and -0.0 is not 0.0.
-        bits = np.ascontiguousarray(values).view(np.uint8).reshape(rows, -1)
-        if width and not bool((bits == first.view(np.uint8)).all()):
+        # By their bits: NaN equals NaN, and -0.0 is not 0.0. Each row is compared with
+        # the next, flat, which is several times faster than with one row broadcast.
+        bits = np.ascontiguousarray(values).view(f"u{self._dtype.itemsize}")
+        if not np.array_equal(bits[:width], first.view(bits.dtype)):
+            return False
+        if not np.array_equal(bits[width:], bits[: len(bits) - width]):
             return False
         if self._one is None:
             self._one = first.copy()

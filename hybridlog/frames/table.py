@@ -46,9 +46,7 @@ class TableBuilder:
         """Rows so far."""
         return len(self._time)
 
-    def append(
-        self, log_time: NDArray[np.int64], seq: NDArray[np.int64], records: Records
-    ) -> None:
+    def append(self, log_time: NDArray[np.int64], seq: NDArray[np.int64], records: Records) -> None:
         """Add the rows of one chunk; nothing of them is kept by reference.
 
         Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,10 +24,7 @@ def repaired(strings: Strings) -> Strings:
         return strings
     raw = data.tobytes()
     bounds = (strings.offset - low).tolist()
-    cells = [
-        raw[begin:end].decode("utf-8", "replace").encode()
-        for begin, end in zip(bounds, bounds[1:], strict=False)
-    ]
+    cells = [raw[begin:end].decode("utf-8", "replace").encode() for begin, end in pairwise(bounds)]
     offset = np.zeros(len(bounds), np.int64)
     np.cumsum([len(cell) for cell in cells], out=offset[1:])
     return Strings(np.frombuffer(b"".join(cells), np.uint8), offset)

@@ -391,7 +391,7 @@ def _from_date(moment: date) -> int:
 
 
 def _from_datetime64(moment: object) -> int:
-    import numpy as np  # noqa: PLC0415 - whoever has a datetime64 has numpy loaded
+    import numpy as np
 
     if not isinstance(moment, np.datetime64) or np.isnat(moment):
         raise TimeError(f"{_shown(moment)} is not a time: {ACCEPTED}")

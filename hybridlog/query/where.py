@@ -176,7 +176,7 @@ class Expression:
 
     def to_filter(self, field_types: Mapping[str, str] | None = None) -> dict[str, object]:
         """The MongoDB filter; see `compile_filter`."""
-        from hybridlog.query.mongo_filter import to_filter  # noqa: PLC0415 - it needs Node
+        from hybridlog.query.mongo_filter import to_filter
 
         return to_filter(self, field_types)
 

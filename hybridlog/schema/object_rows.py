@@ -116,7 +116,7 @@ def _double(value: float) -> float:
     try:
         return float(value)
     except OverflowError:
-        return math.copysign(math.inf, value)
+        return math.inf if value > 0 else -math.inf
 
 
 def _numbers(values: Sequence[Plain]) -> NDArray[Any] | None:

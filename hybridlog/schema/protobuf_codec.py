@@ -165,11 +165,12 @@ def _message_class(schema: Schema) -> type[Message]:
     pool = DescriptorPool()
     try:
         _fill(pool, schema.data)
-        return GetMessageClass(pool.FindMessageTypeByName(schema.name))
+        made: type[Message] = GetMessageClass(pool.FindMessageTypeByName(schema.name))
     except KeyError as error:
         raise DefinitionError(f"{schema.name}: the definition does not say what it is") from error
     except (DecodeError, TypeError, ValueError, RecursionError) as error:
         raise DefinitionError(f"{schema.name}: the definition is malformed ({error})") from error
+    return made
 
 
 def _fill(pool: DescriptorPool, data: bytes) -> None:
@@ -208,7 +209,7 @@ def _plain(message: Message) -> dict[str, Plain]:
         if field.has_presence and not message.HasField(field.name):
             continue
         value = getattr(message, field.name)
-        if not field.is_repeated:
+        if not _is_repeated(field):
             found[field.name] = _value(field, value)
         elif _is_map(field):
             inner = field.message_type.fields_by_name["value"]
@@ -241,6 +242,12 @@ def _map_key(key: object) -> str:
     return str(key).lower() if isinstance(key, bool) else str(key)
 
 
+def _is_repeated(field: FieldDescriptor) -> bool:
+    # Up to protobuf 5 there is only the label, from 7 on only the property.
+    repeated = getattr(field, "is_repeated", None)
+    return field.label == field.LABEL_REPEATED if repeated is None else bool(repeated)
+
+
 def _is_map(field: FieldDescriptor) -> bool:
     return field.type == _MESSAGE and bool(field.message_type.GetOptions().map_entry)
 
@@ -258,16 +265,16 @@ def _add_paths(
         if len(found) >= _MAX_PATHS:
             return
         path = prefix + name
-        array = within_array or field.is_repeated
+        array = within_array or _is_repeated(field)
         inner = field.message_type if field.type in {_MESSAGE, _GROUP} else None
         if inner is not None and _is_map(field):
             found.append(FieldPath(path, "map", within_array))
             continue
         kind = _TYPES[field.type] if inner is None else _TIMES.get(inner.full_name, inner.full_name)
-        found.append(FieldPath(path, f"{kind}[]" if field.is_repeated else kind, array))
+        found.append(FieldPath(path, f"{kind}[]" if _is_repeated(field) else kind, array))
         if inner is None or kind in _TIMES.values():
             continue
         within = [*above, message.full_name]
         if inner.full_name not in within and len(within) < _MAX_DEPTH:
-            dot = "[]." if field.is_repeated else "."
+            dot = "[]." if _is_repeated(field) else "."
             _add_paths(found, inner, path + dot, within, within_array=array)

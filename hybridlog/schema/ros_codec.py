@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
     from rosbags.interfaces.typing import FieldDesc, Typesdict
-    from rosbags.typesys.store import Typestore
 
     from hybridlog_storage.messages import Buffer, Schema
 
@@ -139,13 +138,14 @@ class RosObjects:
     """
 
     def __init__(self, message_type: MessageType, wire: Literal["ros1", "cdr"]) -> None:
-        from rosbags.typesys import Stores, TypesysError, get_typestore  # noqa: PLC0415
+        from rosbags.typesys import TypesysError  # noqa: PLC0415
+        from rosbags.typesys.store import Typestore  # noqa: PLC0415
 
         self._wire = wire
         self._label = message_type.name
         build = _Typesdict(message_type.name)
         self._name = build.add(message_type)
-        self._store: Typestore = get_typestore(Stores.EMPTY)
+        self._store = Typestore()
         try:
             self._store.register(build.types)
             self._store.get_msgdef(self._name)

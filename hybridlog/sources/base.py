@@ -73,6 +73,8 @@ class Source(ABC):
         time_range: Log time `[start, end)`, ns, as the log's own index says, None when
             it does not or has no messages.
         bytes_read: How much of `size_bytes` has been read, for showing progress.
+        packed_messages: The log says of itself that each payload is a zstd frame, and
+            this reader yields the frames (`JoinedSource` unpacks them).
     """
 
     def __init__(self, path: Path, *, kind: str, profile: str, files: Sequence[Path]) -> None:
@@ -87,6 +89,7 @@ class Source(ABC):
         self.message_count: int | None = None
         self.time_range: tuple[int, int] | None = None
         self.bytes_read: int = 0
+        self.packed_messages: bool = False
 
     @abstractmethod
     def batches(self) -> Iterator[Batch]:

@@ -100,7 +100,7 @@ def _open_file(path: Path) -> Source:
     if is_packed:
         return _join(path, [path], None)
     source = _open_plain(path)
-    if not getattr(source, "packed_messages", False):
+    if not source.packed_messages:
         return source
     source.close()
     return _join(path, [path], None)
@@ -189,13 +189,14 @@ def _join(
     if not known:
         sniff(files[0])
         raise _unknown(files[0], is_packed=parts[0].packed)
-    is_ros1 = known[0] is Format.BAG
+    # Of an MCAP file only its reader can say more.
     is_mcap = known[0] is Format.MCAP
-    is_rosbag2 = is_mcap and (metadata is not None or len(parts) > 1)
+    is_bag = metadata is not None
+    profiles = {Format.BAG: "ros1", Format.SQLITE: "ros2", Format.MCAP: "ros2" if is_bag else ""}
     source = JoinedSource(
         path,
-        kind="ROS 2 bag (mcap)" if is_rosbag2 else known[0].value,
-        profile="ros1" if is_ros1 else "ros2" if not is_mcap or metadata is not None else "",
+        kind=("ROS 2 bag (mcap)" if is_bag else "") if is_mcap else known[0].value,
+        profile=profiles[known[0]],
         parts=parts,
         opener=_open_plain,
         damage=damage,
@@ -206,6 +207,7 @@ def _join(
         source.time_range = metadata.time_range
     else:
         source.look()
+    source.kind = source.kind or known[0].value
     return source
 
 

@@ -120,6 +120,7 @@ class JoinedSource(Source):
                 reason = _without_path(error, part.path)
                 self.damage.append(Damage(part.path, 0, size, reason, part.message_count))
             else:
+                self.profile = self.profile or inner.profile
                 with inner:
                     self._kept = None
                     yield from self._read(part, inner, done, size)
@@ -161,7 +162,7 @@ class JoinedSource(Source):
         got = 0
         found_before = len(self.damage)
         batches = inner.batches()
-        if part.packed_messages or getattr(inner, "packed_messages", False):
+        if part.packed_messages or inner.packed_messages:
             batches = regroup(self._unpacked(part, batches))
         for batch in batches:
             got += len(batch)

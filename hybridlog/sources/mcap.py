@@ -100,6 +100,8 @@ class McapSource(Source):
         self._pending: _Open | None = None
         self._uncounted: list[_Open] = []
         self._end_is_noted = False
+        # Channels of the message indexes since the last chunk, None before the first.
+        self._indexed: set[int] | None = None
 
     def _open(self) -> Summary | None:
         if self._file.read(len(MAGIC)) != MAGIC:
@@ -142,10 +144,11 @@ class McapSource(Source):
 
     def _take(self, offset: int, item: Item) -> Iterator[Batch]:
         if isinstance(item, records.MessageIndex):
-            if self._pending is not None and self._pending.chunk:
-                self._pending.counted = (self._pending.counted or 0) + len(item.records)
+            self._index(offset, item)
             return
         self._settle()
+        if isinstance(item, ScannedChunk):
+            self._indexed = set()
         if isinstance(item, ScannedChunk):
             yield from self._chunk(item)
         elif isinstance(item, Loose):
@@ -158,6 +161,20 @@ class McapSource(Source):
             self.extras.append(item)
         elif isinstance(item, End):
             self._end(item)
+
+    def _index(self, offset: int, item: records.MessageIndex) -> None:
+        """Message indexes count what is in a lost chunk, and betray one that is not seen."""
+        if self._pending is not None and self._pending.chunk:
+            self._pending.counted = (self._pending.counted or 0) + len(item.records)
+            return
+        # A chunk has one index a channel. Totals, where there are any, count better.
+        foreign = self._indexed is None or item.channel_id in self._indexed
+        if foreign and item.records and self.message_count is None:
+            self._settle()
+            reason = "the chunk of these message indexes is missing"
+            self._pending = _Open(offset, 0, reason, chunk=True, counted=len(item.records))
+        elif self._indexed is not None:
+            self._indexed.add(item.channel_id)
 
     def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
         try:

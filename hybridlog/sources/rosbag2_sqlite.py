@@ -24,6 +24,7 @@ from hybridlog.sources.base import (
     cannot_open,
 )
 from hybridlog.sources.rosbag2_metadata import MAX_BYTES, parse_metadata
+from hybridlog.sources.spool import copy_start
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Batch, Channel, Schema
 
@@ -56,29 +57,20 @@ class _Row(NamedTuple):
 class SqliteSource(Source):
     """A `.db3` file of rosbag2.
 
-    Attributes:
-        packed_messages: Each payload is a zstd frame of its own, as the bag says.
-
     Raises:
         SourceError: No such file, no ROS 2 bag, or a database that gives nothing.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])
-        self.packed_messages = False
         self._channel_of: dict[int, int] = {}
         self._undefined: Counter[int] = Counter()
         self._select = ""
         self._got = 0
+        header = _read_header(path)
+        self._missing = header.pages * header.page - self.size_bytes
         try:
-            with path.open("rb") as file:
-                magic = file.read(len(MAGIC))
-        except OSError as error:
-            raise cannot_open(path, error) from error
-        if magic != MAGIC:
-            raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
-        try:
-            self._db, log_unread = _connect(path)
+            self._db, log_unread = _connect_whole_pages(path, header, self.size_bytes)
         except sqlite3.Error as error:
             raise _unreadable(path, error) from error
         if log_unread is not None:
@@ -261,6 +253,9 @@ class SqliteSource(Source):
                 break
             start = found
         self.bytes_read = self.size_bytes
+        if self._missing > 0 and not regions:
+            reason = "the file is cut short, but only behind its messages"
+            self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
         self._report_undefined()
 
     def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
@@ -287,7 +282,7 @@ class SqliteSource(Source):
         if len(batch):
             yield batch
 
-    def _one(self, start: int) -> _Row | None | Literal[False]:
+    def _one(self, start: int) -> _Row | Literal[False] | None:
         """The first row from an id on; None when there is none, False when it is bad."""
         try:
             row: _Row | None = self._db.execute(f"{self._select} LIMIT 1", (start,)).fetchone()
@@ -344,6 +339,41 @@ class SqliteSource(Source):
 
 _LOG_TIMES = ("timestamp", "recv_timestamp")
 _MAX_REGIONS = 4096
+
+
+class _Header(NamedTuple):
+    """What is used of the header of a database file: bytes a page, number of pages."""
+
+    page: int
+    pages: int
+
+
+def _read_header(path: Path) -> _Header:
+    try:
+        with path.open("rb") as file:
+            data = file.read(100)
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    if not data.startswith(MAGIC):
+        raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
+    page = int.from_bytes(data[16:18], "big")
+    return _Header(1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big"))
+
+
+def _connect_whole_pages(
+    path: Path, header: _Header, size: int
+) -> tuple[sqlite3.Connection, Path | None]:
+    """Opens a database without the page that its end cuts.
+
+    SQLite would read zeros for what is missing of that page, and give them as payload.
+    """
+    if header.page < 512 or size % header.page == 0:
+        return _connect(path)
+    spooled = copy_start(path, size - size % header.page)
+    try:
+        return _connect(spooled.path)
+    finally:
+        spooled.remove()
 
 
 def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:

@@ -6,6 +6,7 @@ import errno
 import shutil
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -15,6 +16,7 @@ from hybridlog.sources.base import cannot_open
 from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import IO
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -67,31 +69,62 @@ def spool(path: Path) -> Spooled:
     Raises:
         SourceError: It cannot be read, or there is no room for it.
     """
-    folder = Path(tempfile.gettempdir())
-    room = shutil.disk_usage(folder).free - _SPARE
     try:
-        source = path.open("rb")
+        with path.open("rb") as source:
+            size = zstandard.frame_content_size(source.read(32))
+            source.seek(0)
+            return _to_temporary(path, max(size, 0), partial(_unpack, source))
     except OSError as error:
         raise cannot_open(path, error) from error
-    with source:
-        packed = source.seek(0, 2)
-        source.seek(0)
-        size = zstandard.frame_content_size(source.read(32))
-        source.seek(0)
-        if size > room:
-            raise _no_room(path, folder, f"{size} bytes")
-        with tempfile.NamedTemporaryFile(prefix="hybridlog-", delete=False) as target:
-            spooled = Spooled(Path(target.name), None)
-            try:
-                spooled.problem = _unpack(source, target, room)
-            except BaseException as error:
-                spooled.remove()
-                if isinstance(error, OSError):
-                    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
-                        raise _no_room(path, folder, f"more than {packed} bytes") from error
-                    raise cannot_open(path, error) from error
-                raise
+
+
+def copy_start(path: Path, count: int) -> Spooled:
+    """Copies the first `count` bytes of a file to a temporary file.
+
+    Raises:
+        SourceError: It cannot be read, or there is no room for it.
+    """
+    try:
+        with path.open("rb") as source:
+            return _to_temporary(path, count, partial(_copy, source, count))
+    except OSError as error:
+        raise cannot_open(path, error) from error
+
+
+def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]) -> Spooled:
+    """Makes a temporary file and fills it.
+
+    Args:
+        path: The file that it is made of.
+        size: Bytes it will take at least.
+        fill: Writes to it, at most so many bytes, and returns what is wrong.
+    """
+    folder = Path(tempfile.gettempdir())
+    room = shutil.disk_usage(folder).free - _SPARE
+    if size > room:
+        raise _no_room(path, folder)
+    with tempfile.NamedTemporaryFile(prefix="hybridlog-", delete=False) as target:
+        spooled = Spooled(Path(target.name), None)
+        try:
+            spooled.problem = fill(target, room)
+        except BaseException as error:
+            spooled.remove()
+            if isinstance(error, OSError) and error.errno in _FULL:
+                raise _no_room(path, folder) from error
+            raise
     return spooled
+
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:
+    while count > 0:
+        data = source.read(min(_PIECE, count))
+        if not data:
+            return
+        target.write(data)
+        count -= len(data)
 
 
 def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
@@ -116,8 +149,8 @@ def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
     return None
 
 
-def _no_room(path: Path, folder: Path, size: str) -> SourceError:
+def _no_room(path: Path, folder: Path) -> SourceError:
     return SourceError(
-        f"{path}: unpacks to {size}, for which {folder} has no room; make room there, or set "
-        "TMPDIR to a folder that has it"
+        f"{path}: has to be unpacked to read it, and {folder} has no room for that; make room "
+        "there, or set TMPDIR to a folder that has it"
     )

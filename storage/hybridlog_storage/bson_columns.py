@@ -357,12 +357,16 @@ def _column(documents: NDArray[np.uint8], leaf: _Leaf) -> BsonColumn:
         return None
     if leaf.code == 0x03:
         return [{}] * rows
+    return _arrays(documents, leaf)
+
+
+def _arrays(documents: NDArray[np.uint8], leaf: _Leaf) -> BsonColumn:
     if leaf.item == 0x02:
         return BsonStringArrays(_strings(documents, leaf.spans, None), len(leaf.spans))
     if leaf.item:
         return _numbers(documents, leaf.item, leaf.spans)
     if not leaf.spans:
-        return np.empty((rows, 0))
+        return np.empty((len(documents), 0))
     (begin, length) = leaf.spans[0]
     return _lists(documents[:, begin : begin + length])
 

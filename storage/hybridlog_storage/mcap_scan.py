@@ -322,12 +322,14 @@ class _Window:
         return self._data[offset - self._start :]
 
     def peek(self, offset: int, length: int) -> bytes:
-        """A few bytes from anywhere, leaving the window where it is."""
+        """A few bytes from anywhere, fewer or none at the end, without moving the window."""
+        if not 0 <= offset < self.size:
+            return b""
         begin = offset - self._start
         if begin >= 0 and begin + length <= len(self._data):
             return bytes(self._data[begin : begin + length])
         self._file.seek(offset)
-        return self._file.read(max(min(length, self.size - offset), 0))
+        return self._file.read(min(length, self.size - offset))
 
 
 class _ChunkHead(NamedTuple):
@@ -382,6 +384,10 @@ class _Places:
         """Where the first chunk behind `offset` starts."""
         i = bisect.bisect_right(self._starts, offset)
         return self._starts[i] if i < len(self._starts) else None
+
+    def denies(self, offset: int) -> bool:
+        """Whether no chunk starts at `offset`, as far as can be known."""
+        return bool(self._starts) and offset not in self._lengths and self.believed()
 
     def believed(self) -> bool:
         """Whether enough entries are right."""
@@ -521,7 +527,9 @@ class _Scanner:
         fields = _chunk_head(self._window, at)
         if fields is None or fields.data > end:
             reason = "the fields of a chunk are damaged"
-            yield at, ScanDamage(at, end - at, reason, opcode=Opcode.CHUNK)
+            # Too short, or unknown to the summary: the opcode is what is wrong.
+            real = end - at >= _HEAD + _LEAST[Opcode.CHUNK] and not self._places.denies(at)
+            yield at, ScanDamage(at, end - at, reason, opcode=Opcode.CHUNK if real else None)
         elif end - at > self._limit:
             yield at, self._too_large(at, end, Opcode.CHUNK)
         else:
@@ -738,8 +746,10 @@ class _Scanner:
     def _is_plausible(self, opcode: int, end: int) -> bool:
         if opcode == 0 or end > self._window.size:
             return False
+        if opcode == Opcode.FOOTER:
+            return end + len(MAGIC) >= self._window.size
         if opcode <= max(Opcode):
-            return opcode in _DATA_OPCODES or opcode in {Opcode.HEADER, Opcode.FOOTER}
+            return opcode in _DATA_OPCODES or opcode == Opcode.HEADER
         return opcode >= _FIRST_PRIVATE or self._goes_on(end)
 
     def _goes_on(self, at: int) -> bool:

@@ -121,3 +121,13 @@ def test_an_unusable_directory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(UsageError, match="cannot make"):
         tour.run(tmp_path / "file" / "below")
+
+
+def test_the_real_tour(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    code = tour.run(tmp_path / "real", 17, 1, keep=False)
+    out, err = capfd.readouterr()
+    assert code == 0, err
+    assert out.count("(right:") == 3
+    assert "closed the gripper 1 times" in out
+    assert "(1700, " in out
+    assert not (tmp_path / "real").exists()

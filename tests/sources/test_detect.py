@@ -23,7 +23,7 @@ from tests.data import DATA, needs_data
         ("odd/example-lz4.bag", "ROS 1 bag", "ros1", 8647),
         ("odd/no-messages.bag", "ROS 1 bag", "ros1", 0),
         ("odd/rosbag2/talker_db3/talker.db3", "ROS 2 bag (sqlite3)", "ros2", 20),
-        ("odd/rosbag2/talker.mcap", "MCAP", "ros2", 20),
+        ("odd/rosbag2/talker.mcap", "ROS 2 bag (mcap)", "ros2", 20),
         ("real/ouster.mcap", "MCAP", "ros1", None),
         ("odd/protobuf.mcap", "MCAP", "", None),
     ],

@@ -336,6 +336,18 @@ def test_any_changed_byte_gives_no_wrong_payload_and_is_counted(
     assert missing == 0 or found.damage
 
 
+def test_a_changed_byte_in_the_footer_costs_nothing(put: Callable[[bytes], Path]) -> None:
+    good = VARIANTS["ZSTD"]
+    wanted = official(put(good))
+    for at in range(len(good) - 37 - 13, len(good)):
+        for change in (1, 0x80):
+            bad = bytearray(good)
+            bad[at] ^= change
+            found = read(put(bytes(bad)))
+            assert found.messages == wanted, at
+            assert sum(lost or 0 for lost in found.lost) == 0, at
+
+
 def test_a_changed_byte_costs_one_chunk_at_most(put: Callable[[bytes], Path]) -> None:
     good = VARIANTS["ZSTD"]
     chunks = [i for _, i in scan(io.BytesIO(good), size=len(good)) if isinstance(i, ScannedChunk)]

@@ -290,7 +290,14 @@ def test_any_bytes_as_a_record_give_a_record_or_one_error(opcode: int, data: byt
         assert record is None or 0 < used <= len(data)
 
 
-def test_a_million_messages_are_read_in_a_moment() -> None:
+@pytest.mark.parametrize("claim", [4, 1 << 31, (1 << 63) - 1, (1 << 64) - 1])
+def test_a_field_that_claims_more_than_its_record_holds_is_an_error(claim: int) -> None:
+    attachment = struct.pack("<QQIIQ", 0, 0, 0, 0, claim) + b"abc"
+    with pytest.raises(SegmentError, match="attachment record is damaged"):
+        read_record(Opcode.ATTACHMENT, attachment)
+
+
+def test_messages_are_not_looked_at_one_by_one() -> None:
     count, payload = 200_000, bytes(320)
     one = content_of(Message(7, 123, payload, 456, 9))
     data = one * count

@@ -1,0 +1,338 @@
+"""Images, scans and point clouds as numpy arrays, without a copy where possible."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import warnings
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog_storage.errors import MissingDependencyError, PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+_IMAGES: Final[Mapping[str, tuple[str, int]]] = {
+    "mono8": ("u1", 1),
+    "mono16": ("u2", 1),
+    **{
+        f"{order}{bits}": (f"u{bits // 8}", len(order))
+        for order in ("rgb", "bgr", "rgba", "bgra")
+        for bits in (8, 16)
+    },
+    **{
+        f"bayer_{order}{bits}": (f"u{bits // 8}", 1)
+        for order in ("rggb", "bggr", "gbrg", "grbg")
+        for bits in (8, 16)
+    },
+    **dict.fromkeys(("yuv422", "yuv422_yuy2", "uyvy", "yuyv"), ("u1", 2)),
+}
+# Planes of one byte a sample: rows of the whole picture for each row of the image.
+_PLANAR: Final[Mapping[str, tuple[int, int]]] = {"nv21": (3, 2), "nv12": (3, 2), "nv24": (3, 1)}
+_CV_ENCODING = re.compile(r"(8|16|32|64)(U|S|F)C(\d{1,3})?")
+_CV_TYPES = {"8U", "8S", "16U", "16S", "32S", "32F", "64F", "16F"}
+_CV_CHANNELS = 512
+
+_POINT_TYPES: Final[Mapping[int, str]] = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    8: "f8",
+}
+_COMPRESSED = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_DEPTH_HEADER = struct.Struct("<iff")
+
+
+def to_numpy(type_name: str, message: object) -> NDArray[Any]:
+    """A message as an array.
+
+    * `Image`: shape (height, width) or (height, width, channels) in the encoding's own
+      channel order; big-endian samples have a big-endian dtype. YUV 4:2:2 has two
+      channels as they lie; NV12, NV21 and NV24 come as the raw planes, shape
+      (rows of all planes, width).
+    * `CompressedImage`: shape (height, width) or (height, width, 3 or 4), red first.
+      `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
+      (NaN where nothing was measured).
+    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if there are any)
+      and `angle` (radians), float32.
+    * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
+      cloud's own fields; `PointCloud`: shape (n,), `x`, `y`, `z` and the channels.
+
+    Images, and clouds of the new kind, are views of the message's data and do not copy.
+
+    Args:
+        type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
+        message: The decoded message, its fields as attributes.
+
+    Raises:
+        PayloadError: The type is none of these, or the sizes, the encoding or the
+            fields do not fit the data.
+        MissingDependencyError: Pillow is needed and not there.
+    """
+    maker = _MAKERS.get(type_name.replace("/msg/", "/"))
+    if maker is None:
+        raise PayloadError(
+            f"{type_name} has no array form; {', '.join(_MAKERS)} have. "
+            "Its fields are in decode(), its columns in to_pandas()."
+        )
+    try:
+        return maker(message)
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise PayloadError(f"this {type_name} is not the usual one: {error}") from error
+
+
+def _bytes(data: Any) -> NDArray[np.uint8]:
+    """The bytes of a uint8 sequence, as a view if it is an array or a buffer."""
+    if isinstance(data, (bytes, bytearray, memoryview)):
+        return np.frombuffer(data, np.uint8)
+    return np.ascontiguousarray(data).view(np.uint8).reshape(-1)
+
+
+def _image(message: Any) -> NDArray[Any]:
+    encoding = str(message.encoding).strip()
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = _bytes(message.data)
+    channels, sample = 1, np.dtype(np.uint8)
+    planes = _PLANAR.get(encoding.lower())
+    if planes is not None:
+        whole, part = planes
+        if height % part:
+            raise PayloadError(f"a {encoding} image cannot have {height} rows")
+        height = height * whole // part
+    else:
+        sample, channels = _sample(encoding)
+    if message.is_bigendian:
+        sample = sample.newbyteorder(">")
+    row = width * channels * sample.itemsize
+    _check_rows("an image", (height, width), row, step, len(data))
+    pixel = channels * sample.itemsize
+    if channels == 1:
+        return _view(data, (height, width), sample, (step, pixel))
+    return _view(data, (height, width, channels), sample, (step, pixel, sample.itemsize))
+
+
+def _sample(encoding: str) -> tuple[np.dtype[Any], int]:
+    """Type of a sample, and samples a pixel."""
+    known = _IMAGES.get(encoding.lower())
+    if known is not None:
+        return np.dtype(known[0]), known[1]
+    match = _CV_ENCODING.fullmatch(encoding.upper())
+    if match is not None and match[1] + match[2] in _CV_TYPES:
+        channels = int(match[3] or 1)
+        if 1 <= channels <= _CV_CHANNELS:
+            kind = {"U": "u", "S": "i", "F": "f"}[match[2]]
+            return np.dtype(f"{kind}{int(match[1]) // 8}"), channels
+    raise PayloadError(f"an image has the unknown encoding {encoding[:40]!r}")
+
+
+def _check_rows(what: str, shape: tuple[int, int], row: int, step: int, size: int) -> None:
+    """Check that rows of `row` bytes, `step` bytes apart, lie within `size` bytes."""
+    height, width = shape
+    if height < 0 or width < 0:
+        raise PayloadError(f"{what} cannot have {width} columns and {height} rows")
+    if height and step < row:
+        raise PayloadError(f"{what} has rows of {step} bytes, and {width} columns need {row}")
+    if height and width and (height - 1) * step + row > size:
+        raise PayloadError(
+            f"{what} of {width} x {height} needs {(height - 1) * step + row} bytes and has {size}"
+        )
+
+
+def _view(
+    data: NDArray[np.uint8],
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    strides: tuple[int, ...],
+) -> NDArray[Any]:
+    """An array over `data`; the caller checked that it lies inside."""
+    if 0 in shape:
+        # Sizes beside the zero are free to lie; numpy refuses those it cannot multiply.
+        return np.empty(tuple(min(size, 1 << 31) for size in shape), dtype)
+    array: NDArray[Any] = np.ndarray(shape, dtype, data.data, 0, strides)
+    return array
+
+
+def _compressed_image(message: Any) -> NDArray[Any]:
+    form = str(message.format)
+    data = _bytes(message.data).tobytes()
+    if "compressedDepth" in form:
+        return _depth(form, data)
+    return _picture(data)
+
+
+def _depth(form: str, data: bytes) -> NDArray[Any]:
+    """A depth image behind its header: quantised inverse depth, or depth as it is."""
+    if len(data) < _DEPTH_HEADER.size or "rvl" in form.lower():
+        raise PayloadError(f"a depth image in the form {form[:60]!r} cannot be read: only PNG can")
+    _, scale, shift = _DEPTH_HEADER.unpack_from(data)
+    picture = _picture(data[_DEPTH_HEADER.size :])
+    if picture.ndim != 2:
+        raise PayloadError("a depth image has more than one channel")
+    if not form.upper().startswith("32FC1"):
+        return picture
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.float32(scale) / (picture.astype(np.float32) - np.float32(shift))
+    depth[picture == 0] = np.nan
+    return depth
+
+
+def _picture(data: bytes) -> NDArray[Any]:
+    try:
+        from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            "compressed images need Pillow: pip install 'hybridlog[images]'"
+        ) from error
+
+    # Pillow would silently cut these to eight bits.
+    if data.startswith(_PNG) and data[24:25] == b"\x10" and data[25:26] != b"\x00":
+        raise PayloadError("a PNG with 16 bits and several channels cannot be read")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=_COMPRESSED) as image:
+                # Grey of 16 bits and of 32-bit floats have modes of their own.
+                plain = image.mode in {"L", "RGB", "RGBA", "F", "I"} or image.mode[:4] == "I;16"
+                mode = "RGBA" if "A" in image.mode or "transparency" in image.info else "RGB"
+                mode = "L" if image.mode == "1" else mode
+                array: NDArray[Any] = np.asarray(image if plain else image.convert(mode))
+    except UnidentifiedImageError as error:
+        raise PayloadError(
+            f"a compressed image is none of {', '.join(_COMPRESSED)}, or its head is damaged"
+        ) from error
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        EOFError,
+        struct.error,
+        Warning,
+        Image.DecompressionBombError,
+    ) as error:
+        raise PayloadError(f"a compressed image cannot be read: {error}") from error
+    if array.dtype == np.int32 and array.size and 0 <= array.min() <= array.max() <= 0xFFFF:
+        array = array.astype(np.uint16)  # older versions read 16-bit grey as 32
+    return array
+
+
+def _laser_scan(message: Any) -> NDArray[Any]:
+    ranges = np.asarray(message.ranges, np.float32)
+    intensities = np.asarray(message.intensities, np.float32)
+    names = ["range", "intensity", "angle"] if len(intensities) else ["range", "angle"]
+    scan = np.empty(len(ranges), [(name, np.float32) for name in names])
+    scan["range"] = ranges
+    if len(intensities):
+        if len(intensities) != len(ranges):
+            raise PayloadError(
+                f"a scan has {len(ranges)} ranges and {len(intensities)} intensities"
+            )
+        scan["intensity"] = intensities
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.arange(len(ranges)) * float(message.angle_increment)
+        scan["angle"] = float(message.angle_min) + steps
+    return scan
+
+
+def _point_cloud2(message: Any) -> NDArray[Any]:
+    height, width = int(message.height), int(message.width)
+    step = int(message.point_step)
+    data = _bytes(message.data)
+    order = ">" if message.is_bigendian else "<"
+    dtype = _point_dtype(message.fields, step, order)
+    # The step of a single row is often left at 0.
+    row_step = int(message.row_step) if height > 1 else width * step
+    _check_rows("a point cloud", (height, width), width * step, row_step, len(data))
+    if height == 1:
+        return _view(data, (width,), dtype, (step,))
+    return _view(data, (height, width), dtype, (row_step, step))
+
+
+def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
+    """The structure of one point.
+
+    Raises:
+        PayloadError: A field has an unknown type, lies outside the point, or overlaps
+            another.
+    """
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    ends: list[tuple[int, int, str]] = []
+    for field in fields:
+        code, offset, count = int(field.datatype), int(field.offset), int(field.count) or 1
+        name = _unique(str(field.name), names)
+        if code not in _POINT_TYPES:
+            raise PayloadError(f"field {name!r} of a point cloud has the unknown type {code}")
+        item = np.dtype(order + _POINT_TYPES[code])
+        end = offset + count * item.itemsize
+        if offset < 0 or end <= offset:
+            raise PayloadError(
+                f"field {name!r} of a point cloud has {count} elements from byte {offset}"
+            )
+        if end > step:
+            raise PayloadError(
+                f"field {name!r} of a point cloud ends at byte {end} of points of {step} bytes"
+            )
+        names.append(name)
+        formats.append(item if count == 1 else (item, (count,)))
+        offsets.append(offset)
+        ends.append((offset, end, name))
+    if not names:
+        raise PayloadError("a point cloud has no fields")
+    ends.sort()
+    for (_, end, name), (start, _, other) in pairwise(ends):
+        if start < end:
+            raise PayloadError(f"fields {name!r} and {other!r} of a point cloud overlap")
+    try:
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    except (ValueError, OverflowError) as error:
+        raise PayloadError(f"points of {step} bytes cannot be read: {error}") from error
+
+
+def _unique(name: str, taken: list[str]) -> str:
+    """A field name that numpy accepts: not empty and not there already."""
+    name = name or f"field_{len(taken)}"
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _point_cloud(message: Any) -> NDArray[Any]:
+    points = message.points
+    names = ["x", "y", "z"]
+    columns = []
+    for channel in message.channels:
+        if len(channel.values) != len(points):
+            raise PayloadError(
+                f"a point cloud has {len(points)} points and {len(channel.values)} values "
+                f"in channel {str(channel.name)!r}"
+            )
+        names.append(_unique(str(channel.name), names))
+        columns.append(channel.values)
+    cloud = np.empty(len(points), [(name, np.float32) for name in names])
+    for axis in ("x", "y", "z"):
+        cloud[axis] = np.fromiter((getattr(p, axis) for p in points), np.float32, len(points))
+    for name, values in zip(names[3:], columns, strict=True):
+        cloud[name] = values
+    return cloud
+
+
+_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/CompressedImage": _compressed_image,
+    "sensor_msgs/LaserScan": _laser_scan,
+    "sensor_msgs/PointCloud2": _point_cloud2,
+    "sensor_msgs/PointCloud": _point_cloud,
+}

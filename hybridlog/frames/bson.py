@@ -1,0 +1,451 @@
+"""Index documents as columns: what the index answers without a payload.
+
+Index documents hold the nearest BSON type; the wire types are given back here. Fields
+that a document lacks have no place in a column, so documents are parted by the fields
+they have, and a `TableBuilder` puts the parts together again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+import numpy as np
+
+from hybridlog.frames.ragged import Ragged
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog_storage.bson_columns import BsonStringArrays, BsonStrings, read_columns
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.bson_columns import BsonColumn, BsonGroup
+
+INDEX_TYPES: Final[Mapping[str, np.dtype[Any] | None]] = {
+    "bool": np.dtype(np.bool_),
+    "char": np.dtype(np.uint8),
+    **{name: np.dtype(name) for size in (8, 16, 32, 64) for name in (f"int{size}", f"uint{size}")},
+    "float32": np.dtype(np.float32),
+    "float64": np.dtype(np.float64),
+    "time": None,
+    "duration": None,
+    "string": None,
+}
+"""Types of single values that come back from the index as they were on the wire. `byte`
+is none of them: its sign differs between the ROS versions."""
+
+WireType: TypeAlias = "np.dtype[Any] | str"
+"""A dtype or a key of `INDEX_TYPES`."""
+
+_INSTANTS: Final[Mapping[str, Literal["time", "duration"]]] = {
+    "time": "time",
+    "duration": "duration",
+}
+_ID_BYTES = 20
+_KEY = np.dtype([("time", ">u8"), ("recording", ">u4"), ("seq", ">u8")])
+_REFERENCE = {"seg": "_meta.ref.seg", "chunk": "_meta.ref.chunk", "off": "_meta.ref.off"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceColumns:
+    """What index documents say about their messages.
+
+    Attributes:
+        t: int64[n], log time, ns.
+        seq: int64[n], arrival number in the recording.
+        seg: int64[n], segment number; -1 when the documents came without it.
+        chunk: int64[n], file offset of the chunk record; -1 likewise.
+        off: int64[n], start of the payload in the uncompressed chunk; -1 likewise.
+        length: int64[n], bytes of the payload; -1 likewise.
+    """
+
+    t: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    seg: NDArray[np.int64]
+    chunk: NDArray[np.int64]
+    off: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of documents."""
+        return len(self.t)
+
+    def take(self, rows: NDArray[np.intp]) -> ReferenceColumns:
+        """The chosen documents."""
+        return ReferenceColumns(
+            self.t[rows],
+            self.seq[rows],
+            self.seg[rows],
+            self.chunk[rows],
+            self.off[rows],
+            self.length[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BsonPart:
+    """Documents of a batch that have the same fields.
+
+    Attributes:
+        rows: Their numbers in the batch, ascending.
+        reference: What they say about their messages.
+        records: Their fields.
+    """
+
+    rows: NDArray[np.intp]
+    reference: ReferenceColumns
+    records: Records
+
+
+@dataclass(slots=True)
+class _Piece:
+    """Documents with the same fields in the same kinds of columns."""
+
+    rows: NDArray[np.intp]
+    columns: dict[str, BsonColumn]
+
+
+def reference_columns(batch: bytes) -> ReferenceColumns:
+    """What the index documents of a batch say about their messages, in document order.
+
+    Log time and arrival number are taken from `_meta.t` and `_meta.seq`, or else from
+    `_id`.
+
+    Args:
+        batch: Documents one after the other, projected to `_meta` or parts of it.
+
+    Raises:
+        StoreError: A document is malformed, or has neither `_meta.t` and `_meta.seq`
+            nor an `_id`.
+    """
+    return _references(_pieces(read_columns(batch)))
+
+
+def records_from_bson(
+    batch: bytes,
+    types: Mapping[str, WireType],
+    *,
+    with_id: bool = False,
+    with_meta: bool = False,
+) -> tuple[BsonPart, ...]:
+    """The fields of the index documents of a batch as columns.
+
+    Args:
+        batch: Documents one after the other.
+        types: Wire type by dotted path; for arrays the type of their elements. Paths
+            that are not named keep the type of their BSON values, as do values that do
+            not fit the named type. Dates come as times.
+        with_id: Keep `_id`, as bytes.
+        with_meta: Keep `_meta`.
+
+    Returns:
+        Documents with the same fields together, in document order within each part.
+        Null counts as absent. Nearly always there is one part.
+
+    Raises:
+        StoreError: A document is malformed, or says nothing about its place in time.
+    """
+    pieces = _pieces(read_columns(batch))
+    references = _references(pieces)
+    families: dict[frozenset[str], list[tuple[NDArray[np.intp], dict[str, Column]]]] = {}
+    for piece in pieces:
+        columns = {
+            path: _column(column, types.get(path))
+            for path, column in piece.columns.items()
+            if column is not None
+            and (with_id or path != "_id")
+            and (with_meta or not path.startswith("_meta."))
+        }
+        families.setdefault(frozenset(columns), []).append((piece.rows, columns))
+    parts = []
+    for members in families.values():
+        for rows, columns in _joined(members):
+            parts.append(BsonPart(rows, references.take(rows), _nested(columns, len(rows))))
+    return tuple(sorted(parts, key=lambda part: int(part.rows[0])))
+
+
+def index_columns(batch: bytes, types: Mapping[str, WireType]) -> tuple[ReferenceColumns, Records]:
+    """Certain fields of the index documents of a batch, in document order.
+
+    Documents that lack one of the fields are left out: those are of messages whose
+    payload could not be read.
+
+    Args:
+        batch: Documents one after the other, projected to these fields and to
+            `_meta.t` and `_meta.seq`.
+        types: Wire type by dotted path.
+
+    Raises:
+        StoreError: A document is malformed, or the values of a field are of kinds that
+            make no column.
+    """
+    members = []
+    pieces = _pieces(read_columns(batch))
+    for piece in pieces:
+        if all(piece.columns.get(path) is not None for path in types):
+            columns = {path: _column(piece.columns[path], types[path]) for path in types}
+            members.append((piece.rows, columns))
+    references = _references(pieces)
+    if not members:
+        nothing = {path: _empty(wanted) for path, wanted in types.items()}
+        return references.take(np.empty(0, np.intp)), _nested(nothing, 0)
+    joined = _joined(members)
+    if len(joined) > 1:
+        raise StoreError(
+            "the index documents of one topic hold values of different kinds in one of "
+            f"{', '.join(types)}; rebuild the index with `hybridlog reindex`"
+        )
+    rows, columns = joined[0]
+    return references.take(rows), _nested(columns, len(rows))
+
+
+def _empty(wanted: WireType) -> Column:
+    if wanted == "string":
+        return Strings(np.empty(0, np.uint8), np.zeros(1, np.int64))
+    dtype = _dtype(wanted)
+    return _typed(np.empty(0, np.int64 if dtype is None else dtype), wanted)
+
+
+def _dtype(wanted: WireType) -> np.dtype[Any] | None:
+    if isinstance(wanted, str):
+        return INDEX_TYPES.get(wanted)
+    return wanted
+
+
+def _pieces(groups: Iterable[BsonGroup]) -> list[_Piece]:
+    """Groups, with documents that were decoded one by one gathered into columns again."""
+    pieces = []
+    for group in groups:
+        if group.documents is None:
+            pieces.append(_Piece(group.rows, group.columns))
+            continue
+        alike: dict[tuple[tuple[str, type], ...], list[int]] = {}
+        leaves = [dict(_leaves(document)) for document in group.documents]
+        for place, leaf in enumerate(leaves):
+            alike.setdefault(tuple((k, type(v)) for k, v in leaf.items()), []).append(place)
+        for shape, places in alike.items():
+            columns = {path: _values([leaves[p][path] for p in places]) for path, _ in shape}
+            pieces.append(_Piece(group.rows[places], columns))
+    return pieces
+
+
+def _leaves(document: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+    """Values by dotted path."""
+    pending = list(document.items())[::-1]
+    while pending:
+        path, value = pending.pop()
+        if isinstance(value, dict) and value:
+            pending.extend(reversed([(f"{path}.{name}", v) for name, v in value.items()]))
+        else:
+            yield path, value
+
+
+def _values(values: list[Any]) -> BsonColumn:
+    """Values of one Python type as `read_columns` would give them."""
+    first = values[0]
+    if first is None:
+        return None
+    if isinstance(first, (bool, int, float)):
+        kinds = {bool: np.bool_, float: np.float64}
+        return np.array(values, kinds.get(type(first), np.int64))
+    if isinstance(first, (str, bytes)):
+        cells = [v.encode("utf-8", "replace") if isinstance(v, str) else v for v in values]
+        offset = np.zeros(len(cells) + 1, np.int64)
+        np.cumsum([len(cell) for cell in cells], out=offset[1:])
+        data = np.frombuffer(b"".join(cells), np.uint8)
+        return BsonStrings(data, offset, None if isinstance(first, str) else 0)
+    return values
+
+
+def _references(pieces: Sequence[_Piece]) -> ReferenceColumns:
+    rows = sum(len(piece.rows) for piece in pieces)
+    found = {name: np.full(rows, -1, np.int64) for name in ("t", "seq", "length", *_REFERENCE)}
+    paths = {"length": "_meta.ref.len", **_REFERENCE}
+    for piece in pieces:
+        found["t"][piece.rows], found["seq"][piece.rows] = _place_in_time(piece)
+        for name, path in paths.items():
+            column = piece.columns.get(path)
+            if column is not None:
+                found[name][piece.rows] = _integers(column, path)
+    return ReferenceColumns(**found)
+
+
+def _place_in_time(piece: _Piece) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    time, seq = piece.columns.get("_meta.t"), piece.columns.get("_meta.seq")
+    if time is not None and seq is not None:
+        return _integers(time, "_meta.t"), _integers(seq, "_meta.seq")
+    key = piece.columns.get("_id")
+    if isinstance(key, BsonStrings) and bool((np.diff(key.offset) == _ID_BYTES).all()):
+        parts = np.ascontiguousarray(key.data[: key.offset[-1]]).view(_KEY)
+        return parts["time"].astype(np.int64), parts["seq"].astype(np.int64)
+    raise _strange("_meta.t and _meta.seq")
+
+
+def _integers(column: BsonColumn, path: str) -> NDArray[np.int64]:
+    if isinstance(column, np.ndarray) and column.dtype.kind == "i" and column.ndim == 1:
+        return column.astype(np.int64, copy=False)
+    raise _strange(path)
+
+
+def _strange(path: str) -> StoreError:
+    return StoreError(
+        f"index documents do not hold what hybridlog writes as {path}; "
+        "rebuild the index with `hybridlog reindex`"
+    )
+
+
+def _column(column: BsonColumn, wanted: WireType | None) -> Column:
+    """One BSON column as wire values."""
+    if isinstance(column, BsonStrings):
+        if column.subtype is None:
+            return Strings(column.data, column.offset)
+        return Arrays(Scalars(column.data), column.offset)
+    if isinstance(column, BsonStringArrays):
+        strings = Strings(column.strings.data, column.strings.offset)
+        return Arrays(strings, np.arange(len(column) + 1, dtype=np.int64) * column.width)
+    if isinstance(column, np.ndarray):
+        if column.ndim == 1:
+            return _typed(column, wanted)
+        rows, width = column.shape
+        offset = np.arange(rows + 1, dtype=np.int64) * width
+        return Arrays(_typed(column.reshape(-1), wanted), offset)
+    return _objects(column or [])
+
+
+def _typed(values: NDArray[Any], wanted: WireType | None) -> Scalars:
+    if values.dtype.kind == "M":
+        # Saturating: milliseconds reach further than nanoseconds.
+        most = np.iinfo(np.int64).max // 10**6
+        return Scalars(np.clip(values.view(np.int64), -most, most) * 10**6, "time")
+    if isinstance(wanted, str) and (kind := _INSTANTS.get(wanted)) is not None:
+        fits = values.dtype.kind == "i"
+        return Scalars(values.astype(np.int64), kind) if fits else Scalars(values)
+    dtype = None if wanted is None else _dtype(wanted)
+    return Scalars(values if dtype is None else _cast(values, dtype))
+
+
+def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Values in their wire type; as they are where they do not fit it."""
+    found = values.dtype.kind
+    if dtype.kind == "f" and found in "if":
+        with np.errstate(over="ignore"):
+            return values.astype(dtype)
+    if dtype == np.uint64 and found == "f":
+        # Doubles stand for integers from 2^63 on; the last ones round up to 2^64.
+        inside = np.clip(values, 0.0, np.nextafter(2.0**64, 0.0))
+        integers: NDArray[Any] = np.nan_to_num(inside).astype(dtype)
+        return integers
+    if dtype.kind in "iu" and found == "i":
+        limits = np.iinfo(dtype)
+        fits = values.min(initial=0) >= limits.min and values.max(initial=0) <= limits.max
+        return values.astype(dtype) if fits else values
+    return values
+
+
+def _objects(values: Sequence[Any]) -> Column:
+    """Python values as a column; what is irregular becomes JSON text."""
+    kinds = {type(value) for value in values}
+    kind = kinds.pop() if len(kinds) == 1 else object
+    if issubclass(kind, list):
+        offset = np.zeros(len(values) + 1, np.int64)
+        np.cumsum([len(value) for value in values], out=offset[1:])
+        flat = [item for value in values for item in value]
+        return Arrays(_objects(flat) if flat else Scalars(np.empty(0)), offset)
+    if issubclass(kind, dict) and len({tuple(value) for value in values}) == 1:
+        names = list(values[0])
+        return Records({n: _objects([v[n] for v in values]) for n in names}, len(values))
+    if issubclass(kind, (bool, int, float, str)):
+        return _column(_values(list(values)), None)
+    texts = [json.dumps(value, ensure_ascii=False, default=str) for value in values]
+    return _column(_values(texts), None)
+
+
+def _joined(
+    members: list[tuple[NDArray[np.intp], dict[str, Column]]],
+) -> list[tuple[NDArray[np.intp], dict[str, Column]]]:
+    """Pieces with the same fields as one, in document order; apart if kinds differ."""
+    if len(members) == 1:
+        return members
+    signatures: dict[tuple[str, ...], list[tuple[NDArray[np.intp], dict[str, Column]]]] = {}
+    paths = list(members[0][1])
+    for rows, columns in members:
+        signature = tuple(_signature(columns[path]) for path in paths)
+        signatures.setdefault(signature, []).append((rows, columns))
+    joined = []
+    for alike in signatures.values():
+        rows = np.concatenate([rows for rows, _ in alike])
+        order = np.argsort(rows)
+        columns = {
+            path: _take(_concatenated([each[path] for _, each in alike]), order) for path in paths
+        }
+        joined.append((rows[order], columns))
+    return joined
+
+
+def _signature(column: Column) -> str:
+    """What columns must share to be put one after the other."""
+    if isinstance(column, Scalars):
+        return column.kind
+    if isinstance(column, Strings):
+        return "string"
+    if isinstance(column, Arrays):
+        empty = not len(column.values) and isinstance(column.values, Scalars)
+        return "[]" if empty else f"[{_signature(column.values)}]"
+    inner = (f"{name}:{_signature(value)}" for name, value in column.fields.items())
+    return f"{{{','.join(inner)}}}"
+
+
+def _concatenated(columns: Sequence[Any]) -> Column:
+    """Columns of one signature as one."""
+    first = columns[0]
+    if isinstance(first, Scalars):
+        return Scalars(np.concatenate([column.values for column in columns]), first.kind)
+    if isinstance(first, Records):
+        fields = {n: _concatenated([c.fields[n] for c in columns]) for n in first.fields}
+        return Records(fields, sum(column.rows for column in columns))
+    length = np.concatenate([np.diff(column.offset) for column in columns])
+    offset = np.zeros(len(length) + 1, np.int64)
+    np.cumsum(length, out=offset[1:])
+    if isinstance(first, Strings):
+        return Strings(
+            np.concatenate([c.data[int(c.offset[0]) : int(c.offset[-1])] for c in columns]), offset
+        )
+    return Arrays(_concatenated([column.values for column in columns]), offset)
+
+
+def _take(column: Column, order: NDArray[np.intp]) -> Column:
+    """A column in another order."""
+    if isinstance(column, Scalars):
+        return Scalars(column.values[order], column.kind)
+    if isinstance(column, Records):
+        return Records({n: _take(c, order) for n, c in column.fields.items()}, len(order))
+    if isinstance(column, Strings):
+        data, offset = Ragged.from_offsets(column.data, column.offset).take(order).compact()
+        return Strings(data, offset)
+    numbers = np.arange(len(column.values), dtype=np.intp)
+    places, offset = Ragged.from_offsets(numbers, column.offset).take(order).compact()
+    return Arrays(_take(column.values, places), offset)
+
+
+def _nested(columns: Mapping[str, Column], rows: int) -> Records:
+    """Columns by dotted path as records within records."""
+    top = Records({}, rows)
+    for path, column in columns.items():
+        *parents, name = path.split(".")
+        inner = top
+        for parent in parents:
+            below = inner.fields.setdefault(parent, Records({}, rows))
+            if not isinstance(below, Records):
+                # A name with a dot in it stands beside the field it seems to be part of.
+                inner, name = top, path
+                break
+            inner = below
+        while name in inner.fields:
+            name += "_"
+        inner.fields[name] = column
+    return top

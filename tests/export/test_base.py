@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import errno
+import gc
+import io
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from hybridlog.export import (
+    FORMATS,
+    open_batch_writer,
+    open_row_writer,
+    open_table_writer,
+)
+from hybridlog.export.base import Sink
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from tests.export.batches import many, ros1_channels
+
+TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})
+
+
+def fill(name: str, target: object, times: int = 1) -> object:
+    """A writer of any format with something in it."""
+    kind = FORMATS[name].kind
+    if kind == "exact":
+        exact = open_batch_writer(name, target)  # type: ignore[arg-type]
+        for _ in range(times):
+            exact.write(many(300), ros1_channels())
+        return exact
+    if kind == "table":
+        table = open_table_writer(name, target)  # type: ignore[arg-type]
+        for _ in range(times):
+            table.write(TABLE)
+        return table
+    rows = open_row_writer(name, target)  # type: ignore[arg-type]
+    for _ in range(times):
+        rows.write([{"x": 1}] * 100)
+    return rows
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_nothing_is_there_before_close_and_nothing_stays_after_abort(
+    name: str, tmp_path: Path
+) -> None:
+    target = tmp_path / "out"
+    writer = fill(name, target)
+    assert not target.exists()
+    writer.abort()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+    writer.abort()  # type: ignore[attr-defined]
+    writer.close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_close_leaves_only_the_target(name: str, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    writer = fill(name, target)
+    writer.close()  # type: ignore[attr-defined]
+    writer.close()  # type: ignore[attr-defined]
+    writer.abort()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_exception_in_the_block_aborts(name: str, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    if name != "raw":
+        target.write_bytes(b"what was there")
+    with pytest.raises(KeyError), fill(name, target):  # type: ignore[attr-defined]
+        raise KeyError
+    if name == "raw":
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert target.read_bytes() == b"what was there"
+        assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "raw"])
+def test_a_full_disk(name: str) -> None:
+    with pytest.raises(DiskFullError, match="no space left"):
+        fill(name, "/dev/full").close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_disk_that_fills_up_at_the_end(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    writer = fill(name, tmp_path / "out")
+    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "sync", full)
+    with pytest.raises(DiskFullError):
+        writer.close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "raw"])
+def test_a_stream_gets_the_same_bytes(name: str, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    fill(name, stream).close()  # type: ignore[attr-defined]
+    fill(name, tmp_path / "out").close()  # type: ignore[attr-defined]
+    assert stream.getvalue() == (tmp_path / "out").read_bytes()
+    assert not stream.closed
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_wrong_places(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no directory|No such file"):
+        fill(name, tmp_path / "missing" / "out")
+    (tmp_path / "dir" / "inner").mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"is a directory|not empty"):
+        fill(name, tmp_path / "dir")
+    with pytest.raises(UsageError, match=r"[Tt]oo long"):
+        fill(name, tmp_path / ("x" * 300)).close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == [tmp_path / "dir"]
+
+
+def test_no_such_format() -> None:
+    for open_writer in (open_batch_writer, open_table_writer, open_row_writer):
+        with pytest.raises(UsageError, match="no format"):
+            open_writer("docx", io.BytesIO())
+    with pytest.raises(UsageError, match="mcap"):
+        open_batch_writer("csv", io.BytesIO())
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
+    sink = Sink(tmp_path / "link")
+    sink.write(b"abc")
+    sink.commit()
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "file").read_bytes() == b"abc"
+
+
+def test_a_pipe_is_written_not_replaced(tmp_path: Path) -> None:
+    fifo = tmp_path / "pipe"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    sink = Sink(fifo)
+    sink.write(b"abc")
+    sink.commit()
+    assert os.read(reader, 100) == b"abc"
+    os.close(reader)
+    assert stat.S_ISFIFO(fifo.stat().st_mode)
+
+
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        sink = Sink(tmp_path / "out")
+        sink.commit()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == 0o640
+
+
+def test_a_broken_pipe_stays_one() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    stream = open(write, "wb", buffering=0)  # noqa: PTH123, SIM115
+    with pytest.raises(BrokenPipeError):
+        Sink(stream).write(b"x")
+    stream.close()
+
+
+def test_other_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    sink = Sink(tmp_path / "out")
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(HybridlogError, match="Input/output"):
+        sink.commit()
+    sink.abort()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_of_formats_loads_no_library() -> None:
+    code = (
+        "import sys, hybridlog.export, hybridlog.query.times, hybridlog.query.topics, "
+        "hybridlog.query.where, hybridlog.query.filters; "
+        "print(sorted({'pyarrow', 'pandas', 'rosbags', 'mcap', 'pymongo', 'numpy'} "
+        "& set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", ["parquet", "arrow", "csv", "npz", "mcap"])
+def test_an_aborted_stream_has_no_end(name: str) -> None:
+    stream = io.BytesIO()
+    writer = fill(name, stream)
+    before = stream.getvalue()
+    writer.abort()  # type: ignore[attr-defined]
+    del writer
+    gc.collect()
+    assert stream.getvalue() == before

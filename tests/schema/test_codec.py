@@ -1,0 +1,809 @@
+"""Codecs against rosbags, json and protobuf themselves."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import bson
+import numpy as np
+import pytest
+from bson.int64 import Int64
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag1 import Reader as Bag
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from hybridlog.schema.codec import Codec, OpaqueCodec, codec_for
+from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.messages import Channel, Schema
+from tests.data import DATA, needs_data
+from tests.schema.test_document import document_of, without_means
+
+LIMIT = 32
+
+
+# --- the reference: the table of the design note, one value at a time -----------------
+
+
+def number(name: str, value: Any) -> Any:
+    if name == "bool":
+        return bool(value)
+    if name in {"float32", "float64"}:
+        return float(value)
+    if name in {"uint32", "int64"}:
+        return Int64(value)
+    if name == "uint64":
+        return Int64(value) if value < 1 << 63 else float(value)
+    return int(value)
+
+
+def field_of(desc: Any, value: Any, store: Typestore, ros: int) -> Any:
+    kind, detail = desc
+    if kind == Nodetype.NAME:
+        if detail in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
+            return Int64(value.sec * 10**9 + value.nanosec)
+        return record_of(detail, value, store, ros)
+    if kind == Nodetype.BASE:
+        if detail[0] == "string":
+            return value
+        if detail[0] == "byte" and ros == 1:
+            return value - 256 if value > 127 else value
+        return number(detail[0], value)
+    inner = detail[0]
+    if inner[0] == Nodetype.BASE and inner[1][0] != "string":
+        name = inner[1][0]
+        values = value.view(np.int8) if name == "byte" and ros == 1 else value
+        values = [v.item() for v in values]
+        if len(values) > LIMIT:
+            return summary_of(name, values)
+        return [number(name, v) for v in values]
+    if len(value) > LIMIT:
+        return {"n": Int64(len(value))}
+    return [field_of(inner, v, store, ros) for v in value]
+
+
+def summary_of(name: str, values: list[Any]) -> dict[str, Any]:
+    finite = [v for v in values if math.isfinite(v)]
+    if not finite:
+        return {"n": Int64(len(values)), "min": None, "max": None, "mean": None}
+    wide = name if name in {"uint64", "float32", "float64"} else "int64"
+    low, high = (number(wide, f(finite) + (0.0 if "float" in name else 0)) for f in (min, max))
+    mean = math.fsum(finite) / len(finite)
+    return {"n": Int64(len(values)), "min": low, "max": high, "mean": mean}
+
+
+def record_of(name: str, message: Any, store: Typestore, ros: int) -> dict[str, Any]:
+    return {
+        field: field_of(desc, getattr(message, field), store, ros)
+        for field, desc in store.fielddefs[name][1]
+        if field != "structure_needs_at_least_one_member"
+    }
+
+
+def joined(payloads: list[bytes]) -> tuple[bytes, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+    length = np.array([len(p) for p in payloads], np.int64)
+    return b"".join(payloads), np.cumsum(length) - length, length
+
+
+def bodies_of(codec: Codec, payloads: list[bytes]) -> list[bytes | str]:
+    found: dict[int, bytes | str] = {}
+    for group in codec.bodies(*joined(payloads)):
+        assert len(group.rows) == len(group.body)
+        if group.error is not None:
+            assert group.body.shape[1] == 0
+        for row, body in zip(group.rows.tolist(), group.body, strict=True):
+            assert row not in found
+            found[row] = body.tobytes() if group.error is None else group.error
+    assert sorted(found) == list(range(len(payloads)))
+    return [found[row] for row in range(len(payloads))]
+
+
+def check(body: bytes | str, expected: dict[str, Any]) -> None:
+    assert isinstance(body, bytes), body
+    document = document_of(body)
+    if document == bson.encode(expected):
+        return
+    theirs, their_means = without_means(expected)
+    ours, our_means = without_means(bson.decode(document))
+    assert bson.encode(ours) == bson.encode(theirs)
+    assert our_means == pytest.approx(their_means, rel=1e-9, abs=1e-9)
+
+
+# --- ROS: real logs -------------------------------------------------------------------
+
+
+def messages_of(path: Path) -> Iterator[tuple[Channel, bytes]]:
+    if path.suffix == ".bag":
+        with Bag(path) as bag:
+            channels = {
+                c.id: Channel(
+                    c.topic,
+                    "ros1",
+                    Schema(c.msgtype.replace("/msg/", "/"), "ros1msg", c.msgdef.data.encode()),
+                )
+                for c in bag.connections
+            }
+            for connection, _, payload in bag.messages():
+                yield channels[connection.id], bytes(payload)
+        return
+    with path.open("rb") as stream:
+        cache: dict[int, Channel] = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.id not in cache:
+                made = schema and Schema(schema.name, schema.encoding, schema.data)
+                cache[channel.id] = Channel(channel.topic, channel.message_encoding, made)
+            yield cache[channel.id], message.data
+
+
+@lru_cache
+def few_messages_of(path: Path) -> dict[Channel, list[bytes]]:
+    found: dict[Channel, list[bytes]] = {}
+    for channel, payload in messages_of(path):
+        some = found.setdefault(channel, [])
+        if len(some) < 60 and sum(map(len, some)) < 300_000:
+            some.append(payload)
+    return found
+
+
+ROS_FILES = [
+    "real/leg_tracker_negative_2.bag",
+    "real/robot_localization_test1.bag",
+    "real/tilt_laser.bag",
+    "real/sick_laser_radar.bag",
+    "real/compressed_image.bag",
+    "real/luminar_pointcloud.bag",
+    "real/auv_ros2.mcap",
+    "odd/example.bag",
+    "odd/array_test.bag",
+    "odd/empty_msgs.bag",
+    "odd/every_sensor_msg_ros2.mcap",
+    "odd/rosbag2/talker.mcap",
+]
+
+
+def reader_of(channel: Channel) -> tuple[Typestore, str, Any, int]:
+    """rosbags' own parser and reader for a channel."""
+    assert channel.schema is not None
+    ros = 1 if channel.message_encoding == "ros1" else 2
+    parts = channel.schema.name.split("/")
+    name = "/".join([parts[0], "msg", parts[-1]])
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    own = get_types_from_msg(channel.schema.data.decode(), name)
+    for each in own:
+        store.fielddefs.pop(each, None)
+        store.types.pop(each, None)
+    store.register(own)
+    return store, name, store.deserialize_ros1 if ros == 1 else store.deserialize_cdr, ros
+
+
+@needs_data
+@pytest.mark.parametrize("file", ROS_FILES)
+def test_bodies_fields_and_objects_of_real_logs(file: str) -> None:
+    compared = 0
+    for channel, payloads in few_messages_of(DATA / file).items():
+        codec = codec_for(channel)
+        assert codec.indexed, codec.reason
+        try:
+            store, name, read, ros = reader_of(channel)
+        except TypesysError:
+            continue
+        bodies = bodies_of(codec, payloads)
+        for payload, body in zip(payloads, bodies, strict=True):
+            message = read(payload, name)
+            check(body, record_of(name, message, store, ros))
+            compared += 1
+        for payload, body in zip(payloads[:3], bodies[:3], strict=True):
+            assert isinstance(body, bytes)
+            assert bson.encode(codec.fields(payload)) == document_of(body)
+            assert same_object(codec.decode(memoryview(payload)), read(payload, name))
+    assert compared > 0
+
+
+def same_object(ours: Any, theirs: Any) -> bool:
+    if hasattr(theirs, "__dataclass_fields__"):
+        return all(
+            same_object(getattr(ours, f), getattr(theirs, f))
+            for f in theirs.__dataclass_fields__
+            if f != "__msgtype__" and not f.isupper()
+        )
+    if isinstance(theirs, np.ndarray):
+        return bool(np.array_equal(ours, theirs, equal_nan=theirs.dtype.kind == "f"))
+    if isinstance(theirs, list):
+        return len(ours) == len(theirs) and all(map(same_object, ours, theirs))
+    return bool(ours == theirs or (ours != ours and theirs != theirs))
+
+
+# --- ROS: made-up types ---------------------------------------------------------------
+
+PRIMITIVES = "bool byte char int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
+names = st.sampled_from(["a", "b2", "c_d", "width", "from", "x"])
+
+
+@st.composite
+def definitions(draw: st.DrawFn) -> tuple[int, str]:
+    ros = draw(st.sampled_from([1, 2]))
+    times = ["time", "duration"] if ros == 1 else ["builtin_interfaces/Time"]
+    simple = st.sampled_from(PRIMITIVES.split() * 2 + ["string"] * 8 + times)
+
+    def lines(types: st.SearchStrategy[str], least: int) -> str:
+        chosen = draw(st.dictionaries(names, types, min_size=least, max_size=5))
+        suffixes = ["", "", "[]", "[2]", "[34]"]
+        return "".join(f"{t}{draw(st.sampled_from(suffixes))} {n}\n" for n, t in chosen.items())
+
+    inner = lines(simple, 1)
+    middle = lines(simple | st.just("pkg/Inner"), 1)
+    outer = lines(simple | st.sampled_from(["pkg/Inner", "Middle"]), 1)
+    rule = "=" * 80
+    text = f"{outer}{rule}\nMSG: pkg/Middle\n{middle}{rule}\nMSG: pkg/Inner\n{inner}"
+    return ros, text
+
+
+def random_value(desc: Any, store: Typestore, draw: st.DrawFn) -> Any:
+    kind, detail = desc
+    if kind == Nodetype.NAME:
+        make = store.types[detail]
+        return make(*[random_value(d, store, draw) for _, d in store.fielddefs[detail][1]])
+    if kind == Nodetype.BASE:
+        if detail[0] == "string":
+            return draw(st.sampled_from(["", "odom", "süß", "a\0b"]))
+        return draw(element(detail[0]))
+    inner, size = detail
+    count = size if kind == Nodetype.ARRAY else draw(st.sampled_from([0, 1, 2, 3, 32, 33]))
+    if inner[0] == Nodetype.BASE and inner[1][0] != "string":
+        dtype = {"byte": "uint8", "char": "uint8"}.get(inner[1][0], inner[1][0])
+        seeds = draw(st.lists(element(inner[1][0]), min_size=1, max_size=4))
+        return np.resize(np.array(seeds, dtype), count)
+    seeds = [random_value(inner, store, draw) for _ in range(min(count, 2))]
+    return [seeds[i % len(seeds)] for i in range(count)]
+
+
+def element(name: str) -> st.SearchStrategy[Any]:
+    if name == "bool":
+        return st.booleans()
+    if name.startswith("float"):
+        # Of one size, so that the mean is the same in any order but for rounding.
+        usual = st.floats(-1e6, 1e6, width=int(name[5:]))  # type: ignore[arg-type]
+        return usual | st.sampled_from([-0.0, math.nan, math.inf, -math.inf])
+    info = np.iinfo({"byte": "uint8", "char": "uint8"}.get(name, name))
+    return st.integers(int(info.min), int(info.max))
+
+
+@settings(max_examples=60, deadline=None)
+@given(definitions(), st.data())
+def test_random_types_through_rosbags(definition: tuple[int, str], data: st.DataObject) -> None:
+    ros, text = definition
+    store = Typestore()
+    store.register(
+        {
+            f"builtin_interfaces/msg/{n}": (
+                [],
+                [("sec", (Nodetype.BASE, ("int32", 0))), ("nanosec", (Nodetype.BASE, (w, 0)))],
+            )
+            for n, w in (("Time", "uint32"), ("Duration", "int32" if ros == 1 else "uint32"))
+        }
+    )
+    store.register(get_types_from_msg(text, "pkg/msg/Outer"))
+    if ros == 1:
+        channel = Channel("/t", "ros1", Schema("pkg/Outer", "ros1msg", text.encode()))
+        write, read = store.serialize_ros1, store.deserialize_ros1
+    else:
+        channel = Channel("/t", "cdr", Schema("pkg/msg/Outer", "ros2msg", text.encode()))
+        write, read = store.serialize_cdr, store.deserialize_cdr
+    codec = codec_for(channel)
+    assert codec.indexed, codec.reason
+    outer = (Nodetype.NAME, "pkg/msg/Outer")
+    payloads = []
+    for _ in range(data.draw(st.integers(1, 4))):
+        message = random_value(outer, store, data.draw)
+        for instant in times_in(message):
+            instant.sec = abs(instant.sec)  # rosbags reads the seconds of ROS 1 as signed
+        payloads.append(bytes(write(message, "pkg/msg/Outer")))
+    for payload, body in zip(payloads, bodies_of(codec, payloads), strict=True):
+        plain = {k.removesuffix("_"): v for k, v in vars(read(payload, "pkg/msg/Outer")).items()}
+        check(body, record_with(plain, store, ros))
+        assert bson.encode(codec.fields(payload)) == document_of(body)  # type: ignore[arg-type]
+
+
+def times_in(message: Any) -> Iterator[Any]:
+    if isinstance(message, list):
+        for each in message:
+            yield from times_in(each)
+    elif hasattr(message, "nanosec"):
+        yield message
+    elif hasattr(message, "__dataclass_fields__"):
+        for each in vars(message).values():
+            yield from times_in(each)
+
+
+def record_with(plain: dict[str, Any], store: Typestore, ros: int) -> dict[str, Any]:
+    fields = store.fielddefs["pkg/msg/Outer"][1]
+    return {n: python_of(d, plain[n], store, ros) for n, d in fields}
+
+
+def python_of(desc: Any, value: Any, store: Typestore, ros: int) -> Any:
+    """`field_of`, for names that rosbags spells `from_`."""
+    if desc[0] == Nodetype.NAME and not desc[1].startswith("builtin_interfaces/"):
+        return {
+            n: python_of(d, getattr(value, "from_" if n == "from" else n), store, ros)
+            for n, d in store.fielddefs[desc[1]][1]
+        }
+    if desc[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} and desc[1][0][0] == Nodetype.NAME:
+        if len(value) > LIMIT and not desc[1][0][1].startswith("builtin_interfaces/"):
+            return {"n": Int64(len(value))}
+        listed = [python_of(desc[1][0], v, store, ros) for v in value]
+        return summary_of("int64", listed) if len(listed) > LIMIT else listed
+    return field_of(desc, value, store, ros)
+
+
+# --- ROS: faults ----------------------------------------------------------------------
+
+
+def ros1(text: str, name: str = "pkg/T") -> Codec:
+    return codec_for(Channel("/t", "ros1", Schema(name, "ros1msg", text.encode())))
+
+
+def test_invalid_utf8_is_mended_in_the_index() -> None:
+    codec = ros1("string s\nuint8 v")
+    payload = b"\x03\0\0\0a\xff\xc3\x07"
+    assert codec.fields(payload) == {"s": "a\ufffd\ufffd", "v": 7}
+    with pytest.raises(PayloadError, match=r"\.raw"):
+        codec.decode(payload)
+
+
+def test_payloads_that_do_not_fit_are_errors_and_the_others_are_read() -> None:
+    codec = ros1("float64 x")
+    good = np.array([1.5]).tobytes()
+    bodies = bodies_of(codec, [good, b"short", good, b"", good + b"too long"])
+    assert [isinstance(b, bytes) for b in bodies] == [True, False, True, False, False]
+    for row in (1, 3, 4):
+        assert "pkg/T" in str(bodies[row])
+    assert codec.fields(b"short") == {}
+    with pytest.raises(PayloadError, match="pkg/T"):
+        codec.decode(b"short")
+    decoded = codec.columns(*joined([good, b"short"]), None)
+    assert decoded.rows.tolist() == [0]
+
+
+def test_a_document_past_8_mib_is_an_error() -> None:
+    codec = ros1("string s\nint32 v")
+    huge = (9 << 20).to_bytes(4, "little") + b"x" * (9 << 20) + bytes(4)
+    small = (1).to_bytes(4, "little") + b"x" + bytes(4)
+    bodies = bodies_of(codec, [huge, small])
+    assert "8 MiB" in str(bodies[0])
+    check(bodies[1], {"s": "x", "v": 0})
+    assert codec.fields(huge) == {}
+
+
+def test_no_rows_at_all() -> None:
+    nothing = joined([])
+    for codec in (ros1("string s"), codec_for(Channel("/t", "json", None)), OpaqueCodec("x")):
+        assert list(codec.bodies(*nothing)) == []
+    decoded = ros1("string s\nfloat64 x").columns(*nothing, None)
+    assert list(decoded.records.fields) == ["s", "x"]
+    assert len(codec_for(Channel("/t", "json", None)).columns(*nothing, None).records) == 0
+
+
+def test_big_arrays_of_objects_are_views() -> None:
+    payload = (1000).to_bytes(4, "little") + bytes(1000)
+    message: Any = ros1("uint8[] data").decode(payload)
+    assert message.data.base is not None
+    assert not message.data.flags.owndata
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "reason"),
+    [
+        ("ros1", None, "no definition"),
+        ("cdr", Schema("pkg/msg/T", "", b""), "pkg/msg/T: no definition"),
+        ("cdr", Schema("T", "ros2msg", b"wstring s"), "wstring"),
+        ("cdr", Schema("T", "ros2msg", b"T again"), "itself"),
+        ("ros1", Schema("T", "ros1msg", b"int32 x=__import__('os')"), None),
+        ("ros1", Schema("T", "ros1msg", b"int32 x; import os"), "T"),
+        ("ros1", Schema("T", "ros2msg", b"int32 x"), "'ros2msg'"),
+        ("protobuf", Schema("T", "protobuf", b"\xff\xff"), "malformed"),
+        ("protobuf", Schema("T", "protobuf", b""), "does not say"),
+        ("cbor", None, "'cbor' is stored and fetched, not indexed"),
+        ("", None, "without an encoding"),
+    ],
+)
+def test_what_cannot_be_read_is_opaque_and_says_why(
+    encoding: str, schema: Schema | None, reason: str | None
+) -> None:
+    codec = codec_for(Channel("/t", encoding, schema))
+    if reason is None:  # a constant
+        assert codec.paths() == []
+        assert codec.indexed
+        return
+    assert not codec.indexed
+    assert reason in str(codec.reason)
+    assert bodies_of(codec, [b"abc", b""]) == [b"", b""]
+    assert codec.fields(b"abc") == {}
+    assert codec.paths() == []
+    with pytest.raises(DefinitionError, match="raw"):
+        codec.decode(b"abc")
+    with pytest.raises(DefinitionError):
+        codec.columns(*joined([b"abc"]), None)
+
+
+def test_codecs_are_shared() -> None:
+    schema = Schema("pkg/T", "ros1msg", b"int32 x")
+    one = codec_for(Channel("/a", "ros1", schema))
+    two = codec_for(Channel("/b", "ros1", Schema("pkg/T", "ros1msg", b"int32 x")))
+    assert one is two
+    assert codec_for(Channel("/a", "ros1", schema), array_limit=5) is not one
+
+
+def test_array_limit() -> None:
+    schema = Schema("pkg/T", "ros1msg", b"uint8[3] a")
+    codec = codec_for(Channel("/a", "ros1", schema), array_limit=2)
+    assert codec.fields(b"\x01\x02\x06") == {"a": {"n": 3, "min": 1, "max": 6, "mean": 3.0}}
+
+
+def test_objects_of_hostile_definitions() -> None:
+    odd = codec_for(Channel("/t", "ros1", Schema("pkg/T'; x", "ros1msg", b"int32 x")))
+    if odd.indexed:
+        with pytest.raises(DefinitionError, match="no name"):
+            odd.decode(bytes(4))
+    with pytest.raises(DefinitionError, match="raw"):
+        ros1("string[20000] s").decode(b"")
+    with pytest.raises(DefinitionError, match="raw"):
+        ros1("int32 from\nint32 from_").decode(bytes(8))
+
+
+def test_columns_of_chosen_fields() -> None:
+    codec = ros1("int32 x\nfloat64 y\nstring s")
+    payload = bytes(12) + b"\x01\0\0\0a"
+    decoded = codec.columns(*joined([payload, payload]), {"x", "s"})
+    assert list(decoded.records.fields) == ["x", "s"]
+
+
+# --- JSON -----------------------------------------------------------------------------
+
+JSON = codec_for(Channel("/j", "json", None))
+
+
+def indexed(text: str | bytes) -> dict[str, object]:
+    payload = text.encode() if isinstance(text, str) else text
+    (body,) = bodies_of(JSON, [payload])
+    assert isinstance(body, bytes), body
+    assert bson.encode(JSON.fields(payload)) == document_of(body)
+    return JSON.fields(payload)
+
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 63) - 1) | st.floats() | st.text(),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.text(st.characters(exclude_characters="\0"), max_size=3), inner)
+    ),
+    max_leaves=10,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.dictionaries(st.sampled_from("abcd"), plain), max_size=5))
+def test_json_is_indexed_as_it_stands(values: list[dict[str, Any]]) -> None:
+    payloads = [json.dumps(v).encode() for v in values]
+    for value, body in zip(values, bodies_of(JSON, payloads), strict=True):
+        assert isinstance(body, bytes)
+        assert document_of(body) == bson.encode(value)
+    for payload, value in zip(payloads, values, strict=True):
+        assert json.dumps(JSON.decode(payload)) == json.dumps(value)
+
+
+def test_json_rules() -> None:
+    assert indexed("[1, 2]") == {"value": [1, 2]}
+    assert indexed("7") == {"value": 7}
+    assert indexed('{"_id": 1, "_meta": 2, "m": {"_id": 3}}') == {
+        "_id_": 1,
+        "_meta_": 2,
+        "m": {"_id": 3},
+    }
+    assert indexed('{"a": 1, "a": 2}') == {"a": 2}
+    assert indexed('{"a\\u0000b": {"\\u0000": 1}}') == {"a\ufffdb": {"\ufffd": 1}}
+    assert indexed('{"a": "x\\u0000y"}') == {"a": "x\0y"}
+    assert indexed('{"a": "\\ud800x"}') == {"a": "\ufffdx"}
+    assert indexed('{"a": NaN, "b": -Infinity}')["b"] == -math.inf
+    assert indexed('{"": "ü"}') == {"": "ü"}
+    assert indexed(b'\xef\xbb\xbf{"a": 1}') == {"a": 1}
+    found = indexed(f'{{"a": {1 << 63}, "b": {10**400}, "c": -{10**400}, "d": {(1 << 63) - 1}}}')
+    assert found == {"a": float(1 << 63), "b": math.inf, "c": -math.inf, "d": (1 << 63) - 1}
+    assert type(found["a"]) is float
+
+
+def test_json_arrays_past_the_limit() -> None:
+    integers = indexed(json.dumps({"a": list(range(33))}))["a"]
+    assert integers == {"n": 33, "min": 0, "max": 32, "mean": 16.0}
+    assert type(integers["min"]) is Int64  # type: ignore[index]
+    floats = indexed(json.dumps({"a": [0.5] * 20 + [math.nan] * 20}))["a"]
+    assert floats == {"n": 40, "min": 0.5, "max": 0.5, "mean": 0.5}
+    assert indexed(json.dumps({"a": [math.nan] * 40}))["a"] == {
+        "n": 40,
+        "min": None,
+        "max": None,
+        "mean": None,
+    }
+    assert indexed(json.dumps({"a": [1.5] + [1 << 64] * 40}))["a"] == {
+        "n": 41,
+        "min": 1.5,
+        "max": float(1 << 64),
+        "mean": pytest.approx(40 * 2.0**64 / 41),
+    }
+    assert indexed(json.dumps({"a": ["x"] * 40, "b": [{}] * 33, "c": [None] * 33})) == {
+        "a": {"n": 40},
+        "b": {"n": 33},
+        "c": {"n": 33},
+    }
+    assert indexed(json.dumps({"a": list(range(32))}))["a"] == list(range(32))
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (b"", "not JSON"),
+        (b'{"a": ', "not JSON"),
+        (b'{"a": "\xff"}', "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b"[" * 150 + b"]" * 150, "nested deeper"),
+        (b'{"a": "' + b"x" * (9 << 20) + b'"}', "8 MiB"),
+        (b'{"a": ' + b"1" * 10_000 + b"}", "not JSON"),
+    ],
+)
+def test_json_that_cannot_be_indexed(payload: bytes, why: str) -> None:
+    bodies = bodies_of(JSON, [b'{"a": 1}', payload, b'{"b": 2}'])
+    assert isinstance(bodies[1], str)
+    assert why in bodies[1]
+    check(bodies[0], {"a": 1})
+    check(bodies[2], {"b": 2})
+    assert JSON.fields(payload) == {}
+    if why == "not JSON":
+        with pytest.raises(PayloadError):
+            JSON.decode(payload)
+
+
+def test_json_columns() -> None:
+    rows: list[Any] = [
+        {"i": 1, "f": 1, "b": True, "s": "x", "l": [1, 2], "m": {"x": 1.5, "y": 1}, "o": 1},
+        {"i": 2, "f": 0.5, "b": False, "s": "ü", "l": [], "m": {"x": 2.5}, "o": "a"},
+        {"i": 3, "b": True, "l": [3], "t": [["a"]], "m": None, "o": {"k": [1]}},
+    ]
+    payloads = [json.dumps(r).encode() for r in rows]
+    decoded = JSON.columns(*joined([payloads[0], b"broken", *payloads[1:]]), None)
+    assert decoded.rows.tolist() == [0, 2, 3]
+    assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
+    found = decoded.records.fields
+
+    def scalars(name: str) -> Any:
+        column = found[name]
+        assert isinstance(column, Scalars)
+        return column.values
+
+    assert scalars("i").dtype == np.int64
+    assert scalars("i").tolist() == [1, 2, 3]
+    np.testing.assert_array_equal(scalars("f"), [1, 0.5, math.nan])
+    assert scalars("b").tolist() == [True, False, True]
+    assert texts(found["s"]) == ["x", "ü", ""]
+    lists = found["l"]
+    assert isinstance(lists, Arrays)
+    assert lists.offset.tolist() == [0, 2, 2, 3]
+    assert isinstance(lists.values, Scalars)
+    assert lists.values.values.tolist() == [1, 2, 3]
+    inner = found["m"]
+    assert isinstance(inner, Records)
+    assert isinstance(inner.fields["x"], Scalars)
+    np.testing.assert_array_equal(inner.fields["x"].values, [1.5, 2.5, math.nan])
+    assert texts(found["o"]) == ["1", '"a"', '{"k": [1]}']
+    assert texts(found["t"]) == ["null", "null", '[["a"]]']
+    some = JSON.columns(*joined(payloads), {"m.x", "i", "missing"}).records
+    assert list(some.fields) == ["i", "m"]
+    assert isinstance(some.fields["m"], Records)
+    assert list(some.fields["m"].fields) == ["x"]
+
+
+def texts(column: Any) -> list[str]:
+    assert isinstance(column, Strings)
+    data = column.data.tobytes()
+    return [data[a:b].decode() for a, b in zip(column.offset, column.offset[1:], strict=False)]
+
+
+@needs_data
+def test_json_of_a_real_log() -> None:
+    seen = 0
+    for channel, payloads in few_messages_of(DATA / "odd/protobuf.mcap").items():
+        if channel.message_encoding == "json":
+            for payload, body in zip(
+                payloads, bodies_of(codec_for(channel), payloads), strict=True
+            ):
+                check(body, json.loads(payload))
+                seen += 1
+    assert seen > 0
+
+
+# --- protobuf -------------------------------------------------------------------------
+
+
+def protobuf_channel() -> Channel:
+    """A type with a field of every kind."""
+    from google.protobuf import duration_pb2, timestamp_pb2
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+
+    file = FileDescriptorProto(name="t.proto", package="t", syntax="proto3")
+    file.dependency.extend([timestamp_pb2.DESCRIPTOR.name, duration_pb2.DESCRIPTOR.name])
+    kind = file.enum_type.add(name="Kind")
+    kind.value.add(name="NONE", number=0)
+    kind.value.add(name="SOME", number=5)
+    message = file.message_type.add(name="All")
+    entry = message.nested_type.add(name="MapEntry")
+    entry.options.map_entry = True
+    entry.field.add(name="key", number=1, type=Field.TYPE_STRING, label=1)
+    entry.field.add(name="value", number=2, type=Field.TYPE_INT32, label=1)
+    simple = "double float int32 int64 uint32 uint64 bool string bytes sint64 fixed32 sfixed32"
+    number = 0
+    for name in simple.split():
+        for label in (1, 3):
+            number += 1
+            message.field.add(
+                name=f"{name}_{label}",
+                number=number,
+                type=getattr(Field, f"TYPE_{name.upper()}"),
+                label=label,
+            )
+    for name, type_name, label in (
+        ("stamp", ".google.protobuf.Timestamp", 1),
+        ("took", ".google.protobuf.Duration", 1),
+        ("unset", ".google.protobuf.Duration", 1),
+        ("child", ".t.All", 1),
+        ("children", ".t.All", 3),
+        ("map", ".t.All.MapEntry", 3),
+    ):
+        number += 1
+        message.field.add(
+            name=name, number=number, type=Field.TYPE_MESSAGE, type_name=type_name, label=label
+        )
+    message.field.add(
+        name="kind", number=number + 1, type=Field.TYPE_ENUM, type_name=".t.Kind", label=1
+    )
+    message.field.add(name="_id", number=number + 2, type=Field.TYPE_INT32, label=1)
+    # Timestamp comes with the set, Duration is left out as some writers do; order reversed.
+    files = FileDescriptorSet(file=[file])
+    files.file.add().ParseFromString(timestamp_pb2.DESCRIPTOR.serialized_pb)
+    return Channel("/p", "protobuf", Schema("t.All", "protobuf", files.SerializeToString()))
+
+
+def test_protobuf_rules() -> None:
+    pytest.importorskip("mcap_protobuf")
+    codec = codec_for(protobuf_channel())
+    assert codec.indexed, codec.reason
+    made: Any = type(codec.decode(b""))
+    message = made(
+        double_1=-0.0,
+        float_1=0.5,
+        int32_1=-3,
+        int64_1=4,
+        uint32_1=(1 << 32) - 1,
+        uint64_1=(1 << 64) - 1,
+        bool_1=True,
+        string_1="ü",
+        bytes_1=b"abc",
+        double_3=[1.0] * 33,
+        uint64_3=[1, 1 << 63] * 20,
+        bool_3=[True] * 33,
+        string_3=["x"] * 33,
+        bytes_3=[b"", b"ab"],
+        kind=5,
+        _id=9,
+    )
+    message.stamp.seconds, message.stamp.nanos = 1_700_000_000, 5
+    message.took.seconds, message.took.nanos = -1, -500
+    message.child.int32_1 = 8
+    message.children.add().int64_3.extend([1, 2])
+    message.map["b"] = 1
+    message.map["a"] = 2
+    payload = message.SerializeToString()
+    found = codec.fields(payload)
+    assert found["stamp"] == 1_700_000_000_000_000_005
+    assert type(found["stamp"]) is Int64
+    assert found["took"] == -1_000_000_500
+    assert "unset" not in found
+    assert (found["int32_1"], type(found["int32_1"])) == (-3, int)
+    assert (found["uint32_1"], type(found["uint32_1"])) == ((1 << 32) - 1, Int64)
+    assert (found["uint64_1"], type(found["uint64_1"])) == (float(1 << 64), float)
+    assert found["bytes_1"] == {"n": 3}
+    assert found["bytes_3"] == [{"n": 0}, {"n": 2}]
+    assert found["double_3"] == {"n": 33, "min": 1.0, "max": 1.0, "mean": 1.0}
+    assert found["uint64_3"] == {"n": 40, "min": 1, "max": 2.0**63, "mean": 2.0**62}
+    assert type(found["uint64_3"]["max"]) is float  # type: ignore[index]
+    assert type(found["uint64_3"]["min"]) is Int64  # type: ignore[index]
+    assert found["bool_3"] == {"n": 33, "min": 1, "max": 1, "mean": 1.0}
+    assert found["string_3"] == {"n": 33}
+    assert found["map"] == {"a": 2, "b": 1}
+    assert list(found["map"]) == ["a", "b"]  # type: ignore[call-overload]
+    assert found["kind"] == 5
+    assert found["_id_"] == 9
+    assert math.copysign(1, found["double_1"]) == -1  # type: ignore[call-overload]
+    assert found["child"]["int32_1"] == 8  # type: ignore[index]
+    assert found["children"][0]["int64_3"] == [1, 2]  # type: ignore[index]
+    (body, broken) = bodies_of(codec, [payload, b"\xff\xff"])
+    assert document_of(body) == bson.encode(found)  # type: ignore[arg-type]
+    assert "t.All" in str(broken)
+    with pytest.raises(PayloadError):
+        codec.decode(b"\xff\xff")
+    types = {p.path: p.type for p in codec.paths()}
+    assert types["stamp"] == "time"
+    assert types["double_3"] == "float64[]"
+    assert types["child"] == "t.All"
+    assert "child.child" not in types
+    assert types["_id_"] == "int32"
+    decoded = codec.columns(*joined([payload, b""]), {"stamp", "double_3", "int32_1"})
+    fields = decoded.records.fields
+    assert isinstance(fields["stamp"], Scalars)
+    assert fields["stamp"].kind == "time"
+    assert fields["stamp"].values.tolist() == [1_700_000_000_000_000_005, 0]
+    assert isinstance(fields["double_3"], Arrays)
+    assert fields["double_3"].offset.tolist() == [0, 33, 33]
+
+
+@needs_data
+@pytest.mark.parametrize("file", ["odd/protobuf.mcap", "odd/foxglove_log.mcap"])
+def test_protobuf_of_real_logs(file: str) -> None:
+    pytest.importorskip("mcap_protobuf")
+    from google.protobuf.json_format import MessageToDict
+
+    seen = 0
+    for channel, payloads in few_messages_of(DATA / file).items():
+        if channel.message_encoding != "protobuf":
+            continue
+        codec = codec_for(channel)
+        assert codec.indexed, codec.reason
+        for payload in payloads:
+            fields = codec.fields(payload)
+            message: Any = codec.decode(payload)
+            mapped = MessageToDict(
+                message, preserving_proto_field_name=True, use_integers_for_enums=True
+            )
+            time = message.timestamp
+            assert fields["timestamp"] == time.seconds * 10**9 + time.nanos
+            for name, value in mapped.items():
+                if name != "timestamp":
+                    agrees(fields[name], value)
+            seen += 1
+        assert {p.path for p in codec.paths()} >= {"timestamp"}
+    assert seen > 0
+
+
+def agrees(ours: Any, theirs: Any) -> None:
+    """MessageToDict leaves out what has its default value."""
+    if isinstance(theirs, dict):
+        for name, value in theirs.items():
+            agrees(ours[name], value)
+    else:
+        assert ours == theirs
+
+
+def test_protobuf_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "google.protobuf.descriptor_pool", None)
+    schema = Schema("t.Unseen", "protobuf", b"\x0a\x00")
+    codec = codec_for(Channel("/p", "protobuf", schema))
+    assert not codec.indexed
+    assert "pip install 'hybridlog[protobuf]'" in str(codec.reason)
+
+
+def test_rosbags_own_errors_are_mapped() -> None:
+    assert issubclass(SerdeError, Exception)
+    codec = codec_for(Channel("/t", "cdr", Schema("p/msg/T", "ros2msg", b"string s")))
+    with pytest.raises(PayloadError):
+        codec.decode(b"\0\x07\0\0abc")
+    with pytest.raises(PayloadError):
+        codec.decode(b"")

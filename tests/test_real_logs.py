@@ -1,0 +1,177 @@
+"""Real logs go in, and come back byte for byte: compared with other people's readers."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hybridlog_storage.errors import AlreadyRecordedError, SourceError
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+import hybridlog as hl
+from tests import independent
+from tests.data import DATA, needs_data
+
+pytestmark = needs_data
+
+WHOLE = [
+    *(f"real/{n}" for n in (
+        "leg_tracker_negative_2.bag",
+        "leg_tracker_stationary.bag",
+        "leg_tracker_positive_7.bag",
+        "robot_localization_test1.bag",
+        "robot_localization_test3.bag",
+        "tilt_laser.bag",
+        "sick_laser_radar.bag",
+        "luminar_pointcloud.bag",
+        "pointcloud_4mb.bag",
+        "ouster.mcap",
+        "compressed_image.bag",
+        "auv_ros2.mcap",
+        "auv_ros2_db3",
+    )),
+    *(f"odd/{n}" for n in (
+        "example.bag",
+        "example-bz2.bag",
+        "example-lz4.bag",
+        "example-unsorted-chunks.bag",
+        "no-messages.bag",
+        "empty_msgs.bag",
+        "array_test.bag",
+        "every_sensor_msg_ros2.mcap",
+        "protobuf.mcap",
+        "foxglove_log.mcap",
+    )),
+    *(f"odd/rosbag2/{n}" for n in (
+        "topics_and_services.mcap",
+        "topics_and_services.db3",
+        "talker.mcap",
+        "talker_db3",
+        "wrong_rmw_test.db3",
+        "empty_bag_0.db3",
+        "split_mcap",
+    )),
+]  # fmt: skip
+DAMAGED = {
+    # name: (source that was damaged, messages that must be read, least places of damage)
+    "tilt_trunc60.bag": ("real/tilt_laser.bag", 2469, 1),
+    "luminar_lz4_bitflip.bag": ("real/luminar_pointcloud.bag", 14, 1),
+    "husky.bag.active": (None, 12303, 0),
+    "tilt_chunksize_lie.bag": ("real/tilt_laser.bag", 4093, 1),
+    "auv_trunc60.mcap": ("real/auv_ros2.mcap", 11421, 1),
+    "auv_no_summary.mcap": ("real/auv_ros2.mcap", 18558, 1),
+    "auv_huge_record_len.mcap": ("real/auv_ros2.mcap", 18558, 1),
+    "ouster_zstd_bitflip.mcap": ("real/ouster.mcap", 100, 1),
+    "lidar_trunc50.db3": (None, 217, 1),
+}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("real") / "store", create=True) as opened:
+        assert opened.database is not None, opened.without_database
+        yield opened
+
+
+def fetched(store: hl.Store, recording: str) -> list[independent.Seen]:
+    topics = {c.topic for r in store.recordings() if r.id == recording for c in r.channels}
+    if not topics:
+        return []
+    return [
+        independent.Seen(m.topic, m.log_time_ns, m.raw)
+        for m in store.query(sorted(topics), [recording])
+    ]
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_every_message_comes_back(store: hl.Store, name: str) -> None:
+    report = store.record(DATA / name, name=name.replace("/", "-"))
+    assert not report.damage
+    assert report.missed == 0
+    got = fetched(store, report.entry.id)
+    want = independent.read(DATA / name)
+    assert Counter(got) == Counter(want)
+    times = [m.log_time for m in got]
+    assert times == sorted(times)
+    assert report.entry.messages == report.indexed == len(want)
+    by_topic = Counter(m.topic for m in want)
+    for topic, count in by_topic.items():
+        assert store.query([topic], [report.entry.id]).count() == count
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_logs_give_what_can_be_read(store: hl.Store, name: str) -> None:
+    origin, messages, places = DAMAGED[name]
+    report = store.record(DATA / "damaged" / name, name=f"damaged-{name}")
+    assert report.entry.messages == messages
+    assert len(report.damage) >= places
+    assert report.entry.status == ("damaged" if places else "complete")
+    for damage in report.damage:
+        assert damage.reason
+    got = Counter(fetched(store, report.entry.id))
+    assert got.total() == messages
+    if origin is not None:
+        assert not got - Counter(independent.read(DATA / origin))
+
+
+@pytest.mark.parametrize("name", ["odd/empty-file.bag", "damaged/magic_only.bag", "CATALOGUE.md"])
+def test_what_is_no_log_leaves_nothing(store: hl.Store, name: str) -> None:
+    before = store.directory.recording_ids()
+    with pytest.raises(SourceError, match=Path(name).name):
+        store.record(DATA / name)
+    assert store.directory.recording_ids() == before
+
+
+def test_the_same_file_is_noticed(store: hl.Store) -> None:
+    with pytest.raises(AlreadyRecordedError, match="real-tilt_laser"):
+        store.record(DATA / "real/tilt_laser.bag")
+    report = store.record(DATA / "real/tilt_laser.bag", again=True, name="twice")
+    assert report.entry.messages == 4093
+    store.remove("twice")
+    assert "twice" not in store.directory.recording_ids()
+
+
+def test_segments_pass_the_official_readers(store: hl.Store) -> None:
+    for recording in store.directory.recording_ids():
+        counted = 0
+        for _, path in store.directory.segments(recording):
+            data = path.read_bytes()
+            list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
+            reader = make_reader(io.BytesIO(data), validate_crcs=True)
+            counted += sum(1 for _ in reader.iter_messages())
+        (entry,) = (r for r in store.recordings() if r.id == recording)
+        assert counted == entry.messages
+
+
+def dump(store: hl.Store) -> dict[str, list[bytes]]:
+    """Everything in the database, as bytes."""
+    assert store.database is not None
+    return {
+        name: sorted(
+            document
+            for raw in store.database.find_raw(name)
+            for document in split_documents(raw)
+        )
+        for name in store.database.list_collections()
+    }
+
+
+def split_documents(raw: bytes) -> list[bytes]:
+    found, at = [], 0
+    while at < len(raw):
+        size = int.from_bytes(raw[at : at + 4], "little")
+        found.append(raw[at : at + size])
+        at += size
+    return found
+
+
+def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> None:
+    assert store.verify().findings == []
+    before = dump(store)
+    assert sum(map(len, before.values())) > 150_000
+    store.reindex()
+    assert dump(store) == before
