@@ -180,7 +180,7 @@ class Robot:
                 commands.append(GripperCommand(start + 3.0, 0.0, 75.0, _OBJECT_WIDTH))
             elif stop.kind == "pick":
                 commands.append(GripperCommand(start + 0.8, 0.0, 50.0, _OBJECT_WIDTH))
-            elif stop.kind in {"place", "dock"} and start > 0:
+            elif stop.kind in {"place", "dock"}:
                 commands.append(GripperCommand(start + 0.8, GRIPPER_OPEN, -1.0, GRIPPER_OPEN))
         return [c for c in commands if c.seconds < self.duration_s]
 

@@ -42,7 +42,7 @@ class Check:
     Attributes:
         fact: Key in the simulation's truth (`BagSummary.truth`).
         reading: `number`: the output is that number. `lines`: it has so many lines.
-        said: The fact in words, for the line that confirms it.
+        said: What is counted, in words.
     """
 
     fact: Literal["gripper_closings", "near_scans", "errors"]
@@ -115,13 +115,13 @@ def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> t
                 "--count",
                 *store,
             ),
-            Check("gripper_closings", "number", "closed the gripper {n} times"),
+            Check("gripper_closings", "number", "gripper closings"),
         ),
         Step(
             "How many scans saw something nearer than half a metre?",
             "hybridlog",
             ("fetch", "--topic", "scan", "--where", "ranges.min < 0.5", "--count", *store),
-            Check("near_scans", "number", "scanned {n} times with something that near"),
+            Check("near_scans", "number", "near scans"),
         ),
         Step(
             "Which errors did the diagnostics report?",
@@ -138,7 +138,7 @@ def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> t
                 "jsonl",
                 *store,
             ),
-            Check("errors", "lines", "reported errors {n} times"),
+            Check("errors", "lines", "messages with an error"),
         ),
         Step(
             "One second of the laser, as numpy arrays in a file",
@@ -264,10 +264,12 @@ def _confirm(step: Step, check: Check, directory: Path, output: str) -> int:
         _complain(f"{directory / TRUTH} cannot be read: {error}")
         return _MISMATCH
     if answer != expected:
-        said = check.said.format(n=expected)
-        _complain(f"wrong answer to `{step.shown}`: {output.strip()!r}, but the robot {said}")
+        _complain(
+            f"wrong answer to `{step.shown}`: {output.strip()!r},"
+            f" but the simulation counted {check.said}: {expected}"
+        )
         return _MISMATCH
-    _say(f"(right: the simulated robot {check.said.format(n=expected)})\n")
+    _say(f"(as the simulation counted, {check.said}: {expected})\n")
     return 0
 
 

@@ -234,7 +234,7 @@ def test_ros2_says_the_same(tmp_path: Path, storage: Any) -> None:
         assert a.header.stamp.nanosec == b.header.stamp.nanosec
     a, b = first["/lidar/points"][0][1], second["/lidar/points"][0][1]
     assert np.array_equal(a.data, b.data)
-    assert [m.level for _, m in second["/rosout"]] == [20]
+    assert [m.level for _, m in second["/rosout"]] == [20, 20]
 
 
 def test_ros2_mcap_opens_in_the_mcap_reader(tmp_path: Path) -> None:
