@@ -114,7 +114,7 @@ def accommodate(current: Accumulator, column: Column) -> Accumulator:
     everything else becomes text. `current` is empty afterwards.
     """
     # Text conversion and unification are Arrow's; it is loaded only when they happen.
-    from hybridlog.frames.arrow import as_chunked, as_text  # noqa: PLC0415
+    from hybridlog.frames.arrow import as_chunked, as_text
 
     held = as_chunked(current.finish())
     if isinstance(column, Arrays) and _is_list(held):
@@ -126,7 +126,7 @@ def accommodate(current: Accumulator, column: Column) -> Accumulator:
 
 
 def _is_list(values: pa.ChunkedArray[Any]) -> bool:
-    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow as pa
 
     kind = values.type
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
@@ -198,7 +198,7 @@ class _Strings:
             strings = repaired(column)
             self._rows.append(strings.data, strings.offset)
             return
-        from hybridlog.frames.arrow import array_of, as_text  # noqa: PLC0415
+        from hybridlog.frames.arrow import array_of, as_text
 
         self.append_text(as_text(array_of(column)))
 
@@ -265,17 +265,17 @@ class _Nested:
         return isinstance(column, Arrays)
 
     def append(self, column: Column) -> None:
-        from hybridlog.frames.arrow import array_of  # noqa: PLC0415
+        from hybridlog.frames.arrow import array_of
 
         self._pieces.append(array_of(column))
 
     def skip(self, rows: int) -> None:
-        import pyarrow as pa  # noqa: PLC0415
+        import pyarrow as pa
 
         self._pieces.append(pa.nulls(rows))
 
     def finish(self) -> Nested | Text:
-        from hybridlog.frames.arrow import as_text, unified  # noqa: PLC0415
+        from hybridlog.frames.arrow import as_text, unified
 
         pieces, self._pieces = self._pieces, []
         together = unified(pieces)

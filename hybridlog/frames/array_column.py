@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import builtins
 import operator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import pandas as pd
@@ -71,7 +71,7 @@ class ArrayDtype(ExtensionDtype):
 
     def __from_arrow__(self, array: pa.Array[Any] | pa.ChunkedArray[Any]) -> ArrayColumn:
         """A column out of an Arrow column of lists."""
-        import pyarrow.compute as pc  # noqa: PLC0415
+        import pyarrow.compute as pc
 
         chunks = getattr(array, "chunks", None)
         pieces = []
@@ -156,6 +156,15 @@ class ArrayColumn(ExtensionArray):
         for place, cell in enumerate(self):
             keys[place] = None if cell is None else cell.tobytes()
         return keys, None
+
+    def duplicated(self, keep: Literal["first", "last", False] = "first") -> NDArray[np.bool_]:
+        """Which rows have the elements of another; by their bytes."""
+        keys = pd.Series(self._values_for_factorize()[0])
+        return keys.duplicated(keep=keep).to_numpy(bool)
+
+    def unique(self) -> Self:
+        """The first of each set of equal rows."""
+        return type(self)(self.rows.take(~self.duplicated()))
 
     def _values_for_argsort(self) -> NDArray[Any]:
         raise TypeError("arrays have no order; sort by another column")
@@ -353,8 +362,8 @@ class ArrayColumn(ExtensionArray):
 
     def __arrow_array__(self, type: pa.DataType | None = None) -> pa.ChunkedArray[Any]:  # noqa: A002
         """An Arrow column of lists."""
-        from hybridlog.frames.accumulate import Lists  # noqa: PLC0415
-        from hybridlog.frames.arrow import lists  # noqa: PLC0415
+        from hybridlog.frames.accumulate import Lists
+        from hybridlog.frames.arrow import lists
 
         kinds = {"M": "time", "m": "duration"}
         rows = self.rows

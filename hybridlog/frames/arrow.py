@@ -176,7 +176,14 @@ def unified(pieces: list[pa.Array[Any]]) -> pa.ChunkedArray[Any] | None:
     """
     if not pieces:
         return pa.chunked_array([pa.nulls(0)])
-    kinds = []
+    together = _cast_alike(pieces)
+    if together is None:
+        together = _cast_alike([_without_empty_type(piece) for piece in pieces])
+    return together
+
+
+def _cast_alike(pieces: list[pa.Array[Any]]) -> pa.ChunkedArray[Any] | None:
+    kinds: list[pa.DataType] = []
     for piece in pieces:
         if piece.type not in kinds:
             kinds.append(piece.type)
@@ -188,6 +195,14 @@ def unified(pieces: list[pa.Array[Any]]) -> pa.ChunkedArray[Any] | None:
         return pa.chunked_array([piece.cast(kind) for piece in pieces], type=kind)
     except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError):
         return None
+
+
+def _without_empty_type(piece: pa.Array[Any]) -> pa.Array[Any]:
+    """Lists that are all empty as lists of nothing: their type was an accident."""
+    if not pa.types.is_list(piece.type) or len(piece.flatten()):
+        return piece
+    missing = piece.is_null().to_numpy(zero_copy_only=False)
+    return _list(pa.list_(pa.null()), pa.nulls(0), np.zeros(len(piece) + 1, np.int64), missing)
 
 
 def as_text(

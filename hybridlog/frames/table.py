@@ -98,7 +98,7 @@ class TableBuilder:
         Raises:
             RuntimeError: The table was handed over already.
         """
-        from hybridlog.frames.arrow import table_of  # noqa: PLC0415
+        from hybridlog.frames.arrow import table_of
 
         time, order = self._sorted()
 
@@ -127,7 +127,7 @@ class TableBuilder:
         Raises:
             RuntimeError: The table was handed over already.
         """
-        from hybridlog.frames.frame import frame_of  # noqa: PLC0415
+        from hybridlog.frames.frame import frame_of
 
         time, order = self._sorted()
         return frame_of(time, self._finish(order))
@@ -149,7 +149,7 @@ class TableBuilder:
         return time[order], order
 
     def _finish(self, order: NDArray[np.intp] | None) -> Iterator[tuple[str, Finished]]:
-        from hybridlog.frames.arrow import take  # noqa: PLC0415
+        from hybridlog.frames.arrow import take
 
         while self._columns:
             path = next(iter(self._columns))

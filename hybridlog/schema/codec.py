@@ -168,7 +168,7 @@ def _codec(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
 
 def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
     if encoding == "json":
-        from hybridlog.schema.json_codec import JsonCodec  # noqa: PLC0415
+        from hybridlog.schema.json_codec import JsonCodec
 
         return JsonCodec(array_limit)
     if encoding not in {"ros1", "cdr", "protobuf"}:
@@ -178,11 +178,11 @@ def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
         named = "" if schema is None or not schema.name else f"{schema.name}: "
         return OpaqueCodec(f"{named}no definition in the source")
     if (encoding, schema.encoding) in _ROS:
-        from hybridlog.schema.ros_codec import RosCodec  # noqa: PLC0415
+        from hybridlog.schema.ros_codec import RosCodec
 
         return RosCodec(schema, "ros1" if encoding == "ros1" else "cdr", array_limit)
     if (encoding, schema.encoding) == ("protobuf", "protobuf"):
-        from hybridlog.schema.protobuf_codec import ProtobufCodec  # noqa: PLC0415
+        from hybridlog.schema.protobuf_codec import ProtobufCodec
 
         return ProtobufCodec(schema, array_limit)
     return OpaqueCodec(

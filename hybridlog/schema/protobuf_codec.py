@@ -124,7 +124,7 @@ class ProtobufCodec:
         )
 
     def _parsed(self, payload: memoryview) -> Message:
-        from google.protobuf.message import DecodeError  # noqa: PLC0415
+        from google.protobuf.message import DecodeError
 
         message = self._class()
         try:
@@ -148,9 +148,9 @@ class ProtobufCodec:
 
 def _message_class(schema: Schema) -> type[Message]:
     try:
-        from google.protobuf.descriptor_pool import DescriptorPool  # noqa: PLC0415
-        from google.protobuf.message import DecodeError  # noqa: PLC0415
-        from google.protobuf.message_factory import GetMessageClass  # noqa: PLC0415
+        from google.protobuf.descriptor_pool import DescriptorPool
+        from google.protobuf.message import DecodeError
+        from google.protobuf.message_factory import GetMessageClass
     except ImportError as error:
         raise DefinitionError(
             f"{schema.name}: protobuf is stored and fetched, and indexed once "
@@ -175,7 +175,7 @@ def _message_class(schema: Schema) -> type[Message]:
 
 def _fill(pool: DescriptorPool, data: bytes) -> None:
     """Adds all files of a set to a pool, each after the files that it imports."""
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: PLC0415
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     waiting = {file.name: file for file in FileDescriptorSet.FromString(data).file}
     added: set[str] = set()
@@ -195,7 +195,7 @@ def _fill(pool: DescriptorPool, data: bytes) -> None:
 
 def _fill_standard(pool: DescriptorPool, name: str) -> None:
     """Adds one of protobuf's own files, which some writers leave out."""
-    from google.protobuf import duration_pb2, timestamp_pb2  # noqa: PLC0415
+    from google.protobuf import duration_pb2, timestamp_pb2
 
     for module in (duration_pb2, timestamp_pb2):
         if module.DESCRIPTOR.name == name:

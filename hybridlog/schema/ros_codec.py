@@ -138,8 +138,8 @@ class RosObjects:
     """
 
     def __init__(self, message_type: MessageType, wire: Literal["ros1", "cdr"]) -> None:
-        from rosbags.typesys import TypesysError  # noqa: PLC0415
-        from rosbags.typesys.store import Typestore  # noqa: PLC0415
+        from rosbags.typesys import TypesysError
+        from rosbags.typesys.store import Typestore
 
         self._wire = wire
         self._label = message_type.name
@@ -163,7 +163,7 @@ class RosObjects:
         """
         view = memoryview(payload)
         read = self._store.deserialize_ros1 if self._wire == "ros1" else self._store.deserialize_cdr
-        from rosbags.serde import SerdeError  # noqa: PLC0415
+        from rosbags.serde import SerdeError
 
         try:
             return read(view, self._name)
@@ -219,7 +219,7 @@ class _Typesdict:
         return self._names[instant]
 
     def _describe(self, field: FieldType) -> FieldDesc:
-        from rosbags.interfaces import Nodetype  # noqa: PLC0415
+        from rosbags.interfaces import Nodetype
 
         if isinstance(field, Primitive):
             return _base(field.dtype.name)
@@ -232,7 +232,7 @@ class _Typesdict:
         return self._describe_array(field)
 
     def _describe_array(self, field: ArrayOf) -> FieldDesc:
-        from rosbags.interfaces import Nodetype  # noqa: PLC0415
+        from rosbags.interfaces import Nodetype
 
         if field.width is not None and not isinstance(field.element, Primitive):
             self._unrolled += field.width
@@ -247,7 +247,7 @@ class _Typesdict:
 
 
 def _base(name: str) -> FieldDesc:
-    from rosbags.interfaces import Nodetype  # noqa: PLC0415
+    from rosbags.interfaces import Nodetype
 
     return cast("FieldDesc", (Nodetype.BASE, (name, 0)))
 

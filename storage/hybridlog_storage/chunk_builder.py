@@ -8,8 +8,8 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from hybridlog_storage.copying import copy_payloads, windows
+from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.segment_format import MESSAGE_HEAD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -90,7 +90,7 @@ class ChunkBuilder:
     def _lay_heads(self, batch: Batch, starts: NDArray[np.int64]) -> None:
         heads = np.empty(len(batch), MESSAGE_HEAD)
         heads["opcode"] = int(Opcode.MESSAGE)
-        heads["size"] = batch.length + (_HEAD - 9)
+        heads["length"] = batch.length + (_HEAD - 9)
         heads["channel"] = batch.channel
         heads["sequence"] = batch.sequence
         heads["log_time"] = batch.log_time

@@ -411,6 +411,23 @@ class _Places:
         return fields is not None and fields.end == offset + self._lengths[offset]
 
 
+def _is_other_record(content: memoryview) -> bool:
+    """Whether the content of a message record is, to the last byte, that of another kind.
+
+    Where chunks are, messages outside of them are rare, but one wrong byte can turn any
+    record between two chunks into one; no checksum covers those.
+    """
+    for opcode in (Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT):
+        try:
+            record, used = read_record(opcode, content)
+        except SegmentError:
+            continue
+        if used == len(content):
+            entries = record.records if isinstance(record, records.MessageIndex) else []
+            return all(offset < MAX_UNCOMPRESSED for _, offset in entries)
+    return False
+
+
 class _Scanner:
     """The state of one scan."""
 
@@ -426,7 +443,7 @@ class _Scanner:
         # the next one is to be searched from here on, not from where the length led.
         self._behind = start
         self._summary_start = self._footer.summary_start if self._footer and summary else None
-        self._chunked = False
+        self._chunked = bool(summary and summary.chunk_indexes)
         self._in_data = True
         self._crc: int | None = None
         if start == len(MAGIC) and self._data_crc() not in {None, 0}:
@@ -477,6 +494,10 @@ class _Scanner:
             yield at, ScanDamage(at, _HEAD, reason, 0)
             self._crc = None
             yield from self._chunk(at, at + (indexed or 0))
+        elif self._hides_chunk(at, opcode, length):
+            yield at, ScanDamage(at, _HEAD, f"a chunk record is marked as of kind {opcode}", 0)
+            self._crc = None
+            yield from self._chunk(at, at + _HEAD + length)
         elif not self._in_data:
             yield from self._summary_record(at, opcode, length)
         elif opcode == Opcode.CHUNK:
@@ -492,6 +513,19 @@ class _Scanner:
         if indexed is None or (opcode, length + _HEAD) == (Opcode.CHUNK, indexed):
             return False
         return _HEAD < indexed <= self._window.size - at and self._places.believed()
+
+    def _hides_chunk(self, at: int, opcode: int, length: int) -> bool:
+        """Whether only the opcode is what keeps a record from being a chunk.
+
+        Message indexes are no suspects, there are too many; private records may look as
+        they like.
+        """
+        if not self._in_data or opcode in {Opcode.CHUNK, Opcode.MESSAGE_INDEX}:
+            return False
+        if opcode >= _FIRST_PRIVATE or length < _LEAST[Opcode.CHUNK]:
+            return False
+        fields = _chunk_head(self._window, at)
+        return fields is not None and fields.end == at + _HEAD + length <= self._window.size
 
     # Chunks
 
@@ -562,12 +596,17 @@ class _Scanner:
             self._at = self._behind = end
             yield at, self._too_large(at, end, Opcode.MESSAGE)
             return
-        self._window.at(at, end - at)
+        content = self._window.at(at, end - at)[_HEAD:]
+        if self._chunked and _is_other_record(content):
+            self._at = self._behind = end
+            self._crc = None
+            yield at, ScanDamage(at, end - at, "a record is marked as a message but is none", 0)
+            return
         until = self._places.next(at) if self._places.believed() else None
         run = self._window.rest(at)[: None if until is None else until - at]
-        content = parse_content(run, messages_only=True)
-        self._at, self._behind = at + content.end, at + content.end
-        yield at, Loose(content, at)
+        found = parse_content(run, messages_only=True)
+        self._at = self._behind = at + found.end
+        yield at, Loose(found, at)
 
     # Everything else
 
@@ -616,8 +655,8 @@ class _Scanner:
 
     def _ends_data(self, end: int) -> bool:
         """Whether the summary, or the end of the file, is what follows."""
-        if end in {self._window.size, self._summary_start}:
-            return True
+        if self._summary_start is not None:
+            return end == self._summary_start
         raw = self._window.peek(end, _HEAD)
         if len(raw) < _HEAD:
             return True
@@ -757,7 +796,9 @@ class _Scanner:
         return at == self._window.size or self._weight(at) is not None
 
     def _swallows(self, at: int, end: int) -> bool:
-        """Whether a record would cover the start of a chunk that is known to be there."""
+        """Whether a record would cover the start of a chunk, or of the summary."""
+        if self._summary_start is not None and at < self._summary_start < end:
+            return True
         known = self._places.next(at)
         return known is not None and known < end and self._places.believed()
 

@@ -19,6 +19,7 @@ from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage import durability
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
 from hybridlog_storage.mcap_scan import (
     PrivateRecord,
     ScanDamage,
@@ -30,8 +31,6 @@ from hybridlog_storage.messages import Batch
 from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
     END_METADATA,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
     RECORDING_METADATA,
     arrival_record,
     arrivals_of,

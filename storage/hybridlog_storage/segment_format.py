@@ -23,7 +23,9 @@ from mcap.records import McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import Buffer, Channel, Schema
+from hybridlog_storage.copying import windows
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
+from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,20 +42,9 @@ NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: arrival numbers of a chunk's messages."""
 
-RECORD_HEAD: Final = struct.Struct("<BQ")
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
-
-MESSAGE_HEAD: Final = np.dtype(
-    {
-        "names": ["opcode", "size", "channel", "sequence", "log_time", "publish_time"],
-        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-        "offsets": [0, 1, 9, 11, 15, 23],
-        "itemsize": 31,
-    }
-)
-"""Everything of a message record that stands before its payload."""
 
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _MAX_ARRIVALS = 1 << 27
@@ -197,3 +188,59 @@ def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
         raise SegmentError(f"arrival numbers of {len(raw) // 8} messages, {count} expected")
     (chunk_offset,) = struct.unpack_from("<Q", body)
     return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8")).astype(np.int64)
+
+
+def message_starts(trailer: Buffer) -> NDArray[np.int64]:
+    """Where the message records of a chunk start in it, ascending, by its message indexes.
+
+    Args:
+        trailer: The message index records, and the record of arrival numbers.
+
+    Returns:
+        int64[n]; unchecked: an index has no checksum of its own.
+    """
+    view = memoryview(trailer)
+    found: list[NDArray[np.int64]] = []
+    at = 0
+    while at + INDEX_HEAD.size <= len(view):
+        opcode, length, _, size = INDEX_HEAD.unpack_from(view, at)
+        if opcode != Opcode.MESSAGE_INDEX or size + 6 != length or size % _INDEX_ENTRY.itemsize:
+            break
+        start = at + INDEX_HEAD.size
+        if start + size > len(view):
+            break
+        entries = np.frombuffer(view[start : start + size], _INDEX_ENTRY)
+        found.append(entries["offset"].astype(np.int64))
+        at = start + size
+    return np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
+
+
+def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
+    """The messages of a chunk of ours, given where their records start.
+
+    Args:
+        content: The uncompressed chunk.
+        starts: int64[n], ascending.
+
+    Returns:
+        None when the records do not follow one another from the first byte of the
+        content to the last, that is, when `starts` cannot be right.
+    """
+    if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
+        return None
+    heads = windows(content, MESSAGE_HEAD.itemsize)[starts].view(MESSAGE_HEAD)
+    sizes = heads["length"].astype(np.int64)
+    ends = starts + sizes + RECORD_HEAD.size
+    whole = bool((heads["opcode"] == int(Opcode.MESSAGE)).all())
+    whole = whole and bool((ends[:-1] == starts[1:]).all()) and int(ends[-1]) == len(content)
+    if not whole or bool((sizes < MESSAGE_HEAD.itemsize - RECORD_HEAD.size).any()):
+        return None
+    return Batch(
+        content,
+        starts + MESSAGE_HEAD.itemsize,
+        sizes - (MESSAGE_HEAD.itemsize - RECORD_HEAD.size),
+        heads["channel"].astype(np.int32),
+        heads["log_time"].astype(np.int64),
+        heads["publish_time"].astype(np.int64),
+        heads["sequence"].astype(np.uint32),
+    )

@@ -25,7 +25,7 @@ from hybridlog_storage.mcap_scan import (
     parse_content,
     read_summary,
 )
-from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.messages import Buffer, Channel
 from hybridlog_storage.segment_format import (
     ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
@@ -36,6 +36,8 @@ from hybridlog_storage.segment_format import (
     arrivals_of,
     channel_of,
     json_of,
+    message_starts,
+    messages_at,
 )
 from hybridlog_storage.segment_writer import StoredChunk
 
@@ -161,11 +163,15 @@ class SegmentReader:
         """
         data = self._read(place.offset, place.length + max(place.trailer, 0))
         try:
-            batch, compressed = open_chunk(memoryview(data)[: place.length])
+            content, compressed = open_chunk(memoryview(data)[: place.length])
             if place.trailer >= 0:
                 trailer = memoryview(data)[place.length :]
             else:
                 trailer = memoryview(self._trailer(place))
+            # The indexes say where messages start; walking the records is the slow way.
+            batch = messages_at(content, message_starts(trailer))
+            if batch is None:
+                batch = parse_content(content).batch
             seq = _arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
             raise SegmentError(
@@ -221,8 +227,8 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
         )
 
 
-def open_chunk(record: memoryview) -> tuple[Batch, int]:
-    """The messages of a whole chunk record, checksum verified, and its compressed size.
+def open_chunk(record: memoryview) -> tuple[Buffer, int]:
+    """The content of a whole chunk record, checksum verified, and its compressed size.
 
     Raises:
         SegmentError: it is no chunk record, or damaged.
@@ -242,7 +248,7 @@ def open_chunk(record: memoryview) -> tuple[Batch, int]:
     content = decompress(compression, record[at:], size)
     if zlib.crc32(content) != crc:
         raise SegmentError("its checksum differs")
-    return parse_content(content).batch, len(record) - at
+    return content, len(record) - at
 
 
 def _arrivals(trailer: memoryview, chunk_offset: int, count: int) -> NDArray[np.int64]:

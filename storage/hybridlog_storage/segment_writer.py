@@ -40,14 +40,13 @@ from hybridlog_storage import durability
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.segment_format import (
     FORMAT_VERSION,
     LIBRARY,
     MAGIC,
-    MESSAGE_HEAD,
     PROFILE,
-    RECORD_HEAD,
     RECORDING_METADATA,
     arrival_record,
     channel_record,

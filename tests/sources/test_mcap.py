@@ -336,6 +336,26 @@ def test_any_changed_byte_gives_no_wrong_payload_and_is_counted(
     assert missing == 0 or found.damage
 
 
+@pytest.mark.parametrize("summary", [True, False])
+@pytest.mark.parametrize("name", ["NONE", "ZSTD"])
+def test_a_record_marked_as_another_kind_gives_no_wrong_payload(
+    name: str, put: Callable[[bytes], Path], *, summary: bool
+) -> None:
+    good = VARIANTS[name]
+    wanted = Counter(official(put(good)))
+    places = {o: i for o, i in scan(io.BytesIO(good), size=len(good)) if o < len(good) - 8}
+    end = next(o for o, i in places.items() if isinstance(i, DataEnd))
+    for at in places:
+        for opcode in [*range(16), 0x20, 0x90]:
+            if at < end and opcode != good[at]:
+                bad = bytearray(good if summary else good[:end])
+                bad[at] = opcode
+                found = read(put(bytes(bad)))
+                assert not Counter(found.messages) - wanted, (at, opcode)
+                if summary:
+                    assert sum(x or 0 for x in found.lost) == 12 - len(found.messages), (at, opcode)
+
+
 def test_a_changed_byte_in_the_footer_costs_nothing(put: Callable[[bytes], Path]) -> None:
     good = VARIANTS["ZSTD"]
     wanted = official(put(good))

@@ -1,0 +1,1 @@
+"""Benchmarks of hybridlog: `python -m benchmarks` lists them."""

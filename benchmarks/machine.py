@@ -1,0 +1,89 @@
+"""What a benchmark ran on: a figure without its machine means nothing."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import subprocess
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_PACKAGES = (
+    "hybridlog",
+    "mcap",
+    "numpy",
+    "pandas",
+    "pyarrow",
+    "pymongo",
+    "rosbags",
+    "zstandard",
+)
+
+
+def describe() -> dict[str, object]:
+    """Machine, system, versions, revision and load, as values that JSON can hold."""
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gib": round(_memory_bytes() / 2**30, 1),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "packages": _versions(),
+        "mongod": _mongod_version(),
+        "revision": _revision(),
+        "load_1min": round(os.getloadavg()[0], 2),
+    }
+
+
+def _cpu() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor() or "unknown"
+    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return found[1] if found else platform.processor() or "unknown"
+
+
+def _memory_bytes() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def _mongod_version() -> str:
+    from hybridlog_storage.errors import MissingDependencyError
+    from hybridlog_storage.mongod import find_mongod
+
+    try:
+        program = find_mongod()
+        answer = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
+    except (MissingDependencyError, OSError, subprocess.SubprocessError):
+        return "absent"
+    found = re.search(r"db version v(\S+)", answer.stdout)
+    return found[1] if found else "unknown"
+
+
+def _revision() -> str:
+    """The commit that was measured, with a plus sign when files differ from it."""
+    root = Path(__file__).parents[1]
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--dirty=+"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return answer.stdout.strip()

@@ -1,0 +1,473 @@
+from __future__ import annotations
+
+import builtins
+import io
+import struct
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image as Pillow
+
+from hybridlog.arrays import to_numpy
+from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from tests.data import DATA, needs_data
+
+
+def image(encoding: str, width: int, height: int, data: bytes, **other: Any) -> SimpleNamespace:
+    fields = {"step": len(data) // max(height, 1), "is_bigendian": 0, **other}
+    raw = np.frombuffer(data, np.uint8)
+    return SimpleNamespace(encoding=encoding, width=width, height=height, data=raw, **fields)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "sample", "channels"),
+    [
+        ("mono8", "u1", 1),
+        ("mono16", "u2", 1),
+        ("rgb8", "u1", 3),
+        ("bgr8", "u1", 3),
+        ("rgba8", "u1", 4),
+        ("bgra8", "u1", 4),
+        ("rgb16", "u2", 3),
+        ("bgra16", "u2", 4),
+        ("8UC1", "u1", 1),
+        ("8UC", "u1", 1),
+        ("8UC3", "u1", 3),
+        ("8SC2", "i1", 2),
+        ("16UC1", "u2", 1),
+        ("16SC4", "i2", 4),
+        ("32SC1", "i4", 1),
+        ("32FC1", "f4", 1),
+        ("64FC10", "f8", 10),
+        ("bayer_rggb8", "u1", 1),
+        ("bayer_gbrg16", "u2", 1),
+        ("yuv422", "u1", 2),
+        ("yuv422_yuy2", "u1", 2),
+    ],
+)
+@pytest.mark.parametrize("big", [0, 1])
+@pytest.mark.parametrize("padding", [0, 5])
+def test_images(encoding: str, sample: str, channels: int, big: int, padding: int) -> None:
+    height, width = 3, 4
+    dtype = np.dtype(sample).newbyteorder(">" if big else "<")
+    wanted = np.arange(height * width * channels).reshape(height, width, channels).astype(dtype)
+    rows = [row.tobytes() + b"\xee" * padding for row in wanted]
+    message = image(encoding, width, height, b"".join(rows), is_bigendian=big)
+    got = to_numpy("sensor_msgs/msg/Image", message)
+    assert got.dtype == dtype
+    assert got.shape == ((height, width) if channels == 1 else (height, width, channels))
+    assert np.array_equal(got.reshape(wanted.shape), wanted)
+    assert np.shares_memory(got, message.data)
+    # The padding of the last row may be left out.
+    message.data = message.data[: len(message.data) - padding]
+    assert np.array_equal(to_numpy("sensor_msgs/Image", message).reshape(wanted.shape), wanted)
+
+
+@pytest.mark.parametrize(("encoding", "rows"), [("nv21", 6), ("nv12", 6), ("nv24", 12)])
+def test_planes(encoding: str, rows: int) -> None:
+    data = bytes(range(rows * 6))
+    got = to_numpy("sensor_msgs/Image", image(encoding, 6, 4, data, step=6))
+    assert got.shape == (rows, 6)
+    assert got.tobytes() == data
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "rows of"),
+        ({"height": 2**32 - 1}, "needs"),
+        ({"width": 5}, "need"),
+        ({"step": 0}, "rows of 0 bytes"),
+        ({"step": 2**32 - 1}, "needs"),
+        ({"height": -1}, "cannot have"),
+        ({"encoding": "64FC999"}, "unknown encoding"),
+        ({"encoding": "12UC1"}, "unknown encoding"),
+        ({"encoding": "jpeg"}, "unknown encoding"),
+        ({"width": "wide"}, "not the usual one"),
+    ],
+)
+def test_images_that_lie(change: dict[str, Any], message: str) -> None:
+    lying = image("rgb8", 4, 3, bytes(36))
+    lying.__dict__.update(change)
+    with pytest.raises(PayloadError, match=message):
+        to_numpy("sensor_msgs/Image", lying)
+    nv21 = image("nv21", 4, 3, bytes(36))
+    with pytest.raises(PayloadError, match="3 rows"):
+        to_numpy("sensor_msgs/Image", nv21)
+
+
+def test_empty_image() -> None:
+    assert to_numpy("sensor_msgs/Image", image("rgb8", 0, 0, b"")).shape == (0, 0, 3)
+    assert to_numpy("sensor_msgs/Image", image("mono8", 7, 0, b"")).shape == (0, 7)
+
+
+# Compressed images
+
+
+def compressed(form: str, data: bytes) -> SimpleNamespace:
+    return SimpleNamespace(format=form, data=np.frombuffer(data, np.uint8))
+
+
+def encoded(array: np.ndarray[Any, Any], form: str, **options: Any) -> bytes:
+    file = io.BytesIO()
+    Pillow.fromarray(array).save(file, form, **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (4, 6, 3), (4, 6, 4)])
+def test_png(shape: tuple[int, ...]) -> None:
+    wanted = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    message = compressed("bgr8; png compressed bgr8", encoded(wanted, "png"))
+    assert np.array_equal(to_numpy("sensor_msgs/CompressedImage", message), wanted)
+
+
+def test_png_of_16_bits() -> None:
+    wanted = np.random.default_rng(1).integers(0, 1 << 16, (4, 6)).astype(np.uint16)
+    got = to_numpy("sensor_msgs/CompressedImage", compressed("mono16; png", encoded(wanted, "png")))
+    assert got.dtype == np.uint16
+    assert np.array_equal(got, wanted)
+
+
+def test_png_of_16_bits_and_colour_is_not_cut_to_eight() -> None:
+    header = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 2, 2, 16, 2, 0, 0, 0)
+    with pytest.raises(PayloadError, match="16 bits"):
+        to_numpy("sensor_msgs/CompressedImage", compressed("png", header))
+
+
+def test_palette_and_black_and_white() -> None:
+    grey = np.array([[0, 255], [255, 0]], np.uint8)
+    for mode, shape in (("P", (2, 2, 3)), ("1", (2, 2)), ("LA", (2, 2, 4))):
+        file = io.BytesIO()
+        Pillow.fromarray(grey).convert(mode).save(file, "png")
+        got = to_numpy("sensor_msgs/CompressedImage", compressed("png", file.getvalue()))
+        assert got.shape == shape
+        assert np.array_equal(got if got.ndim == 2 else got[..., 0], grey)
+
+
+def test_compressed_depth() -> None:
+    depth = np.array([[1000, 0], [2500, 65535]], np.uint16)
+    data = struct.pack("<iff", 0, 0.0, 0.0) + encoded(depth, "png")
+    got = to_numpy("sensor_msgs/CompressedImage", compressed("16UC1; compressedDepth png", data))
+    assert np.array_equal(got, depth)
+    metres = np.array([[0.5, 4.0], [2.0, 1.0]])
+    scale, shift = 100.0, 10.0
+    inverse = np.round(scale / metres + shift).astype(np.uint16)
+    inverse[1, 1] = 0
+    data = struct.pack("<iff", 0, scale, shift) + encoded(inverse, "png")
+    got = to_numpy("sensor_msgs/CompressedImage", compressed("32FC1; compressedDepth", data))
+    assert got.dtype == np.float32
+    assert np.allclose(got[:, 0], metres[:, 0])
+    assert np.isnan(got[1, 1])
+    for form, raw in (("16UC1; compressedDepth rvl", data), ("16UC1; compressedDepth", b"short")):
+        with pytest.raises(PayloadError, match="only PNG"):
+            to_numpy("sensor_msgs/CompressedImage", compressed(form, raw))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_damaged_pictures(data: st.DataObject) -> None:
+    wanted = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    raw = bytearray(encoded(wanted, data.draw(st.sampled_from(["png", "jpeg", "tiff", "bmp"]))))
+    for _ in range(3):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(raw)))
+    try:
+        got = to_numpy("sensor_msgs/CompressedImage", compressed("jpeg", bytes(raw[:cut])))
+    except PayloadError:
+        return
+    assert got.ndim in {2, 3}
+
+
+def test_picture_that_claims_to_be_huge() -> None:
+    raw = bytearray(encoded(np.zeros((4, 4), np.uint8), "png"))
+    raw[16:24] = struct.pack(">II", 30000, 30000)
+    import zlib
+
+    raw[29:33] = struct.pack(">I", zlib.crc32(raw[12:29]))
+    with pytest.raises(PayloadError, match="cannot be read"):
+        to_numpy("sensor_msgs/CompressedImage", compressed("png", bytes(raw)))
+
+
+def test_without_pillow(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def refusing(name: str, *others: Any, **more: Any) -> Any:
+        if name.split(".", maxsplit=1)[0] == "PIL":
+            raise ImportError(name)
+        return real(name, *others, **more)
+
+    monkeypatch.setattr(builtins, "__import__", refusing)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[images\]'"):
+        to_numpy("sensor_msgs/CompressedImage", compressed("png", b""))
+
+
+# Scans and clouds
+
+
+def test_laser_scan() -> None:
+    scan = SimpleNamespace(
+        ranges=np.array([1, 2, np.inf], np.float32),
+        intensities=np.array([], np.float32),
+        angle_min=-0.5,
+        angle_increment=0.25,
+    )
+    got = to_numpy("sensor_msgs/LaserScan", scan)
+    assert got.dtype.names == ("range", "angle")
+    assert got["range"].tolist() == [1, 2, np.inf]
+    assert got["angle"].tolist() == [-0.5, -0.25, 0]
+    scan.intensities = np.array([4, 5, 6], np.float32)
+    assert to_numpy("sensor_msgs/LaserScan", scan)["intensity"].tolist() == [4, 5, 6]
+    scan.intensities = np.array([4], np.float32)
+    with pytest.raises(PayloadError, match="3 ranges and 1 intensities"):
+        to_numpy("sensor_msgs/LaserScan", scan)
+
+
+def point_field(name: str, offset: int, datatype: int, count: int = 1) -> SimpleNamespace:
+    return SimpleNamespace(name=name, offset=offset, datatype=datatype, count=count)
+
+
+def cloud(**change: Any) -> SimpleNamespace:
+    dtype = np.dtype(
+        {
+            "names": ["x", "ring", "rgb"],
+            "formats": ["<f4", "<u2", ("u1", 3)],
+            "offsets": [0, 8, 12],
+            "itemsize": 16,
+        }
+    )
+    points = np.zeros((2, 3), dtype)
+    points["x"] = np.arange(6).reshape(2, 3)
+    points["ring"] = 7
+    points["rgb"] = [1, 2, 3]
+    fields = {
+        "height": 2,
+        "width": 3,
+        "point_step": 16,
+        "row_step": 50,
+        "is_bigendian": False,
+        "fields": [
+            point_field("rgb", 12, 2, 3),
+            point_field("x", 0, 7),
+            point_field("ring", 8, 4, 0),
+        ],
+        "data": np.frombuffer(b"".join(row.tobytes() + b"\xee\xee" for row in points), np.uint8),
+        **change,
+    }
+    return SimpleNamespace(**fields)
+
+
+def test_organised_cloud() -> None:
+    message = cloud()
+    got = to_numpy("sensor_msgs/msg/PointCloud2", message)
+    assert got.shape == (2, 3)
+    assert got.dtype.itemsize == 16
+    assert got["x"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert got["ring"].tolist() == [[7] * 3] * 2
+    assert got["rgb"].shape == (2, 3, 3)
+    assert got["rgb"][1, 2].tolist() == [1, 2, 3]
+    assert np.shares_memory(got, message.data)
+
+
+def test_unorganised_and_empty_clouds() -> None:
+    message = cloud(height=1, row_step=0)
+    got = to_numpy("sensor_msgs/PointCloud2", message)
+    assert got.shape == (3,)
+    assert got["x"].tolist() == [0, 1, 2]
+    assert to_numpy("sensor_msgs/PointCloud2", cloud(width=0, row_step=0)).shape == (2, 0)
+    assert to_numpy("sensor_msgs/PointCloud2", cloud(height=1, width=0)).shape == (0,)
+
+
+def test_big_endian_cloud() -> None:
+    data = np.array([(1.5, 3)], [("x", ">f4"), ("n", ">u4")]).view(np.uint8)
+    fields = [point_field("x", 0, 7), point_field("n", 4, 6)]
+    message = cloud(
+        height=1, width=1, point_step=8, row_step=8, is_bigendian=True, fields=fields, data=data
+    )
+    assert to_numpy("sensor_msgs/PointCloud2", message).tolist() == [(1.5, 3)]
+
+
+def test_field_names_that_numpy_refuses() -> None:
+    fields = [point_field("x", 0, 7), point_field("x", 4, 7), point_field("", 8, 7)]
+    got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=fields))
+    assert got.dtype.names == ("x", "x_", "field_2")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 2**32 - 1}, "need"),
+        ({"height": 2**32 - 1}, "needs"),
+        ({"row_step": 2**32 - 1}, "needs"),
+        ({"row_step": 40}, "need"),
+        ({"point_step": 2**32 - 1}, "cannot be read|need"),
+        ({"point_step": 2**32 - 1, "width": 0}, "cannot be read"),
+        ({"point_step": 0}, "ends at byte"),
+        ({"fields": []}, "no fields"),
+        ({"fields": [point_field("x", 2**32 - 1, 7)]}, "ends at byte"),
+        ({"fields": [point_field("x", -4, 7)]}, "from byte -4"),
+        ({"fields": [point_field("x", 0, 7, 2**32 - 1)]}, "ends at byte"),
+        ({"fields": [point_field("x", 0, 9)]}, "unknown type 9"),
+        ({"fields": [point_field("x", 0, 7), point_field("y", 2, 7)]}, "overlap"),
+        ({"data": np.zeros(97, np.uint8)}, "has 97"),
+    ],
+)
+def test_clouds_that_lie(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(PayloadError, match=message):
+        to_numpy("sensor_msgs/PointCloud2", cloud(**change))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_hostile_sizes_are_refused_or_lie_inside(data: st.DataObject) -> None:
+    size = st.one_of(st.integers(0, 40), st.integers(0, 2**32 - 1))
+    fields = data.draw(
+        st.lists(
+            st.builds(point_field, st.text(max_size=2), size, st.integers(0, 9), size), max_size=3
+        )
+    )
+    names = ("height", "width", "point_step", "row_step")
+    message = cloud(fields=fields, **{name: data.draw(size) for name in names})
+    try:
+        got = to_numpy("sensor_msgs/PointCloud2", message)
+    except PayloadError:
+        return
+    if got.size:
+        low, high = np.lib.array_utils.byte_bounds(got)
+        first, last = np.lib.array_utils.byte_bounds(message.data)
+        assert first <= low
+        assert high <= last
+
+
+def test_old_point_cloud() -> None:
+    points = [SimpleNamespace(x=n, y=2 * n, z=3 * n) for n in range(3)]
+    channels = [SimpleNamespace(name="intensity", values=np.array([7, 8, 9], np.float32))]
+    message = SimpleNamespace(points=points, channels=channels)
+    got = to_numpy("sensor_msgs/PointCloud", message)
+    assert got.tolist() == [(0, 0, 0, 7), (1, 2, 3, 8), (2, 4, 6, 9)]
+    channels[0].values = np.zeros(2)
+    with pytest.raises(PayloadError, match="3 points and 2 values"):
+        to_numpy("sensor_msgs/PointCloud", message)
+
+
+def test_other_types_are_refused() -> None:
+    with pytest.raises(PayloadError, match=r"sensor_msgs/Image.*sensor_msgs/PointCloud2"):
+        to_numpy("nav_msgs/msg/Odometry", SimpleNamespace())
+    with pytest.raises(PayloadError, match="not the usual one"):
+        to_numpy("sensor_msgs/Image", SimpleNamespace(encoding="rgb8"))
+
+
+# Real messages
+
+
+def decoded(path: str, *types: str) -> list[tuple[str, Any]]:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    found = []
+    with AnyReader([DATA / path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        chosen = [c for c in reader.connections if c.msgtype.split("/")[-1] in types]
+        for connection, _, raw in reader.messages(chosen):
+            found.append((connection.msgtype, reader.deserialize(raw, connection.msgtype)))
+    return found
+
+
+def ouster(*types: str) -> list[tuple[str, Any]]:
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    found = []
+    store = get_typestore(Stores.EMPTY)
+    with (DATA / "real/ouster.mcap").open("rb") as stream:
+        for schema, _, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            package, name = schema.name.split("/")
+            if name in types:
+                full = f"{package}/msg/{name}"
+                if full not in store.types:
+                    store.register(get_types_from_msg(schema.data.decode(), full))
+                found.append((schema.name, store.deserialize_ros1(message.data, full)))
+    return found
+
+
+def unpacked(message: Any) -> list[tuple[Any, ...]]:
+    """Points read one by one with struct."""
+    codes = "?bBhHiIfd"
+    order = ">" if message.is_bigendian else "<"
+    raw = message.data.tobytes()
+    points = []
+    for row in range(message.height):
+        for place in range(message.width):
+            at = row * message.row_step + place * message.point_step
+            points.append(
+                tuple(
+                    struct.unpack_from(order + codes[f.datatype], raw, at + f.offset)[0]
+                    for f in message.fields
+                )
+            )
+    return points
+
+
+@needs_data
+def test_real_clouds() -> None:
+    messages = [
+        *decoded("real/sick_laser_radar.bag", "PointCloud2")[::40],
+        *decoded("real/luminar_pointcloud.bag", "PointCloud2")[:1],
+        *decoded("odd/every_sensor_msg_ros2.mcap", "PointCloud2"),
+    ]
+    assert len(messages) > 5
+    for name, message in messages:
+        got = to_numpy(name, message)
+        assert np.shares_memory(got, message.data)
+        assert got.dtype.names == tuple(field.name for field in message.fields)
+        assert repr(got.reshape(-1).tolist()) == repr(unpacked(message))
+    (name, message), *_ = ouster("PointCloud2")
+    got = to_numpy(name, message)
+    assert got.shape == (64, 2048)
+    assert repr(got[5, :3].tolist()) == repr(unpacked(message)[5 * 2048 : 5 * 2048 + 3])
+    # Distance is a field of its own, in millimetres.
+    distance = np.sqrt(sum(got[axis].astype(float) ** 2 for axis in "xyz")) * 1000
+    hit = got["range"] > 0
+    assert hit.sum() > 10_000
+    assert np.abs(distance - got["range"])[hit].max() < 60
+
+
+@needs_data
+def test_real_images() -> None:
+    images = ouster("Image")
+    assert len(images) == 6
+    for name, message in images:
+        got = to_numpy(name, message)
+        assert got.shape == (64, 2048)
+        assert got.tobytes() == message.data.tobytes()
+    ((name, message),) = decoded("odd/every_sensor_msg_ros2.mcap", "Image")
+    got = to_numpy(name, message)
+    assert got.shape == (480, 640, 3)
+    assert got.tobytes() == message.data.tobytes()
+
+
+@needs_data
+def test_real_compressed_images() -> None:
+    for path, shape in (
+        ("real/compressed_image.bag", (960, 1280, 3)),
+        ("odd/every_sensor_msg_ros2.mcap", (480, 640, 3)),
+    ):
+        ((name, message),) = decoded(path, "CompressedImage")
+        got = to_numpy(name, message)
+        assert got.shape == shape
+        with Pillow.open(io.BytesIO(message.data.tobytes())) as picture:
+            assert got.tobytes() == picture.convert("RGB").tobytes()
+
+
+@needs_data
+def test_real_scans() -> None:
+    for path in ("real/leg_tracker_positive_7.bag", "real/tilt_laser.bag"):
+        for name, message in decoded(path, "LaserScan")[::50]:
+            got = to_numpy(name, message)
+            assert np.array_equal(got["range"], message.ranges, equal_nan=True)
+            assert got["angle"][0] == np.float32(message.angle_min)
+            assert abs(got["angle"][-1] - message.angle_max) < 1e-3
+            assert ("intensity" in got.dtype.names) == bool(len(message.intensities))
