@@ -39,6 +39,12 @@ if TYPE_CHECKING:
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
+_NUMBERS = {
+    "bool", "byte", "char", "float32", "float64",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}  # fmt: skip
+
+
 class Message:
     """One message of an answer. Its payload is decoded only when it is looked at.
 
@@ -213,7 +219,7 @@ class Query:
         """
         known = self.field_types()
         for path in paths:
-            if known and not any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known):
+            if known and not _is_field(path, known):
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(_fields=tuple(paths))
 
@@ -280,10 +286,10 @@ class Query:
     def count(self) -> int:
         """Number of messages, without reading a payload."""
         started = time.monotonic()
-        total = self._count()
+        total = -(-self._count() // self._every)
+        self.counters.messages = total if self._limit is None else min(total, self._limit)
         self.counters.elapsed_s = time.monotonic() - started
-        whole = -(-total // self._every)
-        return whole if self._limit is None else min(whole, self._limit)
+        return self.counters.messages
 
     def documents(self) -> Iterator[dict[str, Any]]:
         """The index documents, in order of topic, then log time and arrival.
@@ -300,18 +306,21 @@ class Query:
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
-        from hybridlog.tables import collect
+        from hybridlog.tables import arranged, collect
 
         table = collect(self).to_arrow()
+        table = table.select(arranged(table.column_names, self._fields))
         if self._reverse:
             table = table.take(np.arange(table.num_rows - 1, -1, -1))
         return table
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: scalars as columns, arrays as numpy cells, indexed by log time (UTC, ns)."""
-        from hybridlog.tables import collect
+        from hybridlog.tables import arranged, collect
 
         frame = collect(self).to_pandas()
+        if self._fields is not None:
+            frame = frame[arranged(list(frame.columns), self._fields)]
         if self._reverse:
             frame = frame.iloc[::-1]
         frame.attrs["hybridlog"] = _as_dict(self.counters)
@@ -586,6 +595,7 @@ class Query:
         if not conditions:
             return
         own = conditions[0] if len(conditions) == 1 else {"$or": conditions}
+        started = time.monotonic()
         taken = given = 0
         for raw in database.find_raw(
             collection_of(topic),
@@ -601,6 +611,8 @@ class Query:
                 rows = rows[: self._limit - given]
             taken += count
             given += len(rows)
+            self.counters.documents_read += count
+            self.counters.elapsed_s = time.monotonic() - started
             yield raw, rows
             if self._limit is not None and given >= self._limit:
                 return
@@ -618,6 +630,23 @@ def _span(recording: RecordingEntry) -> tuple[int, int]:
 
 def _as_dict(counters: Counters) -> dict[str, float]:
     return {name: getattr(counters, name) for name in counters.__dataclass_fields__}
+
+
+def _is_field(path: str, known: Mapping[str, str]) -> bool:
+    if summary_type(path, known) is not None:
+        return True
+    return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
+
+
+def summary_type(path: str, known: Mapping[str, str]) -> str | None:
+    """Type of a summary of an array of numbers (`ranges.min`), None if a path is none."""
+    array, _, what = path.rpartition(".")
+    element, bracket, _ = known.get(array, "").partition("[")
+    if not bracket or what not in {"n", "min", "max", "mean"} or element not in _NUMBERS:
+        return None
+    if what == "n" or (what != "mean" and not element.startswith("float")):
+        return "int64"
+    return "float64"
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hybridlog.reader import Query
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.segment_catalog import SegmentCatalog
+    from hybridlog.sources.base import Source
 
 DEFAULT_STORE = "hybridlog-store"
 _MOST_OPEN_SEGMENTS = 256
@@ -66,9 +67,11 @@ def open_store(
     """
     where = store_path(path)
     wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
-    directory = (
-        StoreDirectory.create(where, mongo=mongo) if create else StoreDirectory(where)
-    )
+    if create:
+        directory = StoreDirectory.create(where, mongo=mongo)
+        directory.check_writable()
+    else:
+        directory = StoreDirectory(where)
     store = Store(directory)
     try:
         store.connect(wanted or directory.settings.mongo)
@@ -104,6 +107,7 @@ class Store:
         self.without_database: HybridlogError | None = None
         self.tended = maintenance.Tended()
         self._mongod: EmbeddedMongod | None = None
+        self._uri: str | None = None
         self._catalog: Catalog | SegmentCatalog | None = None
         self._recordings: list[RecordingEntry] | None = None
         self._lanes: dict[str, list[Lane]] = {}
@@ -131,11 +135,16 @@ class Store:
         """
         from hybridlog_storage.database import Database
 
+        self._uri = uri
         if uri is None:
             from hybridlog_storage.mongod import EmbeddedMongod
 
             self._mongod = EmbeddedMongod(self.directory.mongod)
-            uri = self._mongod.start()
+            try:
+                uri = self._mongod.start()
+            except StoreError as error:
+                # A store that cannot be written has no embedded MongoDB; its segments do.
+                raise DatabaseError(str(error)) from error
         self.database = Database.connect(uri)
         self._claim(self.database)
         catalog = Catalog(self.database)
@@ -312,18 +321,18 @@ class Store:
 
     def record(
         self,
-        path: str | Path,
+        log: str | Path | Source,
         options: RecordOptions | None = None,
         progress: Callable[[int, int], None] | None = None,
-        **choices: Any,  # noqa: ANN401 - the fields of RecordOptions
+        **choices: Any,
     ) -> RecordReport:
         """Record a ROS 1 bag, a ROS 2 bag or an MCAP file.
 
         Args:
-            path: The log.
+            log: Its path, or a source that was opened and not read yet.
             options: What and how.
             progress: Called with bytes read and messages stored.
-            choices: Fields of `RecordOptions`, instead of it.
+            choices: Fields of `RecordOptions`, instead of `options`.
 
         Raises:
             SourceError: nothing could be read.
@@ -333,7 +342,7 @@ class Store:
         from hybridlog.sources.detect import open_source
         from hybridlog.sources.fingerprint import fingerprint
 
-        with open_source(Path(path)) as source:
+        with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
             report = record(
                 source,
                 self.directory,
@@ -342,8 +351,22 @@ class Store:
                 options or RecordOptions(**choices),
                 progress,
             )
+        if report.failure is not None:
+            self._catch_up(report)
         self.refresh()
         return report
+
+    def _catch_up(self, report: RecordReport) -> None:
+        """MongoDB failed while a log was recorded: index the rest, if it can be had again."""
+        try:
+            self.disconnect()
+            self.connect(self._uri)
+            maintenance.catch_up(self.directory, self.database_for("The index"), report.entry.id)
+        except DatabaseError as error:
+            report.failure = error
+            self.without_database = error
+            return
+        report.indexed, report.missed, report.failure = report.entry.messages, 0, None
 
     def reindex(self, progress: maintenance.Progress | None = None) -> list[RecordingEntry]:
         """Drop the index and make it again from the segments."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.errors import DefinitionError, UsageError
 from hybridlog_storage.messages import Batch
 
 from hybridlog.frames import TableBuilder
@@ -102,8 +102,24 @@ def _tables(query: Query, blocks: Iterator[Block], *, several: bool) -> Iterator
         yield _finished(builder, query)
 
 
+def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
+    """Column names in the order in which their fields were asked for."""
+    if fields is None:
+        return list(names)
+
+    def place(name: str) -> int:
+        for number, path in enumerate(fields):
+            plain = path.replace("[]", "")
+            if name == plain or name.startswith(f"{plain}.") or plain.startswith(f"{name}."):
+                return number
+        return -1  # what was not asked for comes first: log time, topic
+
+    return sorted(names, key=place)
+
+
 def _finished(builder: TableBuilder, query: Query) -> pa.Table:
     table = builder.to_arrow()
+    table = table.select(arranged(table.column_names, query.selected_fields))
     if query.is_reversed:
         table = table.take(np.arange(table.num_rows - 1, -1, -1))
     return table
@@ -165,33 +181,51 @@ def _check(lanes: Sequence[Lane]) -> None:
 
 
 def scalar_types(query: Query) -> Mapping[str, str] | None:
-    """Types of the fields asked for, if the index alone can answer; None if it cannot."""
+    """Types of the fields asked for, if the index alone can answer; None if it cannot.
+
+    Raises:
+        UsageError: a summary of an array is asked for where the index cannot answer.
+    """
     from hybridlog.frames.bson import INDEX_TYPES
+    from hybridlog.reader import summary_type
 
     fields = query.selected_fields
-    if fields is None or query.store.database is None or len(query.topics) != 1:
+    if fields is None:
         return None
     types: dict[str, str] = {}
+    summaries: list[str] = []
+    indexed = query.store.database is not None and len(query.topics) == 1
     for lane in query.lanes():
         paths = {p.path: p for p in lane.codec.paths()}
+        known = {name: path.type for name, path in paths.items()}
         for name in fields:
-            path = paths.get(name)
-            if path is None or path.array or path.type not in INDEX_TYPES:
-                return None
-            if types.setdefault(name, path.type) != path.type:
-                return None
-    return types
+            found = summary_type(name, known)
+            if found is not None:
+                summaries.append(name)
+            elif name in paths and not paths[name].array and known[name] in INDEX_TYPES:
+                found = known[name]
+            if found is None or types.setdefault(name, found) != found:
+                indexed = False
+    if summaries and not indexed:
+        raise UsageError(
+            f"{summaries[0]} stands in the index: ask for it on one topic, together with "
+            "single values only, while MongoDB is there."
+        )
+    return types if indexed else None
 
 
 def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[Block]:
-    from hybridlog.frames.bson import index_columns
+    """Blocks of the fields asked for, in the order of the index."""
+    from hybridlog.frames.bson import records_from_bson
 
     topic = query.topics[0]
     projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
     for raw, rows in query.thinned_documents(topic, projection):
-        reference, records = index_columns(raw, types)
-        query.counters.documents_read += len(reference)
-        query.counters.messages += len(rows)
-        if len(rows) < len(reference):
-            reference, records = reference.take(rows), take(records, rows)
-        yield Block(topic, reference.t, reference.seq, records, 0)
+        # Documents that lack a field (an array too short for a summary) form parts.
+        for part in records_from_bson(raw, types):
+            chosen = np.flatnonzero(np.isin(part.rows, rows, assume_unique=True))
+            query.counters.messages += len(chosen)
+            reference, records = part.reference, part.records
+            if len(chosen) < len(reference):
+                reference, records = reference.take(chosen), take(records, chosen)
+            yield Block(topic, reference.t, reference.seq, records, 0)

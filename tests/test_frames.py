@@ -21,6 +21,7 @@ from hybridlog.frames.bson import index_columns, records_from_bson, reference_co
 from hybridlog.frames.ragged import Ragged, RaggedBuilder
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 from hybridlog_storage.errors import StoreError
+from tests.data import DATA, needs_data
 
 
 def strings(*cells: str | bytes) -> Strings:
@@ -700,3 +701,68 @@ def test_dates_are_times() -> None:
     assert isinstance(column, Scalars)
     assert column.kind == "time"
     assert column.values.tolist() == [round(when.timestamp() * 1000) * 10**6]
+
+
+# Real messages
+
+
+@needs_data
+@pytest.mark.parametrize("topic", ["/imu_data", "/scan", "/tf", "/velocity"])
+def test_real_log_agrees_with_rosbags(topic: str) -> None:
+    from rosbags.highlevel import AnyReader
+
+    from hybridlog.schema.codec import codec_for
+    from hybridlog_storage.messages import Channel, Schema
+
+    with AnyReader([DATA / "real/tilt_laser.bag"]) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == topic][:1]
+        raw = [(time, bytes(data)) for _, time, data in reader.messages([connection])]
+        wanted = [reader.deserialize(data, connection.msgtype) for _, data in raw]
+    name = connection.msgtype.replace("/msg/", "/")
+    schema = Schema(name, "ros1msg", connection.msgdef.data.encode())
+    codec = codec_for(Channel(topic, "ros1", schema))
+    tables, indexed = [TableBuilder(), TableBuilder()], TableBuilder()
+    for start in range(0, len(raw), 100):
+        part = raw[start : start + 100]
+        offset = offsets([data for _, data in part])
+        decoded = codec.columns(
+            b"".join(data for _, data in part), offset[:-1], np.diff(offset), None
+        )
+        for builder in tables:
+            builder.append(
+                times(*(time for time, _ in part)),
+                np.arange(start, start + len(part)),
+                decoded.records,
+            )
+        batch = b"".join(
+            bson.encode(
+                {**codec.fields(data), "_meta": {"t": Int64(time), "seq": Int64(start + place)}}
+            )
+            for place, (time, data) in enumerate(part)
+        )
+        types = {path.path: path.type.split("[")[0] for path in codec.paths()}
+        for group in records_from_bson(batch, types):
+            indexed.append(group.reference.t, group.reference.seq, group.records)
+    frame, table, index = tables[0].to_pandas(), tables[1].to_arrow(), indexed.to_arrow()
+    table.validate(full=True)
+    index.validate(full=True)
+    assert frame.index.astype("int64").tolist() == sorted(time for time, _ in raw)
+    for path in frame.columns:
+        for got, message in zip(frame[path], wanted, strict=True):
+            value: Any = message
+            for part_name in path.split("."):
+                value = getattr(value, part_name)
+            if isinstance(value, np.ndarray):
+                assert got.dtype == value.dtype
+                assert np.array_equal(got, value, equal_nan=True)
+            elif isinstance(value, list):
+                assert len(got) == len(value)
+                assert got[0]["child_frame_id"] == value[0].child_frame_id
+                assert got[0]["transform"]["rotation"]["w"] == value[0].transform.rotation.w
+            elif hasattr(value, "nanosec"):
+                assert got.value == value.sec * 10**9 + value.nanosec
+            else:
+                assert got == value
+        if path in index.column_names and not pa.types.is_nested(table[path].type):
+            assert index[path].type == table[path].type
+            assert index[path].equals(table[path])

@@ -4,38 +4,79 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import NoReturn
+import traceback
+from typing import NoReturn, TextIO
 
-EXIT_CODES = {
-    0: "done",
-    1: "verify found something, or an error that has no code of its own",
-    2: "the question is wrong: an option, a topic, a time, a predicate",
-    3: "a log that cannot be read at all",
-    4: "a damaged log: what could be read is stored",
-    5: "the store: missing, read-only, damaged, of a newer format",
-    6: "MongoDB does not answer, or died",
-    7: "no space left on the disk",
-    8: "this content is in the store already",
-    9: "an optional package is missing",
-    130: "interrupted",
-}
+from hybridlog_storage.errors import HybridlogError
+
+from hybridlog.cli import stopping
+from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
+
+__all__ = ["EXIT_CODES", "main"]
 
 
 def main() -> NoReturn:
-    """Run the command line and exit."""
-    from hybridlog_storage.errors import HybridlogError
+    """Run the command line and exit with one of `EXIT_CODES`."""
+    stopping.install()
+    for stream in (sys.stdout, sys.stderr):
+        # A name that the terminal's encoding lacks is shown as an escape.
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    try:
+        code = _run()
+    except stopping.Stopped as stopped:
+        _complain(f"interrupted. {stopped.consequence}".rstrip())
+        code = stopped.exit_code
+    sys.exit(_flushed(code))
 
+
+def _run() -> int:
     from hybridlog.cli.app import app
 
     try:
         app()
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
     except HybridlogError as error:
-        print(f"hybridlog: {error}", file=sys.stderr)  # noqa: T201
-        sys.exit(error.exit_code)
+        _complain(str(error))
+        return error.exit_code
+    except BrokenPipeError:
+        _let_go(sys.stdout)
+        return 0
+    except OSError as error:
+        # What the library maps carries a cure; this is the rest, such as a failing disk.
+        _complain(str(error))
+        return HybridlogError.exit_code
+    except Exception:  # noqa: BLE001 - the last resort
+        traceback.print_exc()
+        _complain("this is a mistake in hybridlog; please report it with the lines above.")
+        return INTERNAL
+    return 0
+
+
+def _complain(text: str) -> None:
+    from hybridlog.cli.output import printable
+
+    lines = "\n".join(printable(line) for line in text.split("\n"))
+    try:
+        print(f"hybridlog: {lines}", file=sys.stderr, flush=True)  # noqa: T201
+    except OSError:
+        _let_go(sys.stderr)
+
+
+def _flushed(code: int) -> int:
+    """The exit code, after the last bytes are out: that is where a full disk shows."""
+    try:
+        sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our output has gone, as `head` does: nothing is wrong.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    sys.exit(0)
+        _let_go(sys.stdout)
+    except OSError as error:
+        _let_go(sys.stdout)
+        _complain(f"standard output cannot be written: {error.strerror}")
+        return code or HybridlogError.exit_code
+    return code
+
+
+def _let_go(stream: TextIO) -> None:
+    """What a stream still holds goes nowhere; the interpreter flushes it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

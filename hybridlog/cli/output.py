@@ -1,80 +1,101 @@
-"""Everything that is printed: tables, sizes, times, progress, JSON."""
+"""Everything that is printed: tables, sizes, times, JSON, notes."""
 
 from __future__ import annotations
 
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal
 
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from hybridlog.store import Store
+Column = tuple[str, Literal["left", "right"]]
+"""Heading and justification."""
 
 _UNITS = ("B", "kB", "MB", "GB", "TB")
-_SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kKmMgG]?)(i?)[bB]?\s*")
+_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgG]?)(i?)[bB]?\s*")
 
 
 def console(*, error: bool = False) -> Console:
-    """A console; on a pipe it is as wide as its content needs, without colour."""
+    """A console for a terminal."""
     from rich.console import Console
 
-    stream = sys.stderr if error else sys.stdout
-    width = None if stream.isatty() else 240
-    return Console(file=stream, width=width, highlight=False, soft_wrap=not stream.isatty())
+    return Console(file=sys.stderr if error else sys.stdout, highlight=False)
 
 
-def print_table(
-    columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], *, title: str | None = None
-) -> None:
-    """Print rows under headings.
+def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows under headings; on a terminal, cells that do not fit are folded.
 
     Args:
-        columns: Heading and justification (`left`, `right`) of each.
+        columns: What stands above, and on which side the cells stand.
         rows: Cells; control characters in them are shown, not obeyed.
-        title: Printed above.
     """
+    shown = [[printable(cell) for cell in row] for row in rows]
+    if sys.stdout.isatty():
+        _print_on_screen(columns, shown)
+    else:
+        _print_in_columns(columns, shown)
+
+
+def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left", header_style="bold")
+    table = Table(box=None, pad_edge=False, header_style="bold")
     for heading, side in columns:
         table.add_column(
-            heading,
-            justify="right" if side == "right" else "left",
-            no_wrap=not sys.stdout.isatty() or side == "right",
-            overflow="fold",
+            Text(printable(heading)), justify=side, no_wrap=side == "right", overflow="fold"
         )
     for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
+        table.add_row(*(Text(cell) for cell in row))
     console().print(table)
 
 
-def print_records(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows as a table when it fits the screen, else as one block a row."""
-    widths = [
-        max([len(name), *(len(row[i]) for row in rows)]) for i, name in enumerate(names)
-    ]
-    if not sys.stdout.isatty() or sum(widths) + 2 * len(widths) <= console().width:
-        print_table([(name, "left") for name in names], rows)
-        return
-    longest = max(map(len, names))
-    for row in rows:
-        for name, cell in zip(names, row, strict=True):
-            print(printable(f"{name:<{longest}}  {cell}"))  # noqa: T201
-        print()  # noqa: T201
+def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    """For files and pipes: as wide as it needs to be, nothing folded or left out."""
+    headings = [printable(heading) for heading, _ in columns]
+    widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]
+    for row in (headings, *rows):
+        line = "  ".join(
+            cell.rjust(width) if side == "right" else cell.ljust(width)
+            for cell, width, (_, side) in zip(row, widths, columns, strict=True)
+        )
+        print(line.rstrip())  # noqa: T201
+
+
+def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
+    """Whether rows fit as a table: always, where the lines may be as long as they like."""
+    if not sys.stdout.isatty():
+        return True
+    widths = [max(map(len, cells)) for cells in zip(names, *rows, strict=True)]
+    return sum(widths) + 2 * len(widths) <= console().width
+
+
+def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:
+    """Print one message: a title and a line a field."""
+    width = max((len(name) for name, _ in fields), default=0)
+    print(printable(title))  # noqa: T201
+    for name, value in fields:
+        print(printable(f"  {name:<{width}}  {value}"))  # noqa: T201
 
 
 def printable(text: str) -> str:
     """Text without control characters: names in logs are untrusted."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else _escaped(ord(c)) for c in text)
+
+
+def _escaped(code: int) -> str:
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def print_json(value: object) -> None:
@@ -91,10 +112,30 @@ def size(count: float) -> str:
     """Bytes for people: `12.3 MB`."""
     value = float(count)
     for unit in _UNITS:
-        if value < 1000 or unit == _UNITS[-1]:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        if value < 999.95 or unit == _UNITS[-1]:
+            break
         value /= 1000
-    raise AssertionError
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+
+
+def counted(number: int, what: str, plural: str | None = None) -> str:
+    """`1 message`, `2 messages`."""
+    return f"{number} {what if number == 1 else plural or what + 's'}"
+
+
+def short_time(ns: int) -> str:
+    """A time to the second, for lists."""
+    from hybridlog.query.times import format_time
+
+    return format_time(ns - ns % 10**9)
+
+
+def short_duration(ns: int) -> str:
+    """A length of time to four digits or, from a second on, to the millisecond."""
+    from hybridlog.query.times import format_duration
+
+    step = 10 ** max(0, len(str(abs(ns))) - 4) if abs(ns) < 10**9 else 10**6
+    return format_duration(round(ns / step) * step)
 
 
 def parse_size(text: str) -> int:
@@ -112,67 +153,7 @@ def parse_size(text: str) -> int:
     return int(float(number) * base**power)
 
 
-class Bar(Protocol):
-    """Shows progress."""
-
-    def __call__(self, done: int, note: str = "") -> None:
-        """So much is done."""
-
-
-@contextmanager
-def progress_bar(label: str, total: int, *, quiet: bool) -> Iterator[Bar]:
-    """A bar with rate and remaining time on a terminal; nothing elsewhere."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, note="": None  # noqa: ARG005
-        return
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TextColumn("{task.fields[note]}"),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-        console=console(error=True),
-        transient=True,
-    )
-    with bar:
-        task = bar.add_task(printable(label), total=total, note="")
-        yield lambda done, note="": bar.update(task, completed=done, note=note)
-
-
-@contextmanager
-def opened(
-    path: Path | None, mongo: str | None, *, create: bool = False, needs_database: bool = False
-) -> Iterator[Store]:
-    """A store, with a word about what had to be mended."""
-    from hybridlog.store import open_store
-
-    with open_store(path, mongo=mongo, create=create, require_database=needs_database) as store:
-        for recording, segments in store.tended.recovered.items():
-            kept = sum(s.messages for s in segments)
-            note(f"Recording {recording} was cut short by a crash; {kept} messages are recovered.")
-            for segment in segments:
-                for damage in segment.damage:
-                    note(f"  damaged: {damage}")
-        if store.without_database is not None:
-            note(f"MongoDB is away, so only topics and times can be asked for: "
-                 f"{store.without_database}")
-        yield store
-
-
 def _plain(value: object) -> object:
     if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
-    if isinstance(value, Path):
-        return str(value)
     return str(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -14,12 +14,19 @@ from hybridlog_storage.errors import (
     HybridlogError,
     SourceDamaged,
     SourceError,
+    TimeError,
     UsageError,
 )
 
 from hybridlog.cli import output
+from hybridlog.cli.opening import opened
+from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.stopping import Stopped
 
 if TYPE_CHECKING:
+    from hybridlog_storage.segment_writer import SegmentSettings
+
+    from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog.store import Store
@@ -48,87 +55,146 @@ def run(paths: list[Path], choices: Choices) -> None:
     """Record each path; what goes wrong with one does not keep the others out."""
     if choices.name is not None and len(paths) > 1:
         raise UsageError("--name names one recording; several paths were given.")
+    # Everything that can be wrong with the options is wrong before a store is made.
+    settings = _settings(choices)
     tags = _tags(choices.tag or [])
-    failures: list[HybridlogError] = []
-    results: list[dict[str, Any]] = []
+    _matcher(choices)
+    _check_new_store(paths, choices)
+    done = _Results(choices)
+    try:
+        with opened(
+            choices.store, choices.mongo, create=True, needs_database=True, quiet=choices.quiet
+        ) as store:
+            for path in paths:
+                try:
+                    done.add(path, _record_one(store, path, choices, settings, tags))
+                except (SourceError, AlreadyRecordedError, UsageError) as error:
+                    if len(paths) == 1:
+                        raise
+                    done.fail(path, error)
+    except Stopped as stopped:
+        stopped.consequence = done.on_stop(paths)
+        raise
+    finally:
+        done.show()
+    done.exit()
+
+
+def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
+    """Before a store is made: what cannot succeed should leave nothing behind."""
+    from hybridlog.store import store_path
+
+    if (store_path(choices.store) / "hybridlog.toml").exists():
+        return
     from hybridlog.sources.detect import open_source
 
-    if len(paths) == 1:
-        # Before a store is made: a path that is no log should leave nothing behind.
-        open_source(paths[0]).close()
-    with output.opened(
-        choices.store, choices.mongo, create=True, needs_database=True
-    ) as store:
-        for path in paths:
-            try:
-                report = _record_one(store, path, choices, tags)
-            except (SourceError, AlreadyRecordedError, UsageError) as error:
-                if len(paths) == 1:
-                    raise
-                output.note(f"hybridlog: {error}")
-                failures.append(error)
-                results.append({"path": str(path), "error": str(error)})
-                continue
-            results.append(_summary(path, report))
-            if not choices.as_json and not choices.quiet:
-                _print_report(path, report)
-            failures.extend(_problems(path, report, quiet=choices.quiet))
-    if choices.as_json:
-        output.print_json(results if len(paths) > 1 else results[0])
-    if failures:
-        raise typer.Exit(failures[0].exit_code)
+    first: SourceError | None = None
+    for path in paths:
+        try:
+            open_source(path).close()
+        except SourceError as error:
+            first = first or error
+        else:
+            break
+    else:
+        if first is not None and len(paths) == 1:
+            raise first
+        if first is not None:
+            raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
+    if choices.mongo is not None:
+        # The URI is written down in the store that is made, so it should be right.
+        from hybridlog_storage.database import Database
+
+        Database.connect(choices.mongo).close()
 
 
 def _record_one(
-    store: Store, path: Path, choices: Choices, tags: dict[str, str]
+    store: Store,
+    path: Path,
+    choices: Choices,
+    settings: SegmentSettings,
+    tags: dict[str, str],
 ) -> RecordReport:
-    from hybridlog.recorder import record
+    from hybridlog.recorder import RecordOptions, record
     from hybridlog.sources.detect import open_source
     from hybridlog.sources.fingerprint import fingerprint
 
     with open_source(path) as source:
-        options = _options(source, choices, tags)
-        with output.progress_bar(path.name, source.size_bytes, quiet=choices.quiet) as bar:
+        matcher = _matcher(choices)
+        options = RecordOptions(
+            name=choices.name,
+            tags=tags,
+            matcher=matcher,
+            between=_between(source, choices),
+            again=choices.again,
+            settings=settings,
+        )
+        with progress_bar(path.name, source.size_bytes, quiet=choices.quiet) as bar:
             report = record(
                 source,
                 store.directory,
                 store.database_for("record"),
                 fingerprint(source.files),
                 options,
-                lambda done, messages: bar(done, f"{messages} messages"),
+                lambda read, messages: bar(read, output.counted(messages, "message")),
             )
-        unused = options.matcher.unused() if options.matcher is not None else []
-        for pattern in unused:
-            output.note(f"{path}: no topic fits {pattern!r}")
+        _check_not_empty(report, source, store, options)
+    for pattern in matcher.unused() if matcher is not None else ():
+        output.note(f"{path}: no topic fits {pattern!r}.")
     store.refresh()
     return report
 
 
-def _options(source: Source, choices: Choices, tags: dict[str, str]) -> RecordOptions:
+def _check_not_empty(
+    report: RecordReport, source: Source, store: Store, options: RecordOptions
+) -> None:
+    """A time range in which nothing lies is a mistake; the empty recording goes away."""
+    if options.between is None or report.entry.messages or not report.skipped:
+        return
+    store.refresh()
+    store.remove(report.entry.id)
+    raise _outside(source, options.between)
+
+
+def _between(source: Source, choices: Choices) -> tuple[int, int] | None:
+    from hybridlog.query.times import parse_range
+
+    if choices.between is None:
+        return None
+    start, end = source.time_range or (None, None)
+    between = parse_range(*choices.between, start=start, end=end)
+    if start is not None and end is not None and (between[1] <= start or between[0] >= end):
+        raise _outside(source, between)
+    return between
+
+
+def _outside(source: Source, between: tuple[int, int]) -> TimeError:
+    from hybridlog.query.times import format_time
+
+    low, high = map(format_time, between)
+    spans = ""
+    if source.time_range is not None:
+        start, end = source.time_range
+        spans = f"; it spans {format_time(start)} to {format_time(end - 1)}"
+    return TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
+
+
+def _matcher(choices: Choices) -> TopicMatcher | None:
+    """A matcher of its own for each source, as it counts what it was used for."""
+    from hybridlog.query.topics import matcher
+
+    if not choices.topics and not choices.exclude:
+        return None
+    return matcher(choices.topics or (), choices.exclude or ())
+
+
+def _settings(choices: Choices) -> SegmentSettings:
     from hybridlog_storage.segment_writer import SegmentSettings
 
-    from hybridlog.query.times import parse_range
-    from hybridlog.query.topics import matcher
-    from hybridlog.recorder import RecordOptions
-
-    between = None
-    if choices.between is not None:
-        start, end = source.time_range or (None, None)
-        between = parse_range(*choices.between, start=start, end=end)
-    chosen = None
-    if choices.topics or choices.exclude:
-        chosen = matcher(choices.topics or (), choices.exclude or ())
-    return RecordOptions(
-        name=choices.name,
-        tags=tags,
-        matcher=chosen,
-        between=between,
-        again=choices.again,
-        settings=SegmentSettings(
-            chunk_size=output.parse_size(choices.chunk_size),
-            compression=cast(Any, choices.compression),
-            level=choices.level,
-        ),
+    return SegmentSettings(
+        chunk_size=output.parse_size(choices.chunk_size),
+        compression=cast(Any, choices.compression),
+        level=choices.level,
     )
 
 
@@ -142,42 +208,154 @@ def _tags(pairs: list[str]) -> dict[str, str]:
     return tags
 
 
+class _Results:
+    """How each path went, for the table at the end and the exit code."""
+
+    def __init__(self, choices: Choices) -> None:
+        self._choices = choices
+        self._reports: list[tuple[Path, RecordReport]] = []
+        self._summaries: list[dict[str, Any]] = []
+        self._errors: list[HybridlogError] = []
+
+    def add(self, path: Path, report: RecordReport) -> None:
+        self._reports.append((path, report))
+        self._summaries.append(_summary(path, report))
+        self._errors.extend(_problems(path, report, quiet=self._choices.quiet))
+
+    def fail(self, path: Path, error: HybridlogError) -> None:
+        output.note(f"hybridlog: {error}")
+        self._errors.append(error)
+        self._summaries.append(
+            {"path": str(path), "error": str(error), "exit_code": error.exit_code}
+        )
+
+    def on_stop(self, paths: Sequence[Path]) -> str:
+        """What being stopped now means."""
+        done = len(self._summaries)
+        if done == len(paths):
+            return "Everything was recorded."
+        kept = len(self._reports)
+        before = f" {output.counted(kept, 'recording')} made before stay." if kept else ""
+        return f"Nothing of {paths[done]} is kept.{before}"
+
+    def show(self) -> None:
+        """The table of what was recorded, also when something stopped the rest."""
+        if self._choices.as_json:
+            if self._summaries:
+                one = len(self._summaries) == 1
+                output.print_json(self._summaries[0] if one else self._summaries)
+        elif not self._choices.quiet and self._reports:
+            if len(self._reports) == 1:
+                _print_one(*self._reports[0])
+            else:
+                _print_several(self._reports)
+
+    def exit(self) -> None:
+        """Leave with the code of the first thing that went wrong."""
+        if self._errors:
+            raise typer.Exit(self._errors[0].exit_code)
+
+
 def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
     entry = report.entry
     return {
         "path": str(path),
         "recording": entry.id,
         "status": entry.status,
-        "topics": len({c.topic for c in entry.channels}),
+        "topics": _topics(report),
         "messages": entry.messages,
         "messages_indexed": report.indexed,
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
         "messages_skipped": report.skipped,
         "bytes_in": entry.source["bytes"],
         "bytes_stored": entry.stored_bytes,
+        "ratio": round(_ratio(entry.source["bytes"], entry.stored_bytes), 3),
         "seconds": round(report.elapsed_s, 3),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
         "not_indexed": {c.topic: c.reason for c in entry.channels if c.reason is not None},
     }
 
 
-def _print_report(path: Path, report: RecordReport) -> None:
+def _topics(report: RecordReport) -> int:
+    return len({c.topic for c in report.entry.channels})
+
+
+def _ratio(taken: int, stored: int) -> float:
+    return taken / stored if stored else 0.0
+
+
+def _print_one(path: Path, report: RecordReport) -> None:
     entry = report.entry
     taken = int(entry.source["bytes"])
-    ratio = taken / entry.stored_bytes if entry.stored_bytes else 0.0
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
+    left_out = f" ({report.skipped} left out)" if report.skipped else ""
     output.print_table(
         [("recording", "left"), (entry.id, "left")],
         [
             ("source", f"{path} ({entry.source['kind']})"),
-            ("topics", str(len({c.topic for c in entry.channels}))),
-            ("messages", f"{entry.messages} ({report.skipped} left out)" if report.skipped
-             else str(entry.messages)),
-            ("indexed", f"{report.indexed}"),
+            ("topics", str(_topics(report))),
+            ("messages", f"{entry.messages}{left_out}"),
             ("bytes in", output.size(taken)),
-            ("bytes stored", f"{output.size(entry.stored_bytes)} (ratio {ratio:.2f})"),
+            ("bytes stored", output.size(entry.stored_bytes)),
+            ("ratio", f"{_ratio(taken, entry.stored_bytes):.2f}"),
+            ("messages indexed", str(report.indexed)),
             ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
         ],
+    )
+
+
+def _print_several(reports: Sequence[tuple[Path, RecordReport]]) -> None:
+    rows = [
+        _row(
+            report.entry.id,
+            _topics(report),
+            report.entry.messages,
+            int(report.entry.source["bytes"]),
+            report.entry.stored_bytes,
+            report.indexed,
+            report.elapsed_s,
+        )
+        for _, report in reports
+    ]
+    whole = [report for _, report in reports]
+    rows.append(
+        _row(
+            "total",
+            len({c.topic for report in whole for c in report.entry.channels}),
+            sum(report.entry.messages for report in whole),
+            sum(int(report.entry.source["bytes"]) for report in whole),
+            sum(report.entry.stored_bytes for report in whole),
+            sum(report.indexed for report in whole),
+            sum(report.elapsed_s for report in whole),
+        )
+    )
+    output.print_table(
+        [
+            ("recording", "left"),
+            ("topics", "right"),
+            ("messages", "right"),
+            ("in", "right"),
+            ("stored", "right"),
+            ("ratio", "right"),
+            ("indexed", "right"),
+            ("time", "right"),
+        ],
+        rows,
+    )
+
+
+def _row(
+    name: str, topics: int, messages: int, taken: int, stored: int, indexed: int, elapsed_s: float
+) -> tuple[str, ...]:
+    return (
+        name,
+        str(topics),
+        str(messages),
+        output.size(taken),
+        output.size(stored),
+        f"{_ratio(taken, stored):.2f}",
+        str(indexed),
+        f"{elapsed_s:.2f} s",
     )
 
 
@@ -189,24 +367,27 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             output.note(f"{channel.topic}: not indexed beyond time: {channel.reason}")
         if channel.stats.unreadable:
             output.note(
-                f"{channel.topic}: {channel.stats.unreadable} messages do not fit their "
-                "definition; they are stored, their fields are not indexed"
+                f"{channel.topic}: {output.counted(channel.stats.unreadable, 'message')} do not "
+                "fit their definition; they are stored, their fields are not indexed"
             )
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
-        lost = "" if damage.messages_lost is None else f"; {damage.messages_lost} messages lost"
+        lost = (
+            ""
+            if damage.messages_lost is None
+            else f"; {output.counted(damage.messages_lost, 'message')} lost"
+        )
         output.note(f"{damage.file}{place}: {damage.reason}{lost}")
     if report.failure is not None:
         output.note(
-            f"hybridlog: {report.failure} {report.missed} messages are stored but not in the "
-            "index; the next command that opens the store catches up."
+            f"hybridlog: {report.failure} {output.counted(report.missed, 'message')} are stored "
+            "but not in the index; the next command that opens the store catches up."
         )
         problems.append(DatabaseError(str(report.failure)))
     if report.damage:
         output.note(
-            f"{path} is damaged: {report.entry.messages} messages are stored, "
-            f"{len(report.damage)} places could not be read."
+            f"{path} is damaged: {output.counted(report.entry.messages, 'message')} are stored, "
+            f"{output.counted(len(report.damage), 'place')} could not be read."
         )
         problems.append(SourceDamaged(str(path)))
-    sys.stderr.flush()
     return problems

@@ -361,7 +361,7 @@ def _number(values: NDArray[Any], has: NDArray[np.bool_] | None = None) -> _Numb
 def _text(column: Strings) -> _Text:
     start, length = column.offset[:-1], np.diff(column.offset)
     begin, end = int(column.offset[0]), int(column.offset[-1])
-    data = column.data[begin:end]
+    data = np.ascontiguousarray(column.data[begin:end])
     start = start - begin
     if (data < 0x80).all():
         return _Text(data, start, length)

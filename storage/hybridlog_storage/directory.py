@@ -65,7 +65,9 @@ class StoreDirectory:
             StoreError: the directory holds something else, or cannot be written.
         """
         if (path / _SETTINGS).exists():
-            return cls(path)
+            store = cls(path)
+            (path / "recordings").mkdir(exist_ok=True)
+            return store
         try:
             if path.exists() and not path.is_dir():
                 raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
@@ -82,6 +84,18 @@ class StoreDirectory:
             lines.append(f"mongo = {json.dumps(mongo)}")
         durability.write_new(path / _SETTINGS, ("\n".join(lines) + "\n").encode())
         return cls(path)
+
+    def check_writable(self) -> None:
+        """Refuse a store that cannot be written, before anything is tried.
+
+        Raises:
+            StoreError: it is read-only for this user.
+        """
+        if not os.access(self.path / "recordings", os.W_OK | os.X_OK):
+            raise StoreError(
+                f"The store {self.path} is read-only. Check its owner and mount, or choose "
+                "another with --store."
+            )
 
     @property
     def mongod(self) -> Path:

@@ -281,6 +281,7 @@ def element(name: str) -> st.SearchStrategy[Any]:
     return st.integers(int(info.min), int(info.max))
 
 
+# Each example makes rosbags generate code, so shrinking a failure would take minutes.
 @settings(max_examples=60, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(definitions(), st.data())
 def test_random_types_through_rosbags(definition: tuple[int, str], data: st.DataObject) -> None:
@@ -487,7 +488,9 @@ plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 63) - 1) | st.floats() | st.text(),
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(st.text(st.characters(exclude_characters="\0"), max_size=3), inner)
+        | st.dictionaries(
+            st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=3), inner
+        )
     ),
     max_leaves=10,
 )

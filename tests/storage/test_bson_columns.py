@@ -35,8 +35,14 @@ def item(column: Any, row: int) -> Any:
         raw = column.data[column.offset[row] : column.offset[row + 1]].tobytes()
         return raw.decode() if column.subtype is None else bson.Binary(raw, column.subtype)
     if column.dtype.kind == "M":
-        return int(column[row].astype(np.int64))
+        return column[row].astype(np.int64).tolist()
     return column[row].tolist()
+
+
+def plain(value: Any) -> Any:
+    if isinstance(value, datetime):
+        return round(value.replace(tzinfo=UTC).timestamp() * 1000)
+    return value
 
 
 def flat(document: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -44,12 +50,12 @@ def flat(document: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in document.items():
         if isinstance(value, dict) and value:
             out.update(flat(value, f"{prefix}{name}."))
-        elif isinstance(value, datetime):
-            out[prefix + name] = round(value.replace(tzinfo=UTC).timestamp() * 1000)
+        elif isinstance(value, list) and all(isinstance(each, datetime) for each in value):
+            out[prefix + name] = [plain(each) for each in value]
         elif isinstance(value, bytes) and not isinstance(value, bson.Binary):
             out[prefix + name] = bson.Binary(value, 0)
         else:
-            out[prefix + name] = value
+            out[prefix + name] = plain(value)
     return out
 
 

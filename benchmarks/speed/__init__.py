@@ -1,0 +1,1 @@
+"""The speed targets, measured: each side in its own process, ratios from one run."""

@@ -1,0 +1,28 @@
+"""What the exit code of the command line means."""
+
+from __future__ import annotations
+
+from typing import Final
+
+INTERNAL: Final = 70
+
+EXIT_CODES: Final = {
+    0: "done",
+    1: "verify found something, or an error that has no code of its own",
+    2: "the question is wrong: an option, a topic, a time, a predicate",
+    3: "a log that cannot be read at all",
+    4: "a damaged log: what could be read is stored",
+    5: "the store: missing, read-only, damaged, of a newer format",
+    6: "MongoDB does not answer, or died",
+    7: "no space left on the disk",
+    8: "this content is in the store already",
+    9: "an optional package is missing",
+    INTERNAL: "a mistake in hybridlog itself",
+    130: "interrupted (Ctrl-C); nothing half-made is kept",
+    143: "ended (SIGTERM); nothing half-made is kept",
+}
+
+
+def as_text() -> str:
+    """The table for help texts, one code a line."""
+    return "\n".join(f"  {code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())

@@ -1,0 +1,137 @@
+"""Progress bars, on a terminal only."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+from hybridlog.cli.output import console, printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+
+class Bar(Protocol):
+    """Shows progress."""
+
+    def __call__(self, done: int, note: str = "") -> None:
+        """So many bytes are done; `note` stands beside the bar."""
+
+
+@contextmanager
+def progress_bar(label: str, total: int, *, quiet: bool) -> Iterator[Bar]:
+    """A bar with rate and remaining time on a terminal; nothing elsewhere.
+
+    Args:
+        label: What is under way.
+        total: Bytes in all, about.
+        quiet: No bar.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield _nothing
+        return
+    bar = _make()
+    with bar:
+        task = bar.add_task(_short(printable(label)), total=max(total, 1), note="")
+        yield _Updater(bar, task)
+
+
+class Stages:
+    """One bar over parts that each count from zero.
+
+    Args:
+        bar: Shows the sum.
+    """
+
+    def __init__(self, bar: Bar) -> None:
+        self._bar = bar
+        self._before = 0
+        self._part: tuple[str, int] | None = None
+        self._last = 0
+
+    def __call__(self, recording: str, done: int, total: int) -> None:
+        """In a recording, `done` of `total` bytes."""
+        part = (recording, total)
+        if self._part != part or done < self._last:
+            self._before += self._last
+            self._part = part
+        self._last = done
+        self._bar(self._before + done, recording)
+
+
+class LateBar:
+    """A bar that appears when there is progress to show, for work that is seldom needed.
+
+    Args:
+        label: What is under way.
+        quiet: No bar.
+    """
+
+    def __init__(self, label: str, *, quiet: bool) -> None:
+        self._label = label
+        self._quiet = quiet or not sys.stderr.isatty()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __call__(self, recording: str, done: int, total: int) -> None:
+        """In a recording, `done` of `total` bytes."""
+        if self._quiet:
+            return
+        if self._bar is None:
+            self._bar = _make()
+            self._bar.start()
+        if self._task is None:
+            self._task = self._bar.add_task(self._label, total=total, note="")
+        self._bar.update(
+            self._task, completed=done, total=total, note=_short(printable(recording))
+        )
+
+    def close(self) -> None:
+        """Take it away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+class _Updater:
+    def __init__(self, bar: Progress, task: TaskID) -> None:
+        self._bar = bar
+        self._task = task
+
+    def __call__(self, done: int, note: str = "") -> None:
+        self._bar.update(self._task, completed=done, note=_short(printable(note)))
+
+
+def _nothing(done: int, note: str = "") -> None:
+    """No bar."""
+
+
+def _make() -> Progress:
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    # Texts are names out of logs: they are never read as markup.
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=None),
+        TaskProgressColumn(),
+        TransferSpeedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(compact=True),
+        TextColumn("{task.fields[note]}", markup=False),
+        console=console(error=True),
+        transient=True,
+        expand=True,
+    )
+
+
+def _short(text: str, most: int = 22) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
