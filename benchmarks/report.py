@@ -85,7 +85,7 @@ def _rows(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
             finding.study,
             finding.about,
             _number(finding.value, finding.unit),
-            f"{_number(finding.low, finding.unit)} – {_number(finding.high, finding.unit)}",
+            f"{_number(finding.low, finding.unit)} to {_number(finding.high, finding.unit)}",
             _target(finding),
             _mark(finding),
         )
@@ -100,7 +100,7 @@ def _number(value: float, unit: str) -> str:
         text = f"{value:.3g}"
     else:
         text = f"{value:.2g}"
-    return f"{text}{unit}" if unit == "×" else f"{text} {unit}"
+    return f"{text}{unit}" if unit == "x" else f"{text} {unit}"
 
 
 def _target(finding: Finding) -> str:
@@ -116,4 +116,4 @@ def _mark(finding: Finding) -> str:
         return ""
     if finding.passed:
         return "✓ pass"
-    return "✗ missed" if not finding.aim else "– not reached"
+    return "✗ missed" if not finding.aim else "not reached"

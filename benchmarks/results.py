@@ -43,7 +43,7 @@ class Finding:
         value: The median.
         low: The least of the repetitions.
         high: The greatest of the repetitions.
-        unit: `×` for ratios, else what follows the number.
+        unit: `x` for ratios, else what follows the number.
         relation: How the value must stand to the target.
         target: None when the figure is for information.
         aim: The target is an aim: missing it fails nothing.
@@ -54,7 +54,7 @@ class Finding:
     value: float
     low: float
     high: float
-    unit: str = "×"
+    unit: str = "x"
     relation: Relation = ">="
     target: float | None = None
     aim: bool = False
@@ -124,9 +124,7 @@ def ratio(
     """
     pairs = [a / b for a, b in zip(above, below, strict=True)]
     value = statistics.median(above) / statistics.median(below)
-    return Finding(
-        study, about, value, min(pairs), max(pairs), "×", relation, target, aim=aim
-    )
+    return Finding(study, about, value, min(pairs), max(pairs), "x", relation, target, aim=aim)
 
 
 def figure(

@@ -19,6 +19,9 @@ from typing import Any
 Values = dict[str, Any]
 """What a side takes and gives: numbers, strings, lists and dicts of them."""
 
+LINGER_S = 0.1
+"""Seconds for which a mongod stays after its last user."""
+
 _WARM_BLOCK = 1 << 20
 _ROOT = Path(__file__).parents[1]
 
@@ -42,7 +45,7 @@ def run_side(function: str, arguments: Mapping[str, object], warm: Sequence[Path
         SideError: The process failed.
     """
     warm_cache(warm)
-    environment = {**os.environ, "HYBRIDLOG_MONGOD_LINGER_S": "0.2"}
+    environment = {**os.environ, "HYBRIDLOG_MONGOD_LINGER_S": str(LINGER_S)}
     for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
         environment.pop(name, None)
     done = subprocess.run(

@@ -104,7 +104,7 @@ class ChunkIndexer:
             part = self._parts.get(channel_id)
             if part is None:
                 codec = codec_for(channel, array_limit=self._array_limit)
-                stamped = any(path.path == STAMP and not path.array for path in codec.paths())
+                stamped = any(path.path == STAMP and path.type == "time" for path in codec.paths())
                 origin = Origin(
                     self._recording, self._key, channel.topic, channel.has_publish_time
                 )
@@ -210,12 +210,14 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
 def _stats(
     batch: Batch, channel: Channel, stamped: Codec | None, unreadable: int
 ) -> ChannelStats:
+    first, last = int(batch.log_time.min()), int(batch.log_time.max())
     stats = ChannelStats(
         messages=len(batch),
         payload_bytes=batch.payload_bytes,
         unreadable=unreadable,
-        first=int(batch.log_time.min()),
-        last=int(batch.log_time.max()),
+        first=first,
+        last=last,
+        longest=last - first,
     )
     if channel.has_publish_time:
         stats.first_publish = int(batch.publish_time.min())
@@ -238,4 +240,4 @@ def header_stamps(records: Records) -> NDArray[np.int64] | None:
     """The header stamps of decoded messages, ns; None when they have no header."""
     header = records.fields.get("header")
     stamp = header.fields.get("stamp") if isinstance(header, Records) else None
-    return stamp.values if isinstance(stamp, Scalars) else None
+    return stamp.values if isinstance(stamp, Scalars) and stamp.kind == "time" else None

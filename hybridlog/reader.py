@@ -13,6 +13,7 @@ answer has cost stands in `counters` afterwards.
 from __future__ import annotations
 
 import difflib
+import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -60,6 +61,8 @@ class Message:
 
     __slots__ = (
         "_codec",
+        "_documents",
+        "_row",
         "_view",
         "log_time_ns",
         "publish_time_ns",
@@ -70,7 +73,9 @@ class Message:
         "type",
     )
 
-    def __init__(self, lane: Lane, batch: Batch, seq: NDArray[np.int64], row: int) -> None:
+    def __init__(
+        self, lane: Lane, batch: Batch, seq: NDArray[np.int64], row: int, documents: _Documents
+    ) -> None:
         channel = lane.channel
         self.topic = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
@@ -83,6 +88,8 @@ class Message:
         self.recording = lane.recording.id
         self._view = batch.payload(row)
         self._codec = lane.codec
+        self._documents = documents
+        self._row = row
 
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
@@ -100,7 +107,7 @@ class Message:
     @property
     def fields(self) -> dict[str, object]:
         """Its fields as the index holds them: long arrays are summaries."""
-        return self._codec.fields(self._view)
+        return self._documents.fields(self._row)
 
     @property
     def header_stamp_ns(self) -> int | None:
@@ -127,6 +134,31 @@ class Message:
         from hybridlog.arrays import to_numpy
 
         return to_numpy(self.type, self.decode())
+
+
+class _Documents:
+    """The index documents of a piece, made for all its messages when one is asked for."""
+
+    def __init__(self, lanes: Sequence[Lane], batch: Batch) -> None:
+        self._lanes = lanes
+        self._batch = batch
+        self._bodies: dict[int, bytes] = {}
+
+    def fields(self, row: int) -> dict[str, object]:
+        import bson
+
+        if row not in self._bodies:
+            self._make(int(self._batch.channel[row]))
+        body = self._bodies[row]
+        document = struct.pack("<i", len(body) + 5) + body + b"\x00"
+        return bson.decode(document)
+
+    def _make(self, lane: int) -> None:
+        rows = np.flatnonzero(self._batch.channel == lane)
+        part = self._batch.take(rows)
+        for group in self._lanes[lane].codec.bodies(part.buffer, part.offset, part.length):
+            for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
+                self._bodies[row] = body.tobytes()
 
 
 @dataclass(frozen=True)
@@ -270,8 +302,9 @@ class Query:
         """The messages, ordered by log time, recording and arrival."""
         plan = self.plan()
         for piece in self.pieces(plan):
+            documents = _Documents(plan.lanes, piece.batch)
             for row, lane in enumerate(piece.batch.channel.tolist()):
-                yield Message(plan.lanes[lane], piece.batch, piece.seq, row)
+                yield Message(plan.lanes[lane], piece.batch, piece.seq, row, documents)
 
     def first(self) -> Message | None:
         """The first message, None when there is none."""
@@ -447,7 +480,7 @@ class Query:
                         f"{recording.id} spans {format_time(start)} to {format_time(end)}"
                     )
                     continue
-            chunks = self.store.chunks(recording.id, list(mine), bounds, self._clock)
+            chunks = self.store.chunks(recording, list(mine), bounds, self._clock)
             targets.append(Target(recording, mine, bounds, chunks))
         if outside and not targets:
             assert self._bounds is not None

@@ -57,6 +57,7 @@ class SegmentCatalog:
         channels: Sequence[int] | None = None,
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
+        longest: int | None = None,  # noqa: ARG002 - all entries are in memory
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range.
 

@@ -296,13 +296,17 @@ class Store:
 
     def chunks(
         self,
-        recording: str,
+        recording: RecordingEntry,
         channels: Sequence[int],
         bounds: tuple[int, int] | None,
         clock: str,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range."""
-        return self.catalog.chunks(recording, channels, bounds, clock)
+        longest = None
+        if recording.status != "open":
+            wanted = set(channels)
+            longest = max((c.stats.longest for c in recording.channels if c.id in wanted), default=0)
+        return self.catalog.chunks(recording.id, channels, bounds, clock, longest)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a sealed segment, kept open. Thread safe."""

@@ -7,19 +7,18 @@ import mmap
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
-from functools import lru_cache
 from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from hybridlog_storage.bson_columns import split
-from hybridlog_storage.database import Database
-from hybridlog_storage.mongod import EmbeddedMongod
 
 import hybridlog as hl
 from benchmarks.memory import mongod_peak
 from benchmarks.side import Values
+from hybridlog_storage.bson_columns import split
+from hybridlog_storage.database import Database
+from hybridlog_storage.mongod import EmbeddedMongod
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +27,7 @@ _DOCUMENTS = 1000
 """Documents in one `insert_many`."""
 _BLOCK = 5000
 _THREADS = 2
+_NAMES: dict[type, tuple[str, ...]] = {}
 
 
 def dictionaries(bag: str, directory: str) -> Values:
@@ -130,7 +130,8 @@ def _blocks(
 
 def as_dict(message: object) -> dict[str, Any]:
     """A decoded message as a dictionary that MongoDB takes."""
-    return {name: _plain(getattr(message, name)) for name in _fields(type(message))}
+    names = _field_names(type(message))
+    return {name: _plain(getattr(message, name)) for name in names}
 
 
 def _plain(value: object) -> object:
@@ -143,9 +144,12 @@ def _plain(value: object) -> object:
     return value
 
 
-@lru_cache
-def _fields(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
+def _field_names(kind: type) -> tuple[str, ...]:
+    names = _NAMES.get(kind)
+    if names is None:
+        assert is_dataclass(kind)
+        names = _NAMES[kind] = tuple(field.name for field in fields(kind))
+    return names
 
 
 def _name(topic: str) -> str:

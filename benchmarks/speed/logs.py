@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 START_NS = 1_700_000_000 * 1_000_000_000
 IMAGE_SIDE = 800
-"""Pixels; 800 × 800 `mono8` are 640 000 bytes."""
+"""Pixels; 800 by 800 `mono8` are 640 000 bytes."""
 CAMERA = (640, 480)
 """Width and height in pixels of the cameras of the drive, `mono8`."""
 CAMERA_HZ = 5.0
@@ -103,12 +103,10 @@ def bag_to_mcap(bag: Path, path: Path) -> None:
             channels[connection.id] = writer.register_channel(connection.topic, "ros1", schema)
         for connection, log_time, payload in reader.messages():
             writer.add_message(channels[connection.id], log_time, payload, log_time)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _write(
-    path: Path, types: Types, streams: list[_Stream], duration_s: float, seed: int
-) -> None:
+def _write(path: Path, types: Types, streams: list[_Stream], duration_s: float, seed: int) -> None:
     """Write a bag; it has its name only once it is whole, so it can be used again."""
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)

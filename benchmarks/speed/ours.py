@@ -89,8 +89,9 @@ def _compressed(store: Store, topic: str, start: int, end: int) -> float:
     that the `mcap` package reads.
     """
     import pymongo.database
-    from hybridlog_storage.collection_names import collection_of
     from mcap.reader import make_reader
+
+    from hybridlog_storage.collection_names import collection_of
 
     database = store.database_for("the benchmark")._database  # noqa: SLF001
     assert isinstance(database, pymongo.database.Database)

@@ -1,29 +1,49 @@
 """Commands and their options. Imports nothing heavy: `--help` answers at once."""
 
+# ruff: noqa: FBT002, PLR0917 - typer makes options of parameters
+
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from hybridlog.cli.complete import complete_recording, complete_topic
+from hybridlog.cli.exit_codes import as_text
+
+
+class _Group(TyperGroup):
+    """The commands; a reader of our output that has gone, as `head` does, is no error."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            raise typer.Exit(0) from None
+
 
 app = typer.Typer(
     name="hybridlog",
+    cls=_Group,
     help=(
         "Record what a robot says, and ask it.\n\n"
         "Payloads go into MCAP files, fields into MongoDB, one reader joins the two."
     ),
-    epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
+    epilog=(
+        "The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.\n\n"
+        f"\b\nExit codes:\n{as_text()}"
+    ),
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 
 
-class ClockName(str, Enum):
+class ClockName(StrEnum):
     """Which time a range is about."""
 
     LOG = "log"
@@ -31,7 +51,7 @@ class ClockName(str, Enum):
     HEADER = "header"
 
 
-class Compression(str, Enum):
+class Compression(StrEnum):
     """Compression of chunks."""
 
     ZSTD = "zstd"
@@ -39,7 +59,7 @@ class Compression(str, Enum):
     NONE = "none"
 
 
-class FetchFormat(str, Enum):
+class FetchFormat(StrEnum):
     """What `fetch` writes."""
 
     TABLE = "table"
@@ -53,7 +73,7 @@ class FetchFormat(str, Enum):
     RAW = "raw"
 
 
-class ExportFormat(str, Enum):
+class ExportFormat(StrEnum):
     """What `export` writes."""
 
     PARQUET = "parquet"
@@ -87,14 +107,15 @@ RecordingOption = Annotated[
         "--recording",
         "-r",
         help="Only this recording (id, name, or the beginning of an id). Repeatable.",
+        metavar="RECORDING",
         autocompletion=complete_recording,
     ),
 ]
 BetweenOption = Annotated[
     tuple[str, str] | None,
     typer.Option(
-        help="From T0 up to, not including, T1: ISO 8601, epoch seconds or nanoseconds, "
-        "+5s from the start, -10s from the end.",
+        help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
+        "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
         metavar="T0 T1",
     ),
 ]
@@ -103,7 +124,7 @@ ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite exis
 
 @app.callback(invoke_without_command=True)
 def root(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,  # noqa: FBT002
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Options before the command."""
     if version:
@@ -117,45 +138,71 @@ def root(
 def record(
     paths: Annotated[
         list[Path],
-        typer.Argument(help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files."),
+        typer.Argument(
+            help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.", metavar="PATH..."
+        ),
     ],
     store: StoreOption = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", "-t", help="Only these: name, glob, or re:REGEX. Repeatable."),
+        typer.Option(
+            "--topics",
+            "-t",
+            help="Only these: name, glob, or re:REGEX. Repeatable.",
+            metavar="TOPIC",
+        ),
     ] = None,
     exclude: Annotated[
-        list[str] | None, typer.Option("--exclude", "-x", help="Not these. Repeatable.")
+        list[str] | None,
+        typer.Option("--exclude", "-x", help="Not these. Repeatable.", metavar="TOPIC"),
     ] = None,
     between: BetweenOption = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the recording; without, the file's.")
+        str | None,
+        typer.Option(help="Name of the recording; without, the file's.", metavar="NAME"),
     ] = None,
     tag: Annotated[
         list[str] | None, typer.Option(help="Keep KEY=VALUE with it. Repeatable.", metavar="K=V")
     ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Record it even if its content is in the store.")
-    ] = False,  # noqa: FBT002
+    ] = False,
     chunk_size: Annotated[
-        str, typer.Option(help="Uncompressed size of a chunk, such as 512KiB.")
+        str,
+        typer.Option(help="Uncompressed size of a chunk, such as 512KiB.", metavar="SIZE"),
     ] = "1MiB",
     compression: Annotated[
         Compression, typer.Option(help="Compression of chunks.")
     ] = Compression.ZSTD,
     level: Annotated[int, typer.Option(help="zstd level, 1 to 19.", min=1, max=19)] = 1,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
-    quiet: QuietOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
-    """Record logs into the store; each path becomes a recording."""
+    """Record logs into the store.
+
+    Each path becomes a recording: a ROS 1 bag, a ROS 2 bag (its directory or one file), an
+    MCAP file. Content that is in the store already is refused unless --again. What of a
+    damaged log can be read is stored, and the rest is told.
+    """
     from hybridlog.cli import record as command
 
     command.run(
         paths,
         command.Choices(
-            store, topics, exclude, between, name, tag, again, chunk_size, compression.value,
-            level, mongo, as_json, quiet,
+            store,
+            topics,
+            exclude,
+            between,
+            name,
+            tag,
+            again,
+            chunk_size,
+            compression.value,
+            level,
+            mongo,
+            as_json,
+            quiet,
         ),
     )
 
@@ -164,7 +211,7 @@ def record(
 def ls(
     store: StoreOption = None,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
 ) -> None:
     """List the recordings."""
     from hybridlog.cli import look
@@ -184,9 +231,9 @@ def info(
     ] = None,
     store: StoreOption = None,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
 ) -> None:
-    """Topics, types, counts, rates, sizes, time span, clock skew, losses."""
+    """Show topics, types, rates, sizes, times, clock skew, losses."""
     from hybridlog.cli import look
 
     look.show_info(what, store, mongo, as_json=as_json)
@@ -198,9 +245,9 @@ def schema(
     store: StoreOption = None,
     recording: RecordingOption = None,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
 ) -> None:
-    """The message definition of a topic, and the fields that can be asked about."""
+    """Show a topic's message definition and its fields."""
     from hybridlog.cli import look
 
     look.show_schema(topic, store, recording, mongo, as_json=as_json)
@@ -214,6 +261,7 @@ def fetch(
             "--topic",
             "-t",
             help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+            metavar="TOPIC",
             autocompletion=complete_topic,
         ),
     ],
@@ -223,75 +271,118 @@ def fetch(
         ClockName, typer.Option(help="The time that --between is about.")
     ] = ClockName.LOG,
     at: Annotated[
-        str | None, typer.Option(help="Only the message that was current at this time.")
+        str | None,
+        typer.Option(help="Only the message that was current at this time.", metavar="T"),
     ] = None,
     where: Annotated[
         list[str] | None,
-        typer.Option(help="Only messages that satisfy: 'ranges.min < 0.5'. Repeatable."),
+        typer.Option(
+            help="Only messages that satisfy this, such as 'ranges.min < 0.5 and "
+            'header.frame_id == "laser"\'. Repeatable.',
+            metavar="PREDICATE",
+        ),
     ] = None,
     recording: RecordingOption = None,
     limit: Annotated[
         int | None, typer.Option("--limit", "-n", help="At most so many messages.", min=0)
     ] = None,
     every: Annotated[int, typer.Option(help="Only every n-th message.", min=1)] = 1,
-    reverse: Annotated[bool, typer.Option("--reverse", help="Latest first.")] = False,  # noqa: FBT002
+    reverse: Annotated[bool, typer.Option("--reverse", help="Latest first.")] = False,
     fields: Annotated[
-        str | None, typer.Option(help="Only these fields: a,b.c", metavar="A,B.C")
+        str | None,
+        typer.Option(help="Only these fields, with commas between them.", metavar="A,B.C"),
     ] = None,
-    count: Annotated[bool, typer.Option("--count", help="Only print how many.")] = False,  # noqa: FBT002
+    count: Annotated[bool, typer.Option("--count", help="Only print how many.")] = False,
     form: Annotated[
         FetchFormat | None,
         typer.Option(
             "--format",
             "-F",
-            help="Without: by the suffix of -o; a table on a terminal, else jsonl.",
+            help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write here (raw: a directory).")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Write to this file (raw: a directory); - is standard output.",
+            metavar="FILE",
+        ),
     ] = None,
-    force: ForceOption = False,  # noqa: FBT002
+    force: ForceOption = False,
     mongo: MongoOption = None,
-    quiet: QuietOption = False,  # noqa: FBT002
+    quiet: QuietOption = False,
 ) -> None:
-    """Fetch messages by topic, time and content."""
+    """Fetch messages by topic, time and content.
+
+    Without --format and -o: a table on a terminal, JSON lines elsewhere. What the answer has
+    cost, and what it may lack, is said on standard error.
+    """
     from hybridlog.cli import fetch as command
 
     command.run(
         command.Choices(
-            topic, store, between, clock.value, at, where, recording, limit, every, reverse,
-            fields, count, form.value if form else None, output, force, mongo, quiet,
+            topic,
+            store,
+            between,
+            clock.value,
+            at,
+            where,
+            recording,
+            limit,
+            every,
+            reverse,
+            fields,
+            count,
+            form.value if form else None,
+            output,
+            force,
+            mongo,
+            quiet,
         )
     )
 
 
 @app.command()
 def export(
-    output: Annotated[Path, typer.Argument(help="File (mcap, bag) or directory (tables).")],
-    form: Annotated[ExportFormat, typer.Option("--format", "-F", help="What to write.")],
+    output: Annotated[
+        Path,
+        typer.Argument(help="File (mcap, bag) or directory (parquet, csv).", metavar="OUTPUT"),
+    ],
+    form: Annotated[
+        ExportFormat | None,
+        typer.Option("--format", "-F", help="What to write; without, by the suffix (.mcap, .bag)."),
+    ] = None,
     store: StoreOption = None,
     recording: RecordingOption = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option("--topic", "-t", help="Only these. Repeatable.", autocompletion=complete_topic),
+        typer.Option(
+            "--topic", "-t", help="Only these. Repeatable.", autocompletion=complete_topic
+        ),
     ] = None,
     between: BetweenOption = None,
-    force: ForceOption = False,  # noqa: FBT002
+    force: ForceOption = False,
     mongo: MongoOption = None,
-    quiet: QuietOption = False,  # noqa: FBT002
+    quiet: QuietOption = False,
 ) -> None:
     """Export whole recordings; tables get one file a topic."""
     from hybridlog.cli import export as command
 
-    command.run(output, form.value, store, recording, topic, between, force, mongo, quiet)
+    command.run(
+        output,
+        form.value if form else None,
+        command.Choices(store, recording, topic, between, force, mongo, quiet),
+    )
 
 
 @app.command()
 def reindex(
     store: StoreOption = None,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
-    quiet: QuietOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Drop the index and make it again from the segments."""
     from hybridlog.cli import maintain
@@ -307,10 +398,13 @@ def verify(
     ] = None,
     store: StoreOption = None,
     mongo: MongoOption = None,
-    as_json: JsonOption = False,  # noqa: FBT002
-    quiet: QuietOption = False,  # noqa: FBT002
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
-    """Read everything, check checksums and references; exit 1 with a list if something is off."""
+    """Read everything, check checksums and references.
+
+    Exits with 1, and a list, when something is off.
+    """
     from hybridlog.cli import maintain
 
     maintain.verify(recording, store, mongo, as_json=as_json, quiet=quiet)
@@ -322,7 +416,7 @@ def rm(
         list[str], typer.Argument(help="Recordings.", autocompletion=complete_recording)
     ],
     store: StoreOption = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,  # noqa: FBT002
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     mongo: MongoOption = None,
 ) -> None:
     """Delete recordings, payloads and index."""
@@ -339,7 +433,7 @@ def demo(
     duration: Annotated[float, typer.Option(help="Seconds of robot time.", min=5)] = 60.0,
     seed: Annotated[int, typer.Option(help="Another number, another drive.")] = 1,
 ) -> None:
-    """Simulate a robot, record what it says, and ask it: a tour in one command."""
+    """Take a tour: simulate a robot, record it, ask it."""
     from hybridlog.demo import tour
 
     raise typer.Exit(tour.run(directory, duration_s=duration, seed=seed))

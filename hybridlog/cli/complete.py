@@ -1,40 +1,75 @@
-"""Tab completion of recordings and topics."""
+"""Tab completion of recordings and topics, out of the segments: no MongoDB is started."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
 import typer
 
-
-def _store_of(context: typer.Context) -> str | None:
-    value = context.params.get("store")
-    return str(value) if value is not None else None
+if TYPE_CHECKING:
+    from hybridlog_storage.directory import StoreDirectory
 
 
 def complete_recording(context: typer.Context, incomplete: str) -> list[str]:
     """Ids of recordings that begin with what was typed."""
-    from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.errors import HybridlogError
-
-    from hybridlog.store import store_path
-
-    try:
-        ids = StoreDirectory(store_path(_store_of(context))).recording_ids()
-    except HybridlogError:
-        return []  # a shell that completes has no place for errors
-    return [i for i in ids if i.startswith(incomplete)]
+    with _nothing_on_error():
+        return [i for i in _store(context).recording_ids() if i.startswith(incomplete)]
+    return []
 
 
 def complete_topic(context: typer.Context, incomplete: str) -> list[str]:
-    """Topics of the store that begin with what was typed, with or without the slash."""
+    """Topics that begin with what was typed; without a slash, short names as well.
+
+    A short name is offered when it stands for one topic only.
+    """
+    with _nothing_on_error():
+        topics = _topics(_store(context))
+        found = {topic for topic in topics if topic.startswith(incomplete)}
+        if incomplete and not incomplete.startswith("/"):
+            found.update(n for n in _short_names(topics) if n.startswith(incomplete))
+        return sorted(found)
+    return []
+
+
+def _store(context: typer.Context) -> StoreDirectory:
+    from hybridlog.store import store_path
     from hybridlog_storage.directory import StoreDirectory
+
+    value = context.params.get("store")
+    return StoreDirectory(store_path(os.path.expanduser(value) if value is not None else None))  # noqa: PTH111
+
+
+def _topics(directory: StoreDirectory) -> set[str]:
+    from hybridlog.entries import read_summaries
+
+    return {
+        channel.topic
+        for recording in directory.recording_ids()
+        for summary in read_summaries(directory, recording).values()
+        for channel in summary.channels.values()
+    }
+
+
+def _short_names(topics: set[str]) -> Iterator[str]:
+    """Ends of topics, in whole parts, that no two topics share."""
+    owners: dict[str, int] = {}
+    for topic in topics:
+        parts = topic.strip("/").split("/")
+        for start in range(len(parts)):
+            name = "/".join(parts[start:])
+            owners[name] = owners.get(name, 0) + 1
+    yield from (name for name, count in owners.items() if count == 1)
+
+
+@contextmanager
+def _nothing_on_error() -> Iterator[None]:
+    """A shell that completes has no place for errors."""
     from hybridlog_storage.errors import HybridlogError
 
-    from hybridlog.segment_catalog import SegmentCatalog
-    from hybridlog.store import store_path
-
     try:
-        catalog = SegmentCatalog(StoreDirectory(store_path(_store_of(context))))
-        topics = {c.topic for r in catalog.recordings() for c in r.channels}
-    except HybridlogError:
-        return []
-    return sorted(t for t in topics if t.startswith((incomplete, f"/{incomplete}")))
+        yield
+    except (HybridlogError, OSError):
+        return

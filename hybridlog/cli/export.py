@@ -2,68 +2,127 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hybridlog.cli import output
+from hybridlog.cli.coverage import gaps
+from hybridlog.cli.fetch import form_of, write
+from hybridlog.cli.opening import opened
+from hybridlog.cli.placing import check_room, replacing
+from hybridlog.cli.stopping import Stopped
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, UsageError
-
-from hybridlog.cli import output
-from hybridlog.cli.fetch import make_room, write
 
 if TYPE_CHECKING:
     from hybridlog.reader import Query
 
+_WHOLE = {"mcap", "bag"}
 
-def run(
-    target: Path,
-    form: str,
-    store: Path | None,
-    recordings: list[str] | None,
-    topics: list[str] | None,
-    between: tuple[str, str] | None,
-    force: bool,  # noqa: FBT001
-    mongo: str | None,
-    quiet: bool,  # noqa: FBT001
-) -> None:
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """The options of the command, as typed."""
+
+    store: Path | None
+    recordings: list[str] | None
+    topics: list[str] | None
+    between: tuple[str, str] | None
+    force: bool
+    mongo: str | None
+    quiet: bool
+
+
+def run(target: Path, form: str | None, choices: Choices) -> None:
     """Write everything that is chosen."""
-    with output.opened(store, mongo) as opened:
-        query = opened.topic(*topics) if topics else opened.all_topics()
-        if recordings:
-            query = query.in_recording(*recordings)
-        if between is not None:
-            query = query.between(*between)
-        if form in {"mcap", "bag"}:
-            make_room(target, force=force)
+    form = form or _form(target)
+    force, quiet = choices.force, choices.quiet
+    if form in _WHOLE:
+        check_room(target, form=form, force=force)
+    with opened(choices.store, choices.mongo, quiet=quiet) as view:
+        query = view.topic(*choices.topics) if choices.topics else view.all_topics()
+        if not query.topics:
+            raise UsageError("The store is empty, there is nothing to export.")
+        if choices.recordings:
+            query = query.in_recording(*choices.recordings)
+        if choices.between is not None:
+            query = query.between(*choices.between)
+        if form in _WHOLE:
+            _whole(query, form, target, force=force, quiet=quiet)
+        else:
+            _tables(query, form, target, force=force, quiet=quiet)
+        if not quiet:
+            chosen = [r for r in view.recordings() if r.id in query.recording_ids]
+            for line in gaps(chosen, query.topics, choices.between):
+                output.note(line)
+
+
+def _form(target: Path) -> str:
+    form = form_of(target)
+    if form not in _WHOLE:
+        raise UsageError(
+            f"{target} does not say what to export: end it in .mcap or .bag, or name a directory "
+            "for tables and add --format parquet or csv."
+        )
+    return form
+
+
+def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -> None:
+    try:
+        with replacing(target, form=form, force=force):
             write(query, form, target, quiet=quiet)
-            if not quiet:
-                output.note(
-                    f"{target}: {query.counters.messages} messages, "
-                    f"{output.size(target.stat().st_size)}"
-                )
-            return
-        _tables(query, form, target, force=force, quiet=quiet)
+    except Stopped as stopped:
+        stopped.consequence = f"{target} is not written."
+        raise
+    _tell(target, query, quiet=quiet)
 
 
 def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     """One file a topic; a topic that is no table is said and left out."""
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(f"{directory} is a file; tables go into a directory, one a topic.")
-    directory.mkdir(parents=True, exist_ok=True)
+    paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
+    made = _make(directory)
+    for path in paths.values():
+        check_room(path, form=form, force=force)
     left_out: list[HybridlogError] = []
-    for topic in query.topics:
-        one = query.only(topic)
-        path = directory / f"{collection_of(topic)}.{form}"
-        make_room(path, force=force)
-        try:
-            write(one, form, path, quiet=quiet)
-        except DefinitionError as error:
-            output.note(str(error))
-            left_out.append(error)
-            continue
-        if not quiet:
-            output.note(
-                f"{path}: {one.counters.messages} messages, {output.size(path.stat().st_size)}"
-            )
-    if left_out and len(left_out) == len(query.topics):
+    try:
+        for topic, path in paths.items():
+            one = query.only(topic)
+            try:
+                write(one, form, path, quiet=quiet)
+            except DefinitionError as error:
+                output.note(str(error))
+                left_out.append(error)
+                continue
+            _tell(path, one, quiet=quiet)
+    except Stopped as stopped:
+        stopped.consequence = f"The files named above are whole, {path} is not written."
+        raise
+    finally:
+        if made:
+            with contextlib.suppress(OSError):  # it holds what was written
+                directory.rmdir()
+    if len(left_out) == len(paths):
         raise left_out[0]
+
+
+def _make(directory: Path) -> bool:
+    """Make a directory for tables; whether it was not there before."""
+    if directory.is_dir():
+        return False
+    if directory.exists():
+        raise UsageError(f"{directory} is a file; tables go into a directory, one a topic.")
+    try:
+        directory.mkdir(parents=True)
+    except OSError as error:
+        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
+    return True
+
+
+def _tell(path: Path, query: Query, *, quiet: bool) -> None:
+    if not quiet:
+        output.note(
+            f"{path}: {output.counted(query.counters.messages, 'message')}, "
+            f"{output.size(path.stat().st_size)}"
+        )

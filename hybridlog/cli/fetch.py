@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import UsageError
-
 from hybridlog.cli import output
+from hybridlog.cli.coverage import gaps, tell_unreadable
+from hybridlog.cli.opening import opened
+from hybridlog.cli.placing import check_room, replacing
+from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.screen import print_answer
+from hybridlog.cli.stopping import Stopped
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -32,8 +37,8 @@ _SUFFIXES = {
     ".mcap": "mcap",
     ".bag": "bag",
 }
-_SCREEN_ROWS = 50
-_WIDEST_CELL = 40
+Progress = Callable[[], None]
+_TEXT = {"jsonl", "csv"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,49 +65,91 @@ class Choices:
 
 
 def run(choices: Choices) -> None:
-    """Answer, and say on standard error what the answer has cost."""
+    """Answer, and say on standard error what the answer has cost and what it may lack."""
     form = _form(choices)
+    path = _path(choices, form)
     started = time.monotonic()
-    with output.opened(choices.store, choices.mongo) as store:
+    with opened(choices.store, choices.mongo, quiet=choices.quiet) as store:
         query = _query(store, choices)
         if choices.count:
-            print(query.count())
+            output.say(str(query.count()))
         elif form == "table":
-            _print_tables(query, choices)
+            query = print_answer(query, choices.limit)
+        elif path is None:
+            write(query, form, sys.stdout.buffer, quiet=True)
         else:
-            target = _target(choices, form)
-            write(query, form, target, quiet=choices.quiet)
+            _write_file(query, form, path, choices)
+        sys.stdout.flush()
         if not choices.quiet:
-            _closing_line(query.counters, time.monotonic() - started)
+            _closing_line(query.counters, time.monotonic() - started, count=choices.count)
+            _tell_gaps(store, query, choices)
+
+
+def _write_file(query: Query, form: str, path: Path, choices: Choices) -> None:
+    try:
+        with replacing(path, form=form, force=choices.force):
+            write(query, form, path, quiet=choices.quiet)
+    except Stopped as stopped:
+        stopped.consequence = f"{path} is not written."
+        raise
 
 
 def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> None:
-    """Write a query's answer to a file or a stream; all of it or nothing."""
-    from hybridlog.export import FORMATS, open_batch_writer, open_row_writer, open_table_writer
+    """Write a query's answer to a file or a stream; all of it or nothing.
 
-    if FORMATS[form].kind == "exact":
-        from hybridlog.latched import in_force
+    Args:
+        query: The question.
+        form: A format of `hybridlog.export.FORMATS`.
+        target: Path or binary stream.
+        quiet: No progress bar.
+    """
+    from hybridlog.export import FORMATS
 
-        with open_batch_writer(form, target, profile=_profile(query)) as exact:
-            total = 0 if quiet else query.size_hint()
-            with output.progress_bar("fetch", total, quiet=quiet) as bar:
-                if form != "raw":
-                    for batch, lanes in in_force(query):
-                        exact.write(batch, [lane.channel for lane in lanes])
-                for batch, lanes in query.batches():
-                    exact.write(batch, [lane.channel for lane in lanes])
-                    bar(query.counters.payload_bytes, f"{query.counters.messages} messages")
-        return
+    total = 0 if quiet else query.size_hint()
+    with progress_bar(form, total, quiet=quiet) as bar:
+        counters = query.counters
+
+        def progress() -> None:
+            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
+
+        if FORMATS[form].kind == "exact":
+            _write_exact(query, form, target, progress)
+        else:
+            _write_rows(query, form, target, progress)
+
+
+def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:
+    from hybridlog.export import open_batch_writer
+    from hybridlog.latched import in_force
+
+    with open_batch_writer(form, target, profile=_profile(query)) as exact:
+        if form != "raw":
+            for batch, lanes in in_force(query):
+                exact.write(batch, [lane.channel for lane in lanes])
+        for batch, lanes in query.batches():
+            exact.write(batch, [lane.channel for lane in lanes])
+            progress()
+
+
+def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> None:
+    from hybridlog.export import open_table_writer
+    from hybridlog.export.jsonl import JsonlWriter
     from hybridlog.tables import stream
 
+    written = 0
     if form == "jsonl":
-        with open_row_writer(form, target) as rows:
+        with JsonlWriter(target) as rows:
             for table in stream(query):
                 rows.write_table(_for_json(table, query))
-        return
-    with open_table_writer(form, target) as tables:
-        for table in stream(query):
-            tables.write(table)
+                written += table.num_rows
+                progress()
+    else:
+        with open_table_writer(form, target) as tables:
+            for table in stream(query):
+                tables.write(table)
+                written += table.num_rows
+                progress()
+    tell_unreadable(query.counters.messages - written)
 
 
 def _query(store: Store, choices: Choices) -> Query:
@@ -115,10 +162,8 @@ def _query(store: Store, choices: Choices) -> Query:
     for predicate in choices.where or ():
         query = query.where(predicate)
     if choices.fields is not None:
-        query = query.fields(*(name.strip() for name in choices.fields.split(",") if name.strip()))
+        query = query.fields(*_names(choices.fields))
     if choices.at is not None:
-        if choices.between is not None:
-            raise UsageError("--at and --between exclude each other.")
         return query.just_at(choices.at)
     if choices.every > 1:
         query = query.every(choices.every)
@@ -129,47 +174,65 @@ def _query(store: Store, choices: Choices) -> Query:
     return query
 
 
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise UsageError(f"--fields wants names with commas between them, not {text!r}.")
+    return list(dict.fromkeys(names))
+
+
 def _form(choices: Choices) -> str:
+    if choices.at is not None:
+        for given, option in (
+            (choices.between is not None, "--between"),
+            (choices.limit is not None, "--limit"),
+            (choices.every > 1, "--every"),
+            (choices.reverse, "--reverse"),
+            (choices.clock != "log", "--clock"),
+        ):
+            if given:
+                raise UsageError(f"--at asks for one message, by log time; {option} does not fit.")
     if choices.form is not None:
         form = choices.form
-    elif choices.output is not None:
-        form = _SUFFIXES.get(choices.output.suffix.lower(), "")
-        if not form:
-            raise UsageError(
-                f"The name {choices.output} does not say what to write: add --format, or end it "
-                f"in {', '.join(_SUFFIXES)}."
-            )
-    else:
+    elif choices.output is None or str(choices.output) == "-":
         form = "table" if sys.stdout.isatty() else "jsonl"
+    else:
+        form = form_of(choices.output)
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen; use --format csv or parquet with -o.")
     return form
 
 
-def _target(choices: Choices, form: str) -> Target:
+def form_of(path: Path) -> str:
+    """The format that the end of a name stands for.
+
+    Raises:
+        UsageError: It stands for none.
+    """
+    form = _SUFFIXES.get(path.suffix.lower())
+    if form is None:
+        raise UsageError(
+            f"The name {path} does not say what to write: add --format, or end it in "
+            f"{', '.join(_SUFFIXES)}."
+        )
+    return form
+
+
+def _path(choices: Choices, form: str) -> Path | None:
+    """Where to; None for standard output. Refused before anything is opened."""
+    if choices.count:
+        return None
     if choices.output is None or str(choices.output) == "-":
-        if form not in {"jsonl", "csv"} and sys.stdout.isatty():
+        if form not in {*_TEXT, "table"} and sys.stdout.isatty():
             raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
-        return sys.stdout.buffer
-    make_room(choices.output, force=choices.force)
+        return None
+    check_room(choices.output, form=form, force=choices.force)
     return choices.output
-
-
-def make_room(path: Path, *, force: bool) -> None:
-    """Refuse to overwrite without --force; with it, an old directory goes away."""
-    if not path.exists() or not (path.is_file() or path.is_dir()):
-        return
-    if not force:
-        raise UsageError(f"{path} exists; --force overwrites it.")
-    if path.is_dir() and not path.is_symlink():
-        if not (path / "index.csv").exists() and any(path.iterdir()):
-            raise UsageError(f"{path} is a directory that holds other things; it is not touched.")
-        shutil.rmtree(path)
 
 
 def _profile(query: Query) -> str:
     encodings = {lane.channel.message_encoding for lane in query.lanes()}
-    return {("ros1",): "ros1", ("cdr",): "ros2"}.get(tuple(sorted(encodings)), "")
+    return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
 
 
 def _for_json(table: pa.Table, query: Query) -> pa.Table:
@@ -185,52 +248,19 @@ def _for_json(table: pa.Table, query: Query) -> pa.Table:
     return table.add_column(0, "log_time_ns", time_ns)
 
 
-def _print_tables(query: Query, choices: Choices) -> None:
-    """Rows on the screen, long arrays in short."""
-    from hybridlog.tables import stream
-
-    wanted = query if choices.limit is not None else query.limit(_SCREEN_ROWS)
-    rows: list[tuple[str, ...]] = []
-    names: list[str] = []
-    for table in stream(wanted):
-        names = table.column_names
-        columns = [[_cell(v) for v in column] for column in table.columns]
-        rows.extend(zip(*columns, strict=True))
-    output.print_records(names, rows)
-    for name in ("messages", "payload_bytes", "bytes_read", "chunks_read", "documents_read"):
-        setattr(query.counters, name, getattr(wanted.counters, name))
-    if choices.limit is None and len(rows) == _SCREEN_ROWS:
-        output.note(
-            f"The first {_SCREEN_ROWS} messages; --limit shows more, -o FILE writes them all."
-        )
-
-
-def _cell(value: pa.Scalar) -> str:
-    """A value in few characters."""
-    import pyarrow as pa
-
-    if not value.is_valid:
-        return ""
-    if pa.types.is_timestamp(value.type):
-        from hybridlog.query.times import format_time
-
-        return format_time(value.value)
-    if pa.types.is_duration(value.type):
-        return f"{value.value} ns"
-    if pa.types.is_list(value.type) or pa.types.is_fixed_size_list(value.type):
-        inner = value.values
-        if len(inner) <= 4:
-            return f"[{', '.join(_cell(v) for v in inner)}]"
-        return f"[{_cell(inner[0])}, {_cell(inner[1])}, … n={len(inner)}]"
-    if pa.types.is_floating(value.type):
-        return f"{value.as_py():.6g}"
-    text = str(value.as_py())
-    return text if len(text) <= _WIDEST_CELL else text[: _WIDEST_CELL - 1] + "…"
-
-
-def _closing_line(counters: Counters, elapsed: float) -> None:
+def _closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
+    taken = f"{output.size(counters.bytes_read)} read from disk"
+    if counters.chunks_read:
+        taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
+    found = "" if count else f"{output.counted(counters.messages, 'message')}, "
     output.note(
-        f"{counters.messages} messages, {output.size(counters.payload_bytes)} of payload, "
-        f"{output.size(counters.bytes_read)} read from disk in {counters.chunks_read} chunks, "
-        f"{counters.documents_read} index documents, {elapsed:.3f} s"
+        f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
+        f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"
     )
+
+
+def _tell_gaps(store: Store, query: Query, choices: Choices) -> None:
+    recordings = [r for r in store.recordings() if r.id in query.recording_ids]
+    between = choices.between if choices.clock == "log" else None
+    for line in gaps(recordings, query.topics, between):
+        output.note(line)

@@ -5,41 +5,31 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlog_storage.errors import StoreError, TopicError
-
-from hybridlog.cli import output
+from hybridlog.cli import coverage, output
+from hybridlog.cli.opening import opened
+from hybridlog.cli.segment import show_segment
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
+_STATUS = {
+    "open": "being recorded",
+    "damaged": "source damaged",
+    "recovered": "cut short by a crash",
+}
+
 
 def list_recordings(store: Path | None, mongo: str | None, *, as_json: bool) -> None:
     """Print one line a recording."""
-    from hybridlog.query.times import format_duration, format_time
-
-    with output.opened(store, mongo) as opened:
-        recordings = opened.recordings()
+    with opened(store, mongo, quiet=as_json) as view:
+        recordings = view.recordings()
     if as_json:
         output.print_json([_brief(r) for r in recordings])
         return
     if not recordings:
         output.note("The store is empty: `hybridlog record FILE` fills it.")
         return
-    rows = []
-    for r in recordings:
-        span = r.span
-        rows.append(
-            (
-                r.id,
-                format_time(span[0]) if span else "-",
-                format_duration(span[1] - span[0]) if span else "-",
-                str(len({c.topic for c in r.channels})),
-                str(r.messages),
-                output.size(r.stored_bytes),
-                r.status,
-                " ".join(f"{k}={v}" for k, v in sorted(r.tags.items())),
-            )
-        )
     output.print_table(
         [
             ("recording", "left"),
@@ -48,22 +38,39 @@ def list_recordings(store: Path | None, mongo: str | None, *, as_json: bool) -> 
             ("topics", "right"),
             ("messages", "right"),
             ("stored", "right"),
-            ("status", "left"),
-            ("tags", "left"),
+            ("note", "left"),
         ],
-        rows,
+        [_line(r) for r in recordings],
+    )
+
+
+def _line(entry: RecordingEntry) -> tuple[str, ...]:
+    span = entry.span
+    notes = [] if entry.status == "complete" else [_STATUS.get(entry.status, entry.status)]
+    if entry.name != entry.id:
+        notes.append(entry.name)
+    notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
+    return (
+        entry.id,
+        output.short_time(span[0]) if span else "-",
+        output.short_duration(span[1] - span[0]) if span else "-",
+        str(len({c.topic for c in entry.channels})),
+        str(entry.messages),
+        output.size(entry.stored_bytes),
+        " ".join(notes),
     )
 
 
 def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_json: bool) -> None:
     """Print what a recording or a segment file holds."""
-    if what is not None and (what.endswith(".mcap") or "/" in what) and Path(what).is_file():
-        _show_segment(Path(what), as_json=as_json)
+    if what is not None and _is_segment(what):
+        show_segment(Path(what), as_json=as_json)
         return
-    with output.opened(store, mongo) as opened:
-        chosen = opened.select([what]) if what is not None else opened.recordings()
-        database = opened.database.name if opened.database is not None else None
-        address = opened.database.address if opened.database is not None else None
+    with opened(store, mongo, quiet=as_json) as view:
+        chosen = view.select([what]) if what is not None else view.recordings()
+        index = "MongoDB is away"
+        if view.database is not None:
+            index = f"database {view.database.name} at {view.database.address}"
     if as_json:
         full = [_full(r) for r in chosen]
         output.print_json(full[0] if what is not None else full)
@@ -72,10 +79,14 @@ def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_jso
         output.note("The store is empty: `hybridlog record FILE` fills it.")
     for number, entry in enumerate(chosen):
         if number:
-            output.note("")
-        _print_recording(entry)
-    if database is not None and chosen:
-        output.note(f"index: database {database} at {address}")
+            output.say()
+        _print_recording(entry, index)
+
+
+def _is_segment(what: str) -> bool:
+    """A file by its path; the id of a recording has no slash, and may end in nothing of ours."""
+    looks = "/" in what or what.endswith((".mcap", ".mcap.open"))
+    return looks and Path(what).exists()
 
 
 def show_schema(
@@ -87,8 +98,8 @@ def show_schema(
     as_json: bool,
 ) -> None:
     """Print a topic's definition and the paths that can be asked about."""
-    with output.opened(store, mongo) as opened:
-        query = opened.topic(topic)
+    with opened(store, mongo, quiet=as_json) as view:
+        query = view.topic(topic)
         if recordings:
             query = query.in_recording(*recordings)
         lanes = query.lanes()
@@ -102,7 +113,12 @@ def show_schema(
             seen[key]["recordings"].append(lane.recording.id)
             continue
         text = None
-        if schema is not None and schema.encoding in {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}:
+        if schema is not None and schema.encoding in {
+            "ros1msg",
+            "ros2msg",
+            "ros2idl",
+            "jsonschema",
+        }:
             text = bytes(schema.data).decode("utf-8", "replace")
         seen[key] = {
             "topic": lane.channel.topic,
@@ -121,19 +137,19 @@ def show_schema(
         return
     for item in seen.values():
         encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
-        print(output.printable(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})"))
+        output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
         if item["definition"]:
             for line in str(item["definition"]).splitlines():
-                print("  " + output.printable(line))
+                output.say("  " + line)
         if item["not_indexed"]:
-            print(f"not indexed: {output.printable(str(item['not_indexed']))}")
+            output.say(f"not indexed: {item['not_indexed']}")
         if item["fields"]:
-            print()
+            output.say()
             output.print_table(
                 [("field", "left"), ("type", "left"), ("asked as", "left")],
                 [(f["path"], f["type"], _asked_as(f)) for f in item["fields"]],
             )
-        print()
+        output.say()
 
 
 def _asked_as(field: dict[str, Any]) -> str:
@@ -165,8 +181,8 @@ def _full(entry: RecordingEntry) -> dict[str, Any]:
     return {
         **_brief(entry),
         "chunks": entry.chunks,
-        "losses": entry.end.get("losses", []),
-        "damage": entry.end.get("damage", []),
+        "coverage": coverage.describe(entry, coverage.losses_of(entry)),
+        "losses": coverage.losses_of(entry),
         "channels": [
             {
                 "topic": c.topic,
@@ -207,34 +223,34 @@ def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
     }
 
 
-def _print_recording(entry: RecordingEntry) -> None:
+def _print_recording(entry: RecordingEntry, index: str) -> None:
     from hybridlog.query.times import format_duration, format_time
 
     span = entry.span
-    losses = entry.end.get("losses", [])
-    lost = sum(loss["count"] or 0 for loss in losses)
-    unknown = any(loss["count"] is None for loss in losses)
+    losses = coverage.losses_of(entry)
+    source = entry.source
     rows = [
         ("name", entry.name),
-        ("status", entry.status),
-        ("source", f"{entry.source['path']} ({entry.source['kind']}, "
-                   f"{output.size(entry.source['bytes'])})"),
+        ("status", _STATUS.get(entry.status, entry.status)),
+        ("source", f"{source['path']} ({source['kind']}, {output.size(source['bytes'])})"),
         ("start", format_time(span[0]) if span else "-"),
         ("last", format_time(span[1]) if span else "-"),
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
         ("messages", str(entry.messages)),
-        ("stored", f"{output.size(entry.stored_bytes)} in {entry.segments} segments, "
-                   f"{entry.chunks} chunks"),
-        ("coverage", _coverage(entry.messages, lost, places=len(losses), unknown=unknown)),
+        (
+            "stored",
+            f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
+            f"{output.counted(entry.chunks, 'chunk')}",
+        ),
+        ("coverage", coverage.describe(entry, losses)),
+        *(("", coverage.line_of(loss)) for loss in losses),
+        *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
+        ("index", index),
     ]
-    if entry.tags:
-        rows.append(("tags", " ".join(f"{k}={v}" for k, v in sorted(entry.tags.items()))))
     output.print_table([("recording", "left"), (entry.id, "left")], rows)
-    for loss in losses:
-        place = f" at byte {loss['offset']}" if loss["offset"] is not None else ""
-        output.note(f"lost: {loss['count'] if loss['count'] is not None else '?'} messages, "
-                    f"{loss['cause']}: {loss['file']}{place}: {loss['reason']}")
-    print()
+    if not entry.channels:
+        return
+    output.say()
     output.print_table(
         [
             ("topic", "left"),
@@ -249,17 +265,7 @@ def _print_recording(entry: RecordingEntry) -> None:
     )
 
 
-def _coverage(messages: int, lost: int, *, places: int, unknown: bool) -> str:
-    if not places:
-        return "complete"
-    least = "at least " if unknown else ""
-    share = 100 * messages / (messages + lost) if messages + lost else 0.0
-    return f"{least}{lost} messages lost in {places} places ({share:.2f} % there)"
-
-
 def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
-    from hybridlog.query.times import format_duration
-
     stats = channel.stats
     rate = _rate(channel)
     notes = []
@@ -271,8 +277,7 @@ def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
         notes.append("latched")
     skew = "-"
     if stats.stamped:
-        mean = round(stats.skew_sum / stats.stamped)
-        skew = ("-" if mean < 0 else "") + format_duration(abs(mean))
+        skew = output.short_duration(round(stats.skew_sum / stats.stamped))
     return (
         channel.topic,
         channel.type or channel.message_encoding,
@@ -281,49 +286,4 @@ def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
         output.size(stats.payload_bytes),
         skew,
         "; ".join(notes),
-    )
-
-
-def _show_segment(path: Path, *, as_json: bool) -> None:
-    """What a segment file (or any sealed MCAP of ours) says of itself."""
-    from hybridlog_storage.segment_reader import SegmentReader
-
-    stem = path.name.split(".")[0]
-    if path.name.endswith(".open"):
-        raise StoreError(f"{path} is being written, or was left by a crash; open its store first.")
-    with SegmentReader(path, int(stem) if stem.isdigit() else 0) as reader:
-        summary = reader.summary()
-        bytes_all = reader.size
-    rows = [
-        (c.topic, c.schema.name if c.schema else "", str(summary.counts.get(i, 0)),
-         str(sum(i in place.channels for place in summary.chunks)))
-        for i, c in sorted(summary.channels.items())
-    ]
-    if as_json:
-        output.print_json(
-            {
-                "segment": str(path),
-                "bytes": bytes_all,
-                "recording": summary.recording,
-                "end": summary.end,
-                "chunks": len(summary.chunks),
-                "channels": [
-                    {"topic": t, "type": k, "messages": int(n), "chunks": int(m)}
-                    for t, k, n, m in rows
-                ],
-            }
-        )
-        return
-    output.print_table(
-        [("segment", "left"), (str(path), "left")],
-        [
-            ("recording", str(summary.recording.get("id"))),
-            ("bytes", output.size(bytes_all)),
-            ("chunks", str(len(summary.chunks))),
-            ("messages", str(sum(summary.counts.values()))),
-        ],
-    )
-    print()
-    output.print_table(
-        [("topic", "left"), ("type", "left"), ("messages", "right"), ("chunks", "right")], rows
     )

@@ -7,10 +7,9 @@ import sys
 import traceback
 from typing import NoReturn, TextIO
 
-from hybridlog_storage.errors import HybridlogError
-
 from hybridlog.cli import stopping
 from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
+from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
 
@@ -46,7 +45,7 @@ def _run() -> int:
         # What the library maps carries a cure; this is the rest, such as a failing disk.
         _complain(str(error))
         return HybridlogError.exit_code
-    except Exception:  # noqa: BLE001 - the last resort
+    except Exception:
         traceback.print_exc()
         _complain("this is a mistake in hybridlog; please report it with the lines above.")
         return INTERNAL

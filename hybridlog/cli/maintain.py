@@ -6,28 +6,27 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
-from hybridlog_storage.errors import UsageError
 
 from hybridlog.cli import output
-
-if TYPE_CHECKING:
-    from hybridlog.maintenance import Progress
-
-
-def _report(bar: output.Bar) -> Progress:
-    return lambda recording, done, total: bar(done, recording)
+from hybridlog.cli.opening import opened
+from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.stopping import Stopped
+from hybridlog_storage.errors import UsageError
 
 
 def reindex(store: Path | None, mongo: str | None, *, as_json: bool, quiet: bool) -> None:
     """Make the index anew."""
     started = time.monotonic()
-    with output.opened(store, mongo, needs_database=True) as opened:
-        total = sum(r.stored_bytes for r in opened.recordings())
-        with output.progress_bar("reindex", total, quiet=quiet) as bar:
-            recordings = opened.reindex(_report(bar))
+    with opened(store, mongo, needs_database=True, quiet=quiet) as view:
+        total = sum(r.stored_bytes for r in view.recordings())
+        try:
+            with progress_bar("reindex", total, quiet=quiet) as bar:
+                recordings = view.reindex(Stages(bar))
+        except Stopped as stopped:
+            stopped.consequence = "The next command that opens the store finishes the index."
+            raise
     messages = sum(r.messages for r in recordings)
     elapsed = time.monotonic() - started
     if as_json:
@@ -35,7 +34,10 @@ def reindex(store: Path | None, mongo: str | None, *, as_json: bool, quiet: bool
             {"recordings": len(recordings), "messages": messages, "seconds": round(elapsed, 3)}
         )
     elif not quiet:
-        print(f"{len(recordings)} recordings, {messages} messages indexed in {elapsed:.2f} s")
+        output.say(
+            f"{output.counted(len(recordings), 'recording')}, "
+            f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
+        )
 
 
 def verify(
@@ -48,22 +50,25 @@ def verify(
 ) -> None:
     """Read and compare everything; exit 1 when something is off."""
     started = time.monotonic()
-    with output.opened(store, mongo, needs_database=True) as opened:
-        total = max((r.stored_bytes for r in opened.recordings()), default=0)
-        with output.progress_bar("verify", total, quiet=quiet) as bar:
-            result = opened.verify(recordings or None, _report(bar))
+    with opened(store, mongo, needs_database=True, quiet=quiet) as view:
+        chosen = view.select(recordings) if recordings else view.recordings()
+        total = sum(r.stored_bytes for r in chosen)
+        with progress_bar("verify", total, quiet=quiet) as bar:
+            result = view.verify(recordings or None, Stages(bar))
     elapsed = time.monotonic() - started
     if as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
         for finding in result.findings:
-            print(output.printable(f"{finding.recording}: {finding.place}: {finding.problem}"))
+            output.say(f"{finding.recording}: {finding.place}: {finding.problem}")
         if not quiet:
-            print(
-                f"{result.recordings} recordings, {result.chunks} chunks, "
-                f"{result.messages} messages, {output.size(result.bytes_read)} read in "
-                f"{elapsed:.2f} s: "
-                + (f"{len(result.findings)} problems" if result.findings else "all is well")
+            problems = output.counted(len(result.findings), "problem")
+            output.say(
+                f"{output.counted(result.recordings, 'recording')}, "
+                f"{output.counted(result.chunks, 'chunk')}, "
+                f"{output.counted(result.messages, 'message')}, "
+                f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: "
+                f"{problems if result.findings else 'all is well'}"
             )
     if result.findings:
         raise typer.Exit(1)
@@ -71,13 +76,15 @@ def verify(
 
 def remove(recordings: list[str], store: Path | None, mongo: str | None, *, yes: bool) -> None:
     """Delete recordings, after asking."""
-    with output.opened(store, mongo, needs_database=True) as opened:
-        chosen = opened.select(recordings)
+    with opened(store, mongo, needs_database=True) as view:
+        chosen = view.select(recordings)
         if not yes:
             names = ", ".join(r.id for r in chosen)
             if not sys.stdin.isatty():
                 raise UsageError(f"Deleting {names} for good needs --yes.")
-            typer.confirm(f"Delete {names} for good?", abort=True)
+            if not typer.confirm(f"Delete {names} for good?", err=True):
+                output.note("Nothing is deleted.")
+                raise typer.Exit(1)
         for entry in chosen:
-            opened.remove(entry.id)
-            print(f"deleted {entry.id}")
+            view.remove(entry.id)
+            output.say(f"deleted {entry.id}")

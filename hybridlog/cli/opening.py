@@ -11,9 +11,8 @@ from hybridlog.cli.output import counted, note
 from hybridlog.cli.progress import LateBar
 
 if TYPE_CHECKING:
-    from hybridlog_storage.recovery import Recovered
-
     from hybridlog.store import Store
+    from hybridlog_storage.recovery import Recovered
 
 
 @contextmanager
@@ -59,8 +58,7 @@ def _tell(store: Store) -> None:
         note(f"Recording {recording} has no files any more; it is out of the index.")
     if store.without_database is not None:
         note(
-            "MongoDB is away, so only topics and times can be asked for: "
-            f"{store.without_database}"
+            f"MongoDB is away, so only topics and times can be asked for: {store.without_database}"
         )
 
 

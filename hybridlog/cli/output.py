@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from hybridlog_storage.errors import UsageError
@@ -66,7 +65,7 @@ def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) 
             cell.rjust(width) if side == "right" else cell.ljust(width)
             for cell, width, (_, side) in zip(row, widths, columns, strict=True)
         )
-        print(line.rstrip())  # noqa: T201
+        say(line.rstrip())
 
 
 def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
@@ -80,9 +79,9 @@ def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
 def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:
     """Print one message: a title and a line a field."""
     width = max((len(name) for name, _ in fields), default=0)
-    print(printable(title))  # noqa: T201
+    say(title)
     for name, value in fields:
-        print(printable(f"  {name:<{width}}  {value}"))  # noqa: T201
+        say(f"  {name:<{width}}  {value}")
 
 
 def printable(text: str) -> str:
@@ -96,6 +95,11 @@ def _escaped(code: int) -> str:
     if code < 0x100:
         return f"\\x{code:02x}"
     return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def say(text: str = "") -> None:
+    """A line of the answer, on standard output."""
+    print(printable(text))  # noqa: T201
 
 
 def print_json(value: object) -> None:

@@ -84,9 +84,7 @@ class LateBar:
             self._bar.start()
         if self._task is None:
             self._task = self._bar.add_task(self._label, total=total, note="")
-        self._bar.update(
-            self._task, completed=done, total=total, note=_short(printable(recording))
-        )
+        self._bar.update(self._task, completed=done, total=total, note=_short(printable(recording)))
 
     def close(self) -> None:
         """Take it away."""

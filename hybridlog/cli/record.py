@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import typer
+
+from hybridlog.cli import output
+from hybridlog.cli.opening import opened
+from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.stopping import Stopped
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -18,18 +23,12 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 
-from hybridlog.cli import output
-from hybridlog.cli.opening import opened
-from hybridlog.cli.progress import progress_bar
-from hybridlog.cli.stopping import Stopped
-
 if TYPE_CHECKING:
-    from hybridlog_storage.segment_writer import SegmentSettings
-
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog.store import Store
+    from hybridlog_storage.segment_writer import SegmentSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +59,7 @@ def run(paths: list[Path], choices: Choices) -> None:
     tags = _tags(choices.tag or [])
     _matcher(choices)
     _check_new_store(paths, choices)
-    done = _Results(choices)
+    done = _Results(paths, choices)
     try:
         with opened(
             choices.store, choices.mongo, create=True, needs_database=True, quiet=choices.quiet
@@ -73,7 +72,7 @@ def run(paths: list[Path], choices: Choices) -> None:
                         raise
                     done.fail(path, error)
     except Stopped as stopped:
-        stopped.consequence = done.on_stop(paths)
+        stopped.consequence = done.on_stop()
         raise
     finally:
         done.show()
@@ -211,7 +210,8 @@ def _tags(pairs: list[str]) -> dict[str, str]:
 class _Results:
     """How each path went, for the table at the end and the exit code."""
 
-    def __init__(self, choices: Choices) -> None:
+    def __init__(self, paths: Sequence[Path], choices: Choices) -> None:
+        self._paths = paths
         self._choices = choices
         self._reports: list[tuple[Path, RecordReport]] = []
         self._summaries: list[dict[str, Any]] = []
@@ -229,26 +229,26 @@ class _Results:
             {"path": str(path), "error": str(error), "exit_code": error.exit_code}
         )
 
-    def on_stop(self, paths: Sequence[Path]) -> str:
+    def on_stop(self) -> str:
         """What being stopped now means."""
         done = len(self._summaries)
-        if done == len(paths):
+        if done == len(self._paths):
             return "Everything was recorded."
         kept = len(self._reports)
         before = f" {output.counted(kept, 'recording')} made before stay." if kept else ""
-        return f"Nothing of {paths[done]} is kept.{before}"
+        return f"Nothing of {self._paths[done]} is kept.{before}"
 
     def show(self) -> None:
         """The table of what was recorded, also when something stopped the rest."""
         if self._choices.as_json:
             if self._summaries:
-                one = len(self._summaries) == 1
+                one = len(self._paths) == 1
                 output.print_json(self._summaries[0] if one else self._summaries)
         elif not self._choices.quiet and self._reports:
             if len(self._reports) == 1:
                 _print_one(*self._reports[0])
             else:
-                _print_several(self._reports)
+                _print_several([report for _, report in self._reports])
 
     def exit(self) -> None:
         """Leave with the code of the first thing that went wrong."""
@@ -304,9 +304,33 @@ def _print_one(path: Path, report: RecordReport) -> None:
     )
 
 
-def _print_several(reports: Sequence[tuple[Path, RecordReport]]) -> None:
-    rows = [
-        _row(
+class _Figures(NamedTuple):
+    """A line of the table of several recordings."""
+
+    name: str
+    topics: int
+    messages: int
+    taken: int
+    stored: int
+    indexed: int
+    elapsed_s: float
+
+    def row(self) -> tuple[str, ...]:
+        return (
+            self.name,
+            str(self.topics),
+            str(self.messages),
+            output.size(self.taken),
+            output.size(self.stored),
+            f"{_ratio(self.taken, self.stored):.2f}",
+            str(self.indexed),
+            f"{self.elapsed_s:.2f} s",
+        )
+
+
+def _print_several(reports: Sequence[RecordReport]) -> None:
+    lines = [
+        _Figures(
             report.entry.id,
             _topics(report),
             report.entry.messages,
@@ -315,47 +339,29 @@ def _print_several(reports: Sequence[tuple[Path, RecordReport]]) -> None:
             report.indexed,
             report.elapsed_s,
         )
-        for _, report in reports
+        for report in reports
     ]
-    whole = [report for _, report in reports]
-    rows.append(
-        _row(
-            "total",
-            len({c.topic for report in whole for c in report.entry.channels}),
-            sum(report.entry.messages for report in whole),
-            sum(int(report.entry.source["bytes"]) for report in whole),
-            sum(report.entry.stored_bytes for report in whole),
-            sum(report.indexed for report in whole),
-            sum(report.elapsed_s for report in whole),
-        )
+    total = _Figures(
+        "total",
+        len({c.topic for report in reports for c in report.entry.channels}),
+        sum(line.messages for line in lines),
+        sum(line.taken for line in lines),
+        sum(line.stored for line in lines),
+        sum(line.indexed for line in lines),
+        sum(line.elapsed_s for line in lines),
     )
     output.print_table(
         [
             ("recording", "left"),
             ("topics", "right"),
             ("messages", "right"),
-            ("in", "right"),
+            ("bytes in", "right"),
             ("stored", "right"),
             ("ratio", "right"),
             ("indexed", "right"),
             ("time", "right"),
         ],
-        rows,
-    )
-
-
-def _row(
-    name: str, topics: int, messages: int, taken: int, stored: int, indexed: int, elapsed_s: float
-) -> tuple[str, ...]:
-    return (
-        name,
-        str(topics),
-        str(messages),
-        output.size(taken),
-        output.size(stored),
-        f"{_ratio(taken, stored):.2f}",
-        str(indexed),
-        f"{elapsed_s:.2f} s",
+        [line.row() for line in (*lines, total)],
     )
 
 

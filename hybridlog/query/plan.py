@@ -11,9 +11,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from hybridlog_storage.copying import interleave
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 Clock = Literal["log", "publish", "header"]
 _LOOK_AHEAD = 4
+_WORTH_THREADS = 4 << 20  # bytes; starting threads takes as long as reading a megabyte
 
 
 @dataclass(slots=True)
@@ -179,32 +180,29 @@ class Sweep:
         started = time.monotonic()
         plan = self._plan
         waiting: list[Piece] = []
-        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
-            try:
-                for piece, following in self._loaded(pool):
-                    if len(piece.batch):
-                        waiting.append(piece)
-                    ready, waiting = self._split(waiting, following)
-                    if ready:
-                        whole = _in_order(ready, plan)
-                        plan.counters.messages += len(whole.batch)
-                        plan.counters.payload_bytes += whole.batch.payload_bytes
-                        plan.counters.elapsed_s = time.monotonic() - started
-                        yield whole
-            finally:
-                pool.shutdown(cancel_futures=True)
-                plan.counters.elapsed_s = time.monotonic() - started
+        try:
+            for piece, following in self._loaded():
+                if len(piece.batch):
+                    waiting.append(piece)
+                ready, waiting = self._split(waiting, following)
+                if ready:
+                    whole = _in_order(ready, plan)
+                    plan.counters.messages += len(whole.batch)
+                    plan.counters.payload_bytes += whole.batch.payload_bytes
+                    plan.counters.elapsed_s = time.monotonic() - started
+                    yield whole
+        finally:
+            plan.counters.elapsed_s = time.monotonic() - started
 
     def unordered(self) -> Iterator[Piece]:
         """All messages, chunk by chunk: what tables are built from."""
         plan = self._plan
         started = time.monotonic()
-        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
-            for piece, _ in self._loaded(pool):
-                plan.counters.messages += len(piece.batch)
-                plan.counters.payload_bytes += piece.batch.payload_bytes
-                if len(piece.batch):
-                    yield piece
+        for piece, _ in self._loaded():
+            plan.counters.messages += len(piece.batch)
+            plan.counters.payload_bytes += piece.batch.payload_bytes
+            if len(piece.batch):
+                yield piece
         plan.counters.elapsed_s = time.monotonic() - started
 
     def _chosen(self, tasks: list[Task]) -> Iterator[tuple[Task, NDArray[np.int64] | None]]:
@@ -220,17 +218,32 @@ class Sweep:
                 if offsets is not None and len(offsets):
                     yield task, offsets
 
-    def _loaded(self, pool: ThreadPoolExecutor) -> Iterator[tuple[Piece, Task | None]]:
+    def _loaded(self) -> Iterator[tuple[Piece, Task | None]]:
         """The wanted messages of each chunk, read a little ahead, and the chunk after it."""
+        tasks = self._plan.tasks()
+        if sum(task.chunk.length for task in tasks) < _WORTH_THREADS:
+            yield from self._ahead(tasks, lambda *item: _Done(self._load(*item)))
+            return
+        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
+            try:
+                yield from self._ahead(tasks, lambda *item: pool.submit(self._load, *item))
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    def _ahead(
+        self,
+        tasks: list[Task],
+        start: Callable[[Task, NDArray[np.int64] | None], _Loading],
+    ) -> Iterator[tuple[Piece, Task | None]]:
         counters = self._plan.counters
-        loading: deque[tuple[Task, Future[tuple[Piece, int]]]] = deque()
-        upcoming = self._chosen(self._plan.tasks())
+        loading: deque[tuple[Task, _Loading]] = deque()
+        upcoming = self._chosen(tasks)
         while True:
             while len(loading) < _LOOK_AHEAD:
                 item = next(upcoming, None)
                 if item is None:
                     break
-                loading.append((item[0], pool.submit(self._load, *item)))
+                loading.append((item[0], start(*item)))
             if not loading:
                 return
             piece, size = loading.popleft()[1].result()
@@ -315,6 +328,22 @@ class Sweep:
             else:
                 rest.append(piece)
         return ready, rest
+
+
+class _Loading(Protocol):
+    """A chunk on its way."""
+
+    def result(self) -> tuple[Piece, int]: ...
+
+
+@dataclass(slots=True)
+class _Done:
+    """A chunk that is there."""
+
+    loaded: tuple[Piece, int]
+
+    def result(self) -> tuple[Piece, int]:
+        return self.loaded
 
 
 def _rows(piece: Piece, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Piece:

@@ -42,6 +42,8 @@ class ChannelStats:
     skew_sum: float = 0.0
     skew_min: int | None = None
     skew_max: int | None = None
+    longest: int = 0
+    """Most log time that one chunk's messages of the channel span."""
 
     def add(self, other: ChannelStats) -> None:
         """Take in the messages of another part of the channel."""
@@ -49,7 +51,7 @@ class ChannelStats:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
-        for name in ("last", "last_publish", "last_stamp", "skew_max"):
+        for name in ("last", "last_publish", "last_stamp", "skew_max", "longest"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
@@ -152,7 +154,7 @@ class Catalog:
 
     def prepare(self) -> None:
         """Make the indexes that questions to the catalog need."""
-        self._db.create_index(CHUNKS, [("rec", 1), ("ch.c", 1), ("first", 1)])
+        self._db.create_index(CHUNKS, [("rec", 1), ("ch.c", 1), ("ch.first", 1)])
 
     def put_recording(self, entry: RecordingEntry) -> None:
         """Write or replace a recording."""
@@ -204,6 +206,7 @@ class Catalog:
         channels: Sequence[int] | None = None,
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
+        longest: int | None = None,
     ) -> list[ChunkEntry]:
         """Chunks of a recording that may hold messages of some channels in a time range.
 
@@ -212,6 +215,8 @@ class Catalog:
             channels: Channel ids, None for all.
             bounds: `[begin, end)`, ns, None for all times.
             clock: `log`, `publish` or `header`: which time `bounds` is about.
+            longest: Most log time that a chunk spans, ns, if known: no chunk that begins
+                earlier than that before `bounds` needs to be looked at.
         """
         query: dict[str, Any] = {"rec": recording}
         of_channel: dict[str, Any] = {}
@@ -220,6 +225,8 @@ class Catalog:
         if bounds is not None:
             suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
             of_channel[f"first{suffix}"] = {"$lt": bounds[1]}
+            if longest is not None and clock == "log":
+                of_channel["first"]["$gte"] = max(bounds[0] - longest, 0)
             of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
         if of_channel:
             query["ch"] = {"$elemMatch": of_channel}

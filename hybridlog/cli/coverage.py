@@ -1,0 +1,111 @@
+"""How complete an answer is: what the recordings it came from have lost."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.cli.output import counted, note
+from hybridlog_storage.errors import TimeError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
+    """The loss ledger of a recording; what a crash cut off stands in it, too."""
+    losses = [dict(loss) for loss in entry.end.get("losses", [])]
+    if entry.status == "recovered":
+        losses.append(
+            {
+                "cause": "cut short by a crash",
+                "file": "",
+                "offset": None,
+                "reason": "what came after its last message was not stored",
+                "count": None,
+                "topic": None,
+            }
+        )
+        losses.extend(
+            {
+                "cause": "damaged segment",
+                "file": "",
+                "offset": None,
+                "reason": str(reason),
+                "count": None,
+                "topic": None,
+            }
+            for reason in entry.end.get("damage", [])
+        )
+    return losses
+
+
+def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
+    """How much of a recording is there: `complete`, or how much is missing."""
+    if not losses:
+        return "being recorded" if entry.status == "open" else "complete"
+    lost = sum(loss["count"] or 0 for loss in losses)
+    if any(loss["count"] is None for loss in losses):
+        known = f"at least {counted(lost, 'message')}" if lost else "an unknown number of messages"
+        return f"{known} lost in {counted(len(losses), 'place')}"
+    share = 100 * entry.messages / (entry.messages + lost) if entry.messages + lost else 0.0
+    return (
+        f"{counted(lost, 'message')} lost in {counted(len(losses), 'place')} ({share:.2f} % there)"
+    )
+
+
+def line_of(loss: dict[str, Any]) -> str:
+    """One loss in words."""
+    count = "messages" if loss["count"] is None else counted(loss["count"], "message")
+    place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
+    file = f" {loss['file']}{place}:" if loss.get("file") else ""
+    topic = f" on {loss['topic']}" if loss.get("topic") else ""
+    return f"{count}{topic} lost, {loss['cause']}:{file} {loss['reason']}"
+
+
+def gaps(
+    recordings: Collection[RecordingEntry],
+    topics: Collection[str],
+    between: tuple[str, str] | None,
+) -> Iterator[str]:
+    """What an answer may lack, a line a recording.
+
+    Args:
+        recordings: Where the answer comes from.
+        topics: What it is about.
+        between: The time range as typed, by the log clock; None for all times.
+    """
+    for entry in recordings:
+        if entry.status == "open":
+            yield f"{entry.id} is still being recorded; what comes later is not in this answer."
+        if between is not None and not _touches(entry, between):
+            continue
+        losses = [x for x in losses_of(entry) if x.get("topic") is None or x["topic"] in topics]
+        if losses:
+            yield (
+                f"{entry.id} is not complete, so this answer may not be: "
+                f"{describe(entry, losses)}; `hybridlog info {entry.id}` says where."
+            )
+
+
+def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
+    """Whether a time range may meet what a recording lost: it can lie behind its end, too."""
+    from hybridlog.query.times import parse_range
+
+    if entry.span is None:
+        return True
+    start, end = entry.span[0], entry.span[1] + 1
+    try:
+        low, high = parse_range(*between, start=start, end=end)
+    except TimeError:
+        return True
+    return high > start and (low < end or entry.status == "recovered")
+
+
+def tell_unreadable(missing: int) -> None:
+    """Say how many messages are in no table because they have no fields to read."""
+    if missing > 0:
+        note(
+            f"{counted(missing, 'message')} do not fit their definition and are not in this "
+            "answer; --format raw, mcap or bag has them as they came."
+        )

@@ -1,0 +1,67 @@
+"""Where an answer is written, and what becomes of what is there already."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from hybridlog_storage.errors import UsageError
+
+_RAW_INDEX = "index.jsonl"
+
+
+def check_room(path: Path, *, form: str, force: bool) -> None:
+    """Refuse to overwrite without --force, and what we did not write even with it.
+
+    Raises:
+        UsageError: something is there that stays.
+    """
+    if not os.path.lexists(path) or _is_device(path):
+        return
+    if path.is_dir():
+        if form != "raw":
+            raise UsageError(f"{path} is a directory; name a file in it.")
+        inside = next(path.iterdir(), None)
+        if inside is None:
+            return
+        if not (path / _RAW_INDEX).is_file():
+            raise UsageError(f"{path} is a directory that holds other things; name a new one.")
+    elif form == "raw":
+        raise UsageError(f"{path} is a file; payloads go into a directory.")
+    if not force:
+        raise UsageError(f"{path} exists; --force overwrites it.")
+
+
+@contextmanager
+def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
+    """Make room for a new output; what was there comes back when the block fails.
+
+    Files are replaced by their writers in one step; only a directory has to step aside.
+
+    Raises:
+        UsageError: something is there that stays.
+    """
+    check_room(path, form=form, force=force)
+    if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
+        yield
+        return
+    aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
+    try:
+        path.rename(aside)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            aside.rename(path)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _is_device(path: Path) -> bool:
+    return path.exists() and not path.is_file() and not path.is_dir()

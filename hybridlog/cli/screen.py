@@ -1,0 +1,130 @@
+"""An answer on a terminal: a table when it fits, else a block a message."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from hybridlog.cli import output
+from hybridlog.cli.coverage import tell_unreadable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from hybridlog.reader import Query
+
+SCREEN_ROWS = 20
+"""Messages shown without --limit."""
+_WIDEST_CELL = 40
+_WIDEST_LINE = 200
+_INNER = 4
+
+
+class _Answer(NamedTuple):
+    names: list[str]
+    rows: list[list[str]]
+
+
+def print_answer(query: Query, limit: int | None) -> Query:
+    """Print messages for people to read, long arrays in short.
+
+    Args:
+        query: The question.
+        limit: The limit it has; without one, the first messages are shown.
+
+    Returns:
+        The question that was answered, with its counters.
+    """
+    from hybridlog.tables import stream
+
+    # One more than is shown tells whether there is more.
+    asked = query if limit is not None else query.limit(SCREEN_ROWS + 1)
+    shown = 0
+    for table in stream(asked):
+        wanted = table if limit is not None else table.slice(0, SCREEN_ROWS - shown)
+        _print_block(_cells(wanted))
+        shown += wanted.num_rows
+    if not shown and not asked.counters.messages:
+        output.note("No message.")
+    more = limit is None and asked.counters.messages > SCREEN_ROWS
+    if more:
+        output.note(
+            f"The first {SCREEN_ROWS} messages. --limit shows more, --format jsonl or -o FILE "
+            "gives them all."
+        )
+    missing = min(asked.counters.messages, SCREEN_ROWS if more else asked.counters.messages) - shown
+    tell_unreadable(missing)
+    return asked
+
+
+def _cells(table: pa.Table) -> _Answer:
+    columns = [[_cell(value) for value in column] for column in table.columns]
+    rows = [list(row) for row in zip(*columns, strict=True)]
+    return _Answer(list(table.column_names), rows)
+
+
+def _print_block(answer: _Answer) -> None:
+    if not answer.rows:
+        return
+    if output.fits(answer.names, answer.rows):
+        output.print_table([(name, "left") for name in answer.names], answer.rows)
+        return
+    for row in answer.rows:
+        # The first column is the time; a column without a value is another topic's.
+        fields = [(n, c) for n, c in zip(answer.names[1:], row[1:], strict=True) if c]
+        output.print_record(row[0], fields)
+
+
+def _cell(value: pa.Scalar) -> str:
+    """A value in few characters."""
+    if not value.is_valid:
+        return ""
+    for applies, shown in _forms():
+        if applies(value.type):
+            return shown(value)
+    return _cut(str(value.as_py()), _WIDEST_CELL)
+
+
+@functools.cache
+def _forms() -> list[tuple[Callable[[pa.DataType], bool], Callable[[pa.Scalar], str]]]:
+    """Tests of a column's type, and how its values are shown."""
+    from pyarrow import types
+
+    from hybridlog.query.times import format_duration, format_time
+
+    def is_list(kind: pa.DataType) -> bool:
+        return bool(
+            types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
+        )
+
+    def is_binary(kind: pa.DataType) -> bool:
+        return bool(types.is_binary(kind) or types.is_large_binary(kind))
+
+    return [
+        (types.is_floating, lambda value: f"{value.as_py():.6g}"),
+        (types.is_timestamp, lambda value: format_time(value.value)),
+        (types.is_duration, lambda value: format_duration(value.value)),
+        (is_list, _list),
+        (types.is_struct, _struct),
+        (is_binary, lambda value: f"{len(value.as_py())} bytes"),
+    ]
+
+
+def _struct(value: pa.Scalar) -> str:
+    inside = (f"{name}: {_cell(item)}" for name, item in value.items())
+    return _cut("{" + ", ".join(inside) + "}", _WIDEST_LINE)
+
+
+def _list(value: pa.Scalar) -> str:
+    inner = value.values
+    if inner is None or not len(inner):
+        return "[]"
+    if len(inner) <= _INNER:
+        return _cut("[" + ", ".join(_cell(item) for item in inner) + "]", _WIDEST_LINE)
+    first = ", ".join(_cell(inner[i]) for i in range(2))
+    return _cut(f"[{first}, … {len(inner)} in all]", _WIDEST_LINE)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
