@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PEAK_LIMIT_MB = 400
 GROWTH_LIMIT = 1.15
-"""What twice the length may add to the peak: less than a hundred megabytes grown by a sixth
+"""What a longer log may add to the peak: less than a hundred megabytes grown by a sixth
 are buffers that happened to be full at once, not memory that grows with the recording."""
 
 
@@ -135,14 +135,20 @@ class Bench:
         found = figure(self.study, about, [max(peaks)], "MB", target=PEAK_LIMIT_MB)
         self.find(found)
 
-    def find_growth(self, whole: str, half: str) -> None:
-        """Peak memory at the full length over that at half of it."""
+    def find_growth(self, whole: str, part: str, times: int) -> None:
+        """Peak memory at the full length over that at a part of it.
+
+        Args:
+            whole: Side that ran over the full length.
+            part: Side that ran over less.
+            times: How much longer the full length is.
+        """
         peaks = {
             side: max(s.values["peak_rss"] for s in self.samples if s.side == side)
-            for side in (whole, half)
+            for side in (whole, part)
         }
-        about = "peak memory at twice the length over that at once the length"
-        values = [peaks[whole] / peaks[half]]
+        about = f"peak memory at {times} times the length over that at once the length"
+        values = [peaks[whole] / peaks[part]]
         self.find(figure(self.study, about, values, "x", target=GROWTH_LIMIT, relation="<="))
 
     def agree(self, first: object, second: object, what: str) -> None:

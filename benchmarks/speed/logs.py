@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
@@ -25,7 +25,7 @@ IMAGE_SIDE = 800
 """Pixels; 800 by 800 `mono8` are 640 000 bytes."""
 CAMERA = (640, 480)
 """Width and height in pixels of the cameras of the drive, `mono8`."""
-CAMERA_HZ = 5.0
+CAMERA_HZ = 15.0
 SCAN_HZ = 20.0
 SCAN_BEAMS = 720
 SCAN_TOPIC = "/scan"
@@ -33,6 +33,8 @@ IMU_TOPIC = "/imu/data"
 
 _DELAY_NS = 1_000_000
 Columns = dict[str, "NDArray[Any]"]
+_Frames = Callable[[np.random.Generator, int, "NDArray[np.uint8]"], None]
+"""Fills frames, uint8[n, height, width], from a generator and the number of the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ def write_imu(path: Path, messages: int, seed: int) -> None:
 def write_images(path: Path, messages: int, seed: int) -> None:
     """Images of 640 kB at 10 Hz: one half of each is noise, the other a smooth surface."""
     types = Types(1)
-    camera = _camera(types, "/camera/image_raw", (IMAGE_SIDE, IMAGE_SIDE), 10.0)
+    camera = _camera(types, "/camera/image_raw", (IMAGE_SIDE, IMAGE_SIDE), 10.0, _half_noise)
     _write(path, types, [camera], messages / 10, seed)
 
 
@@ -81,8 +83,8 @@ def write_drive(path: Path, duration_s: float, seed: int) -> None:
     """Two cameras and a laser scanner."""
     types = Types(1)
     streams = [
-        _camera(types, "/camera/left/image_raw", CAMERA, CAMERA_HZ),
-        _camera(types, "/camera/right/image_raw", CAMERA, CAMERA_HZ, phase_ns=7_000_000),
+        _camera(types, "/camera/left/image_raw", CAMERA, CAMERA_HZ, _scene),
+        _camera(types, "/camera/right/image_raw", CAMERA, CAMERA_HZ, _scene, phase_ns=7_000_000),
         _scan(types),
     ]
     _write(path, types, streams, duration_s, seed)
@@ -240,12 +242,16 @@ def _joints(types: Types, hz: float) -> _Stream:
 
 
 def _camera(
-    types: Types, topic: str, size: tuple[int, int], hz: float, phase_ns: int = 0
+    types: Types,
+    topic: str,
+    size: tuple[int, int],
+    hz: float,
+    frames: _Frames,
+    *,
+    phase_ns: int = 0,
 ) -> _Stream:
-    """Frames whose upper half is noise and whose lower half is smooth."""
     msgtype = "sensor_msgs/msg/Image"
     width, height = size
-    upper = height // 2
     template = types.template(
         msgtype,
         {
@@ -257,15 +263,42 @@ def _camera(
             "data": np.zeros(width * height, np.uint8),
         },
     )
-    slope = np.arange(height - upper)[:, None] // 4 + np.arange(width) // 4
 
     def values(random: np.random.Generator, first: int, count: int) -> Columns:
-        frames = np.empty((count, height, width), np.uint8)
-        frames[:, :upper] = random.integers(0, 256, (count, upper, width), np.uint8)
-        frames[:, upper:] = (slope + np.arange(first, first + count)[:, None, None]) % 256
-        return {"data": frames.reshape(count, -1)}
+        out = np.empty((count, height, width), np.uint8)
+        frames(random, first, out)
+        return {"data": out.reshape(count, -1)}
 
     return _Stream(topic, msgtype, hz, template, values, phase_ns)
+
+
+def _half_noise(random: np.random.Generator, first: int, out: NDArray[np.uint8]) -> None:
+    """The upper half cannot be compressed at all, the lower half is a smooth surface."""
+    count, height, width = out.shape
+    upper = height // 2
+    out[:, :upper] = random.integers(0, 256, (count, upper, width), np.uint8)
+    moment = (np.arange(first, first + count) % 256).astype(np.uint8)[:, None, None]
+    np.add(_surface(height - upper, width), moment, out=out[:, upper:])
+
+
+def _scene(random: np.random.Generator, first: int, out: NDArray[np.uint8]) -> None:
+    """Smooth surfaces under the noise of a sensor, one grey level in the mean square.
+
+    It is the noise that makes camera frames slow to compress and to unpack.
+    """
+    count, height, width = out.shape
+    size = height * width
+    noise = np.rint(random.standard_normal(size + (1 << 16))).astype(np.int8).view(np.uint8)
+    surface = _surface(height, width) // 2 + 30
+    shifts = cast("list[int]", random.integers(0, 1 << 16, count).tolist())
+    for row, shift in enumerate(shifts):
+        moved = np.roll(surface, first + row, axis=1)
+        np.add(moved, noise[shift : shift + size].reshape(height, width), out=out[row])
+
+
+def _surface(height: int, width: int) -> NDArray[np.uint8]:
+    slope = np.arange(height)[:, None] // 4 + np.arange(width) // 4
+    return (slope % 256).astype(np.uint8)
 
 
 def _scan(types: Types) -> _Stream:

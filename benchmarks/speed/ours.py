@@ -61,7 +61,9 @@ def slices(store: str, topic: str, starts: list[int], length_ns: int) -> Values:
 
 
 def frame(store: str, topic: str) -> Values:
-    """One topic as a pandas frame, all columns."""
+    """One topic as a pandas frame, all columns; pandas is loaded before, as on the other sides."""
+    import pandas as pd  # noqa: F401
+
     with hl.open(store) as opened:
         started = time.perf_counter()
         made = opened.topic(topic).to_pandas()

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from benchmarks.speed.bench import Bench
 
 OURS = "hybridlog"
-HALF = "hybridlog, half the length"
+SHORT = "hybridlog, a tenth of the length"
 _SECOND_NS = 1_000_000_000
 _SLICES = 12
+_SHORTER = 10
 
 
 def slices(bench: Bench) -> None:
@@ -27,8 +28,9 @@ def slices(bench: Bench) -> None:
     seconds = bench.size(600, 60)
     seed = bench.settings.seed
     bag = bench.input(f"drive-{seconds}s.bag", lambda p: logs.write_drive(p, seconds, seed))
-    half = bench.input(
-        f"drive-{seconds // 2}s.bag", lambda p: logs.write_drive(p, seconds // 2, seed)
+    short = bench.input(
+        f"drive-{seconds // _SHORTER}s.bag",
+        lambda p: logs.write_drive(p, seconds // _SHORTER, seed),
     )
     file = bench.input(f"drive-{seconds}s.mcap", lambda p: logs.bag_to_mcap(bag, p))
     store = _recorded(bench, "store", bag)
@@ -43,9 +45,9 @@ def slices(bench: Bench) -> None:
             theirs = run("mcap", "file_sides:slices", others, warm=[file])
             bench.agree(mine["answers"], theirs["answers"], "the payloads of a slice")
     discard(store)
-    store = _recorded(bench, "half", half)
-    ours = {"store": str(store), "starts": _starts(seed, seconds // 2), **arguments}
-    bench.run(HALF, "ours:slices", ours, warm=[store / "recordings"])
+    store = _recorded(bench, "short", short)
+    ours = {"store": str(store), "starts": _starts(seed, seconds // _SHORTER), **arguments}
+    bench.run(SHORT, "ours:slices", ours, warm=[store / "recordings"])
     discard(store)
     _find_slices(bench)
 
@@ -83,7 +85,7 @@ def _find_slices(bench: Bench) -> None:
     about = "bytes read over the compressed payload"
     bench.find(figure(bench.study, about, shares, "x", target=1.3, relation="<="))
     bench.find_peak(OURS, "peak memory of the reader, without mongod")
-    bench.find_growth(OURS, HALF)
+    bench.find_growth(OURS, SHORT, _SHORTER)
 
 
 def frames(bench: Bench) -> None:

@@ -69,7 +69,7 @@ def small(bench: Bench) -> None:
         rates = [messages / s for s in seconds]
         bench.find(figure(bench.study, f"{side}: messages per second", rates, "/s"))
     bench.find_peak(OURS, "peak memory of record, without mongod")
-    bench.find_growth(OURS, HALF)
+    bench.find_growth(OURS, HALF, 2)
     peaks = [v / 1e6 for v in values_of(bench.samples, OURS, "mongod_peak_rss")]
     bench.find(figure(bench.study, "peak memory of the embedded mongod", peaks, "MB"))
 
@@ -108,7 +108,7 @@ def images(bench: Bench) -> None:
         figure(bench.study, "size of the segments over the copy's", [sizes[0] / sizes[1]], "x")
     )
     bench.find_peak(OURS, "peak memory of record, without mongod")
-    bench.find_growth(OURS, HALF)
+    bench.find_growth(OURS, HALF, 2)
 
 
 def _record_half(bench: Bench, bag: Path) -> None:

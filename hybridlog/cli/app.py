@@ -278,7 +278,7 @@ def fetch(
         list[str] | None,
         typer.Option(
             help="Only messages that satisfy this, such as 'ranges.min < 0.5 and "
-            'header.frame_id == "laser"\'. Repeatable.',
+            "scan_time > 0'. Repeatable.",
             metavar="PREDICATE",
         ),
     ] = None,

@@ -76,7 +76,7 @@ def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -
     except Stopped as stopped:
         stopped.consequence = f"{target} is not written."
         raise
-    _tell(target, query, quiet=quiet)
+    _tell(target, query, 0, quiet=quiet)
 
 
 def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
@@ -90,12 +90,12 @@ def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: boo
         for topic, path in paths.items():
             one = query.only(topic)
             try:
-                write(one, form, path, quiet=quiet)
+                missing = write(one, form, path, quiet=quiet)
             except DefinitionError as error:
                 output.note(str(error))
                 left_out.append(error)
                 continue
-            _tell(path, one, quiet=quiet)
+            _tell(path, one, missing, quiet=quiet)
     except Stopped as stopped:
         stopped.consequence = f"The files named above are whole, {path} is not written."
         raise
@@ -120,9 +120,11 @@ def _make(directory: Path) -> bool:
     return True
 
 
-def _tell(path: Path, query: Query, *, quiet: bool) -> None:
-    if not quiet:
+def _tell(path: Path, query: Query, missing: int, *, quiet: bool) -> None:
+    """A line a file; what is not in it is said in any case."""
+    left_out = f" ({missing} left out: they do not fit their definition)" if missing else ""
+    if missing or not quiet:
         output.note(
-            f"{path}: {output.counted(query.counters.messages, 'message')}, "
+            f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}, "
             f"{output.size(path.stat().st_size)}"
         )

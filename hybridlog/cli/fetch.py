@@ -76,7 +76,7 @@ def run(choices: Choices) -> None:
         elif form == "table":
             query = print_answer(query, choices.limit)
         elif path is None:
-            write(query, form, sys.stdout.buffer, quiet=True)
+            tell_unreadable(write(query, form, sys.stdout.buffer, quiet=True))
         else:
             _write_file(query, form, path, choices)
         sys.stdout.flush()
@@ -88,13 +88,14 @@ def run(choices: Choices) -> None:
 def _write_file(query: Query, form: str, path: Path, choices: Choices) -> None:
     try:
         with replacing(path, form=form, force=choices.force):
-            write(query, form, path, quiet=choices.quiet)
+            missing = write(query, form, path, quiet=choices.quiet)
     except Stopped as stopped:
         stopped.consequence = f"{path} is not written."
         raise
+    tell_unreadable(missing)
 
 
-def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> None:
+def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> int:
     """Write a query's answer to a file or a stream; all of it or nothing.
 
     Args:
@@ -102,6 +103,9 @@ def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> No
         form: A format of `hybridlog.export.FORMATS`.
         target: Path or binary stream.
         quiet: No progress bar.
+
+    Returns:
+        Messages that are not in it, because they do not fit their definition.
     """
     from hybridlog.export import FORMATS
 
@@ -114,8 +118,9 @@ def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> No
 
         if FORMATS[form].kind == "exact":
             _write_exact(query, form, target, progress)
-        else:
-            _write_rows(query, form, target, progress)
+            return 0
+        written = _write_rows(query, form, target, progress)
+        return counters.messages - written
 
 
 def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:
@@ -131,7 +136,8 @@ def _write_exact(query: Query, form: str, target: Target, progress: Progress) ->
             progress()
 
 
-def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> None:
+def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> int:
+    """Write the rows; returns how many."""
     from hybridlog.export import open_table_writer
     from hybridlog.export.jsonl import JsonlWriter
     from hybridlog.tables import stream
@@ -149,7 +155,7 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
                 tables.write(table)
                 written += table.num_rows
                 progress()
-    tell_unreadable(query.counters.messages - written)
+    return written
 
 
 def _query(store: Store, choices: Choices) -> Query:

@@ -30,35 +30,38 @@ def list_recordings(store: Path | None, mongo: str | None, *, as_json: bool) -> 
     if not recordings:
         output.note("The store is empty: `hybridlog record FILE` fills it.")
         return
-    output.print_table(
-        [
-            ("recording", "left"),
-            ("start", "left"),
-            ("duration", "right"),
-            ("topics", "right"),
-            ("messages", "right"),
-            ("stored", "right"),
-            ("note", "left"),
-        ],
-        [_line(r) for r in recordings],
-    )
+    narrow = output.is_narrow()
+    columns: list[output.Column] = [
+        ("recording", "left"),
+        ("start", "whole"),
+        ("duration", "right"),
+        ("messages", "right"),
+        ("note", "left"),
+    ]
+    if not narrow:
+        columns.insert(3, ("topics", "right"))
+        columns.insert(5, ("stored", "right"))
+    output.print_table(columns, [_line(r, narrow=narrow) for r in recordings])
 
 
-def _line(entry: RecordingEntry) -> tuple[str, ...]:
+def _line(entry: RecordingEntry, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [_STATUS.get(entry.status, entry.status)]
     if entry.name != entry.id:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
-    return (
+    start = output.short_time(span[0], minutes=narrow) if span else "-"
+    cells = [
         entry.id,
-        output.short_time(span[0]) if span else "-",
+        start,
         output.short_duration(span[1] - span[0]) if span else "-",
-        str(len({c.topic for c in entry.channels})),
         str(entry.messages),
-        output.size(entry.stored_bytes),
-        " ".join(notes),
-    )
+        ", ".join(notes),
+    ]
+    if not narrow:
+        cells.insert(3, str(len({c.topic for c in entry.channels})))
+        cells.insert(5, output.size(entry.stored_bytes))
+    return cells
 
 
 def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_json: bool) -> None:
@@ -68,7 +71,7 @@ def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_jso
         return
     with opened(store, mongo, quiet=as_json) as view:
         chosen = view.select([what]) if what is not None else view.recordings()
-        index = "MongoDB is away"
+        index = None
         if view.database is not None:
             index = f"database {view.database.name} at {view.database.address}"
     if as_json:
@@ -223,7 +226,7 @@ def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
     }
 
 
-def _print_recording(entry: RecordingEntry, index: str) -> None:
+def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     from hybridlog.query.times import format_duration, format_time
 
     span = entry.span
@@ -245,7 +248,7 @@ def _print_recording(entry: RecordingEntry, index: str) -> None:
         ("coverage", coverage.describe(entry, losses)),
         *(("", coverage.line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
-        ("index", index),
+        ("index", index or "MongoDB is away"),
     ]
     output.print_table([("recording", "left"), (entry.id, "left")], rows)
     if not entry.channels:
@@ -261,11 +264,14 @@ def _print_recording(entry: RecordingEntry, index: str) -> None:
             ("log - header", "right"),
             ("note", "left"),
         ],
-        [_channel_row(c) for c in sorted(entry.channels, key=lambda c: c.topic)],
+        [
+            _channel_row(c, indexed=index is not None)
+            for c in sorted(entry.channels, key=lambda c: c.topic)
+        ],
     )
 
 
-def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
+def _channel_row(channel: ChannelEntry, *, indexed: bool) -> tuple[str, ...]:
     stats = channel.stats
     rate = _rate(channel)
     notes = []
@@ -275,7 +281,7 @@ def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
         notes.append(f"{stats.unreadable} unreadable")
     if channel.metadata.get("latching") == "1":
         notes.append("latched")
-    skew = "-"
+    skew = "-" if indexed else "?"
     if stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
     return (
@@ -283,7 +289,8 @@ def _channel_row(channel: ChannelEntry) -> tuple[str, ...]:
         channel.type or channel.message_encoding,
         str(stats.messages),
         f"{rate:.2f}" if rate is not None else "-",
-        output.size(stats.payload_bytes),
+        # Segments do not say it of themselves.
+        output.size(stats.payload_bytes) if indexed else "?",
         skew,
         "; ".join(notes),
     )

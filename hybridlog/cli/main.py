@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import traceback
@@ -9,7 +10,7 @@ from typing import NoReturn, TextIO
 
 from hybridlog.cli import stopping
 from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import DiskFullError, HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
 
@@ -44,7 +45,7 @@ def _run() -> int:
     except OSError as error:
         # What the library maps carries a cure; this is the rest, such as a failing disk.
         _complain(str(error))
-        return HybridlogError.exit_code
+        return _code_of(error)
     except Exception:
         traceback.print_exc()
         _complain("this is a mistake in hybridlog; please report it with the lines above.")
@@ -72,8 +73,13 @@ def _flushed(code: int) -> int:
     except OSError as error:
         _let_go(sys.stdout)
         _complain(f"standard output cannot be written: {error.strerror}")
-        return code or HybridlogError.exit_code
+        return code or _code_of(error)
     return code
+
+
+def _code_of(error: OSError) -> int:
+    full = error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+    return DiskFullError.exit_code if full else HybridlogError.exit_code
 
 
 def _let_go(stream: TextIO) -> None:

@@ -14,8 +14,8 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
-Column = tuple[str, Literal["left", "right"]]
-"""Heading and justification."""
+Column = tuple[str, Literal["left", "right", "whole"]]
+"""Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 _SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgG]?)(i?)[bB]?\s*")
@@ -49,7 +49,10 @@ def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -
     table = Table(box=None, pad_edge=False, header_style="bold")
     for heading, side in columns:
         table.add_column(
-            Text(printable(heading)), justify=side, no_wrap=side == "right", overflow="fold"
+            Text(printable(heading)),
+            justify="right" if side == "right" else "left",
+            no_wrap=side != "left",
+            overflow="fold",
         )
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
@@ -68,6 +71,11 @@ def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) 
         say(line.rstrip())
 
 
+def is_narrow() -> bool:
+    """Whether a table should do without its less important columns."""
+    return sys.stdout.isatty() and console().width < 100
+
+
 def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     """Whether rows fit as a table: always, where the lines may be as long as they like."""
     if not sys.stdout.isatty():
@@ -77,11 +85,12 @@ def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
 
 
 def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:
-    """Print one message: a title and a line a field."""
+    """Print one message: a title, a line a field, and an empty one."""
     width = max((len(name) for name, _ in fields), default=0)
     say(title)
     for name, value in fields:
         say(f"  {name:<{width}}  {value}")
+    say()
 
 
 def printable(text: str) -> str:
@@ -127,11 +136,12 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     return f"{number} {what if number == 1 else plural or what + 's'}"
 
 
-def short_time(ns: int) -> str:
-    """A time to the second, for lists."""
+def short_time(ns: int, *, minutes: bool = False) -> str:
+    """A time in UTC to the second, or to the minute, for lists."""
     from hybridlog.query.times import format_time
 
-    return format_time(ns - ns % 10**9)
+    whole = format_time(ns - ns % 10**9)
+    return whole[:16] + "Z" if minutes else whole
 
 
 def short_duration(ns: int) -> str:

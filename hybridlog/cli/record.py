@@ -19,6 +19,7 @@ from hybridlog_storage.errors import (
     HybridlogError,
     SourceDamaged,
     SourceError,
+    StoreError,
     TimeError,
     UsageError,
 )
@@ -104,7 +105,14 @@ def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
         # The URI is written down in the store that is made, so it should be right.
         from hybridlog_storage.database import Database
 
-        Database.connect(choices.mongo).close()
+        from hybridlog.maintenance import STORE_MARK
+
+        with Database.connect(choices.mongo) as database:
+            if database.find_one(STORE_MARK) is not None:
+                raise StoreError(
+                    f"The database {database.name!r} at {database.address} holds the index of "
+                    "another store. Name a database of its own in the URI: mongodb://host/NAME."
+                )
 
 
 def _record_one(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.cli import output
@@ -43,7 +43,7 @@ def print_answer(query: Query, limit: int | None) -> Query:
     shown = 0
     for table in stream(asked):
         wanted = table if limit is not None else table.slice(0, SCREEN_ROWS - shown)
-        _print_block(_cells(wanted))
+        _print_block(_cells(wanted), asked.topics)
         shown += wanted.num_rows
     if not shown and not asked.counters.messages:
         output.note("No message.")
@@ -64,16 +64,20 @@ def _cells(table: pa.Table) -> _Answer:
     return _Answer(list(table.column_names), rows)
 
 
-def _print_block(answer: _Answer) -> None:
+def _print_block(answer: _Answer, topics: Sequence[str]) -> None:
     if not answer.rows:
         return
     if output.fits(answer.names, answer.rows):
         output.print_table([(name, "left") for name in answer.names], answer.rows)
         return
     for row in answer.rows:
-        # The first column is the time; a column without a value is another topic's.
-        fields = [(n, c) for n, c in zip(answer.names[1:], row[1:], strict=True) if c]
-        output.print_record(row[0], fields)
+        # The first column is the time, the second the topic when there are several; a
+        # column without a value is another topic's.
+        several = len(topics) > 1
+        title = f"{row[0]}  {row[1] if several else topics[0]}"
+        first = 2 if several else 1
+        fields = [(n, c) for n, c in zip(answer.names[first:], row[first:], strict=True) if c]
+        output.print_record(title, fields)
 
 
 def _cell(value: pa.Scalar) -> str:

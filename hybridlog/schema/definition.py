@@ -241,8 +241,8 @@ def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawFiel
 def _standard_fields(name: str, ros: int) -> list[RawField] | None:
     """Fields of a standard type from the tables that rosbags ships."""
     # Slow to import, and most definitions are complete.
-    from rosbags.interfaces import Nodetype  # noqa: PLC0415
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import Stores, get_typestore
 
     package, _, leaf = name.rpartition("/")
     key = name if "/" in package else f"{package}/msg/{leaf}"

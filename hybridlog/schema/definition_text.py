@@ -17,6 +17,7 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
 _SEPARATOR = re.compile(r"={20,}\s*\Z")
 _HEADER = re.compile(r"(MSG|IDL|SRV|ACTION):\s*(\S+)\s*\Z")
+_PART_RULE = "---"
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
     r"(?:<=(?P<text_bound>[0-9]{1,10}))?"
@@ -169,12 +170,19 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
     Raises:
         DefinitionError: Not two or three parts, or a line that is no field.
     """
-    parts = re.split(r"(?m)^\s*---\s*$", text)
+    parts: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.strip() == _PART_RULE:
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    if len(parts) not in {2, 3}:
+        raise DefinitionError(f"{name}: {len(parts)} parts; a service has 2 and an action 3")
     folder, _, leaf = name.rpartition("/")
     base = _PART_SUFFIX.sub("", leaf)
     if folder:
         folder += "/"
-    parsed = [parse_msg(name, part, defaults=True) for part in parts]
+    parsed = [parse_msg(name, "\n".join(part), defaults=True) for part in parts]
     stem = f"{folder}{base}"
     if len(parsed) == 2:
         return {
@@ -182,8 +190,6 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
             f"{stem}_Response": parsed[1],
             f"{stem}_Event": _event(folder, base),
         }
-    if len(parsed) != 3:
-        raise DefinitionError(f"{name}: {len(parsed)} parts; a service has 2 and an action 3")
     goal_id = RawField("goal_id", "unique_identifier_msgs/UUID")
     return {
         f"{stem}_Goal": parsed[0],
@@ -207,4 +213,4 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
 
 def has_parts(text: str) -> bool:
     """True for the text of a service or an action."""
-    return re.search(r"(?m)^\s*---\s*$", text) is not None
+    return any(line.strip() == _PART_RULE for line in text.splitlines())

@@ -17,7 +17,7 @@ from mcap.records import Schema as McapSchema
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from zstandard import ZstdError
 
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
@@ -145,6 +145,27 @@ def mcap_groups(path: Path):
     return groups
 
 
+# What ROS 2 derives from the service; rosbags reads messages only.
+ADD_TWO_INTS_EVENT = f"""
+pkg/Info info
+pkg/Request[<=1] request
+pkg/Response[<=1] response
+{"=" * 80}
+MSG: pkg/Info
+uint8 event_type
+builtin_interfaces/Time stamp
+char[16] client_gid
+int64 sequence_number
+{"=" * 80}
+MSG: pkg/Request
+int64 a
+int64 b
+{"=" * 80}
+MSG: pkg/Response
+int64 sum
+"""
+
+
 @needs_data
 @pytest.mark.parametrize("name", mcap_files())
 def test_every_message_of_every_mcap_is_read_as_rosbags_reads_it(name):
@@ -154,11 +175,11 @@ def test_every_message_of_every_mcap_is_read_as_rosbags_reads_it(name):
     for (type_name, encoding, text, wire), payloads in groups.items():
         message_type = parse_definition(Schema(type_name, encoding, text))
         full = type_name if type_name.count("/") == 2 else type_name.replace("/", "/msg/")
-        try:
+        if "\n---\n" in text.decode():
+            assert type_name == "example_interfaces/srv/AddTwoInts_Event"
+            store = oracle(full := "pkg/msg/Event", ADD_TWO_INTS_EVENT)
+        else:
             store = oracle(full, text.decode())
-        except TypesysError:
-            # rosbags ships the derived types of the services that it cannot parse.
-            store = get_typestore(Stores.ROS2_KILTED)
         method = store.deserialize_ros1 if wire == "ros1" else store.deserialize_cdr
         check_batch(message_type, wire, payloads, lambda raw, m=method, n=full: m(raw, n))
 
@@ -168,7 +189,6 @@ def test_every_message_of_every_mcap_is_read_as_rosbags_reads_it(name):
     "name",
     [
         "real/auv_ros2_db3/rosbag2_2024_09_04-17_15_57_0.db3",
-        "odd/rosbag2/topics_and_services.db3",
         "odd/rosbag2/talker_db3/talker.db3",
     ],
 )
@@ -275,7 +295,7 @@ class Values:
 
 
 CASE = settings(
-    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow], database=None
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], database=None
 )
 SHAPES = {
     "seed": st.integers(0, 2**32),
@@ -288,6 +308,8 @@ SHAPES = {
 def make(text, wire, seed, rows, most, even, *, big=False):
     """Message type, payloads, and rosbags' decoder."""
     store = oracle("pkg/msg/T0", text)
+    # rosbags makes an object for each of the elements without bytes that garbage claims.
+    store.max_sequence_length = 1000
     values = Values(store, seed, most, even=even)
     messages = [values.message("pkg/msg/T0") for _ in range(rows)]
     if wire == "ros1":
@@ -306,17 +328,14 @@ def make(text, wire, seed, rows, most, even, *, big=False):
     return message_type, payloads, lambda raw: decode(raw, "pkg/msg/T0")
 
 
-def supported(text: str, wire: str):
+def supported(text: str, wire: str) -> bool:
+    """False for the types that are refused: arrays within elements without bytes."""
+    encoding = "ros1msg" if wire == "ros1" else "ros2msg"
+    message_type = parse_definition(Schema("pkg/T0", encoding, text.encode()))
     try:
-        WireReader(
-            parse_definition(
-                Schema("pkg/T0", "ros1msg" if wire == "ros1" else "ros2msg", text.encode())
-            ),
-            wire,
-        )
-    except DefinitionError as error:
-        assert "without fields" in str(error)
-        return False
+        WireReader(message_type, wire)
+    except DefinitionError:
+        return wire != "ros1"
     return True
 
 
@@ -401,7 +420,7 @@ def garble(payload: bytes, random) -> bytes:
 
 
 @pytest.mark.parametrize("wire", ["ros1", "cdr"])
-@settings(CASE, max_examples=150)
+@CASE
 @given(data=st.data(), **SHAPES)
 def test_garbled_payloads_are_sorted_out_and_never_read_beyond(wire, data, seed, rows, most, even):
     text = data.draw(definitions(wire))
@@ -476,13 +495,6 @@ def test_reasons_name_the_field_and_the_numbers():
     assert decoded.rows.tolist() == [0, 5]
     assert decoded.records.fields["a"].values.tolist() == [1, 1]
     assert reasons(decoded) == {
-        "ends in the middle of field a": [1],
-        "ranges claims 4294967295 elements, 4 bytes remain": [2],
-        "12 bytes left over: the definition does not fit": [3],
-        "s claims 7 bytes, 0 bytes remain": [4],
-        "ps claims 50 elements, 0 bytes remain": [6],
-        "ps claims 1 elements, 7 bytes remain": [],
-    } or reasons(decoded) == {
         "ends in the middle of field a": [1],
         "ranges claims 4294967295 elements, 4 bytes remain": [2],
         "12 bytes left over: the definition does not fit": [3],

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore, get_types_from_msg
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings

@@ -1,0 +1,104 @@
+"""Runs the command line as a user does: in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+COMMAND = [sys.executable, "-m", "hybridlog"]
+_LIMIT_S = 120
+
+
+class Done(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+    raw: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+    @property
+    def lines(self) -> list[str]:
+        return self.out.splitlines()
+
+
+def environment(**extra: str) -> dict[str, str]:
+    """No store or MongoDB by accident, and output that does not depend on the terminal."""
+    kept = {k: v for k, v in os.environ.items() if k not in {"HYBRIDLOG_STORE", "COLUMNS"}}
+    return {**kept, "LC_ALL": "C.UTF-8", **extra}
+
+
+def run(*arguments: object, store: Path | None = None, code: int | None = 0, **env: str) -> Done:
+    """Run a command to its end.
+
+    Args:
+        arguments: Of the command.
+        store: What HYBRIDLOG_STORE says.
+        code: The exit code that is expected; None for any.
+        env: Variables.
+    """
+    if store is not None:
+        env["HYBRIDLOG_STORE"] = str(store)
+    ended = subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        env=environment(**env),
+        timeout=_LIMIT_S,
+        check=False,
+    )
+    done = Done(
+        ended.returncode,
+        ended.stdout.decode("utf-8", "replace"),
+        ended.stderr.decode("utf-8", "replace"),
+        ended.stdout,
+    )
+    assert "Traceback" not in done.err, done.err
+    if code is not None:
+        assert done.code == code, (done.code, done.out[-2000:], done.err[-2000:])
+    return done
+
+
+def start(*arguments: object, output: IO[bytes], wrapper: tuple[str, ...] = ()) -> Any:
+    """Start a command; both of its streams go to `output`."""
+    return subprocess.Popen(
+        [*wrapper, *COMMAND, *map(str, arguments)],
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env=environment(),
+    )
+
+
+def wait_for(condition: Callable[[], object], limit_s: float = 60) -> None:
+    """Wait until something is the case."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.002)
+
+
+def open_bytes(store: Path) -> int:
+    """Bytes in segments that are being written."""
+    total = 0
+    for path in store.glob("recordings/*/*.mcap.open"):
+        try:
+            total += path.stat().st_size
+        except FileNotFoundError:
+            continue
+    return total
+
+
+def recordings(store: Path) -> list[str]:
+    """What lies in a store's directory of recordings, hidden or not."""
+    return sorted(path.name for path in (store / "recordings").iterdir())

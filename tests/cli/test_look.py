@@ -1,0 +1,110 @@
+"""`hybridlog ls`, `info`, `schema`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.independent import read_bag
+
+from .odd_log import HOSTILE_NAME
+from .running import run
+
+
+def test_ls(logs: Path, store: Path) -> None:
+    done = run("ls", store=store)
+    assert done.lines[0].split() == [
+        "recording", "start", "duration", "topics", "messages", "stored", "note",
+    ]  # fmt: skip
+    rows = {line.split()[0]: line for line in done.lines[1:]}
+    assert set(rows) == {"robot", "odd", "torn"}
+    assert "place=lab" in rows["robot"]
+    assert "source damaged" in rows["torn"]
+    assert f" {len(read_bag(logs / 'robot.bag'))} " in rows["robot"]
+    assert done.err == ""
+
+
+def test_ls_json(logs: Path, store: Path) -> None:
+    found = {r["recording"]: r for r in run("ls", "--json", store=store).json}
+    seen = read_bag(logs / "robot.bag")
+    robot = found["robot"]
+    assert robot["start_ns"] == min(m.log_time for m in seen)
+    assert robot["last_ns"] == max(m.log_time for m in seen)
+    assert robot["topics"] == len({m.topic for m in seen})
+    assert robot["source"]["path"] == str(logs / "robot.bag")
+
+
+def test_info(logs: Path, store: Path) -> None:
+    seen = read_bag(logs / "robot.bag")
+    found = run("info", "robot", "--json", store=store).json
+    counted = {c["topic"]: (c["messages"], c["payload_bytes"]) for c in found["channels"]}
+    for topic in {m.topic for m in seen}:
+        mine = [m for m in seen if m.topic == topic]
+        assert counted[topic] == (len(mine), sum(len(m.payload) for m in mine))
+    scan = next(c for c in found["channels"] if c["topic"] == "/base/scan")
+    assert scan["skew_ns"]["min"] <= scan["skew_ns"]["mean"] <= scan["skew_ns"]["max"]
+    assert 10 < scan["rate_hz"] < 40
+    assert found["coverage"] == "complete"
+
+    text = run("info", "robot", store=store).out
+    assert "coverage   complete" in text
+    assert "/base/scan" in text
+    assert "sensor_msgs/LaserScan" in text
+    assert "latched" in text
+    assert "index      database" in text
+
+
+def test_info_without_a_name_shows_all_and_the_losses(store: Path) -> None:
+    done = run("info", store=store)
+    for name in ("robot", "odd", "torn"):
+        assert f"recording  {name}" in done.out
+    assert "lost, source damaged: torn.bag at byte" in done.out
+    assert done.err == ""
+
+
+def test_info_of_a_segment(logs: Path, store: Path) -> None:
+    path = store / "recordings/robot/000000.mcap"
+    found = run("info", path, "--json").json
+    assert found["recording"]["id"] == "robot"
+    assert sum(c["messages"] for c in found["channels"]) == len(read_bag(logs / "robot.bag"))
+    assert "/base/scan" in run("info", path).out
+    run("info", logs / "odd.mcap", code=5)
+
+
+def test_a_recording_that_is_not_there(store: Path) -> None:
+    done = run("info", "rob0t", store=store, code=2)
+    assert "robot" in done.err
+
+
+def test_schema(store: Path) -> None:
+    done = run("schema", "scan", store=store)
+    assert done.lines[0].startswith("/base/scan  sensor_msgs/LaserScan  (ros1")
+    assert any(line.split()[:2] == ["ranges", "float32[]"] for line in done.lines)
+    assert "ranges.min, ranges.max, ranges.mean, ranges.n" in done.out
+    assert "float32[] ranges" in done.out
+
+    (found,) = run("schema", "/base/scan", "--recording", "robot", "--json", store=store).json
+    fields = {f["path"]: f["type"] for f in found["fields"]}
+    assert fields["header.stamp"] == "time"
+    assert fields["angle_min"] == "float32"
+
+
+def test_schema_of_a_topic_whose_type_changes(store: Path) -> None:
+    found = run("schema", "change", "--json", store=store).json
+    assert [item["type"] for item in found] == ["std_msgs/msg/String", "std_msgs/msg/Int32"]
+
+
+def test_schema_of_a_hostile_definition(store: Path) -> None:
+    done = run("schema", "code", store=store)
+    assert "not indexed" in done.out
+    assert "__import__" in done.out
+
+
+def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
+    for command in (("info", "odd"), ("schema", "/*red*/x"), ("fetch", "-t", "*x", "-F", "table")):
+        done = run(*command, store=store, code=None)
+        assert "\x1b" not in done.out + done.err
+        assert "\x07" not in done.out + done.err
+    assert "/\\x1b[31mred\\x07\\x0a/x" in run("info", "odd", store=store).out
+    found = run("info", "odd", "--json", store=store)
+    assert HOSTILE_NAME in {c["topic"] for c in found.json["channels"]}
+    assert "\x1b" not in found.out

@@ -1,0 +1,170 @@
+"""`hybridlog record`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.data import DATA, needs_data
+from tests.independent import read_bag
+
+from .running import recordings, run
+
+
+def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
+    done = run("record", logs / "small.bag", "--store", tmp_path / "s")
+    seen = read_bag(logs / "small.bag")
+    table = dict(line.split(None, 1) for line in done.lines if not line.startswith(("bytes", "me")))
+    assert table["recording"] == "small"
+    assert table["topics"] == str(len({m.topic for m in seen}))
+    for line in ("messages", "messages indexed"):
+        assert f"{line:<16}  {len(seen)}" in done.lines
+    assert [line.split("  ")[0] for line in done.lines] == [
+        "recording",
+        "source",
+        "topics",
+        "messages",
+        "bytes in",
+        "bytes stored",
+        "ratio",
+        "messages indexed",
+        "time",
+    ]
+    assert done.err == ""
+
+
+def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
+    done = run("record", logs / "small.bag", "--store", tmp_path / "s", "--json").json
+    seen = read_bag(logs / "small.bag")
+    stored = sum(p.stat().st_size for p in (tmp_path / "s/recordings/small").glob("*.mcap"))
+    assert done["messages"] == done["messages_indexed"] == len(seen)
+    assert done["bytes_in"] == (logs / "small.bag").stat().st_size
+    assert done["bytes_stored"] == stored
+    assert done["ratio"] == pytest.approx(done["bytes_in"] / stored, abs=1e-3)
+    assert done["damage"] == []
+
+
+def test_choices(logs: Path, tmp_path: Path) -> None:
+    seen = read_bag(logs / "small.bag")
+    start = min(m.log_time for m in seen)
+    run(
+        *("record", logs / "small.bag", "--name", "my run/1", "--tag", "a=b=c", "--tag", "d="),
+        *("--topics", "imu/*", "--topics", "scan", "--exclude", "re:.*scan"),
+        *("--between", "+1s", "+2s", "--chunk-size", "16KiB", "--compression", "lz4"),
+        store=tmp_path / "s",
+    )
+    wanted = [
+        m for m in seen if m.topic == "/imu/data" and 10**9 <= m.log_time - start < 2 * 10**9
+    ]
+    found = run("info", "--json", store=tmp_path / "s").json[0]
+    assert found["name"] == "my run/1"
+    assert found["recording"] == "my-run-1"
+    assert found["tags"] == {"a": "b=c", "d": ""}
+    assert [(c["topic"], c["messages"]) for c in found["channels"]] == [("/imu/data", len(wanted))]
+    assert found["chunks"] > 1
+
+    from mcap.reader import make_reader
+
+    with (tmp_path / "s/recordings/my-run-1/000000.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert {c.compression for c in summary.chunk_indexes} <= {"lz4", ""}
+
+
+def test_several_paths(logs: Path, tmp_path: Path) -> None:
+    done = run(
+        *("record", logs / "small.bag", logs / "nothing.bag", logs / "odd.mcap"),
+        store=tmp_path / "s",
+        code=3,
+    )
+    assert [line.split()[0] for line in done.lines] == ["recording", "small", "odd", "total"]
+    assert "nothing.bag: no such file" in done.err
+    assert recordings(tmp_path / "s") == ["odd", "small"]
+
+    again = run("record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8)
+    assert [item["exit_code"] for item in again.json if "error" in item] == [8]
+    assert again.json[1]["recording"] == "robot"
+
+
+def test_the_same_content_is_noticed(logs: Path, fresh: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "other-name.bag"
+    copy.write_bytes((logs / "small.bag").read_bytes())
+    done = run("record", copy, store=fresh, code=8)
+    assert "'small'" in done.err
+    assert "--again" in done.err
+    assert recordings(fresh) == ["small"]
+    run("record", copy, "--again", store=fresh)
+    assert recordings(fresh) == ["other-name", "small"]
+
+
+def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
+    done = run("record", logs / "odd.mcap", store=tmp_path / "s")
+    for topic in ("/code", "/recursive", "/no_definition", "/cbor"):
+        assert f"{topic}: not indexed beyond time" in done.err
+    assert "/long: 3 messages do not fit their definition" in done.err
+    assert "__import__" in done.err
+    assert done.lines[7].split()[-1] == "36"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--chunk-size", "big"), "no size"),
+        (("--chunk-size", "1"), "chunk size"),
+        (("--tag", "a"), "KEY=VALUE"),
+        (("--topics", "re:(a+)+"), "refused"),
+        (("--between", "x", "y"), "not a time"),
+        (("--between", "+2s", "+1s"), "the range is empty"),
+        (("--between", "2000-01-01", "2000-01-02"), "it spans"),
+        (("--topics", "/nothing"), "/imu/data"),
+        (("--mongo", "http://x"), "connection string"),
+        (("--level", "40"), "level"),
+    ],
+)
+def test_wrong_options(logs: Path, tmp_path: Path, options: tuple[str, ...], words: str) -> None:
+    done = run("record", logs / "small.bag", *options, store=tmp_path / "s", code=2)
+    assert words in done.err
+    assert done.out == ""
+    assert not (tmp_path / "s").exists() or recordings(tmp_path / "s") == []
+
+
+def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
+    files = {"empty.bag": b"", "text.mcap": b"hello, this is no log", "magic.bag": b"#ROSBAG V2.0\n"}
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        done = run("record", tmp_path / name, store=tmp_path / "s", code=3)
+        assert name in done.err
+    run("record", *(tmp_path / name for name in files), store=tmp_path / "s", code=3)
+    run("record", tmp_path, store=tmp_path / "s", code=3)
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_damaged_log(logs: Path, store: Path) -> None:
+    found = run("info", "torn", "--json", store=store).json
+    readable = {(m.topic, m.log_time) for m in read_bag(logs / "small.bag")}
+    assert 0 < found["messages"] < len(readable)
+    assert found["losses"]
+    assert found["status"] == "damaged"
+    assert "lost in" in found["coverage"]
+
+
+def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
+    done = run("record", logs / "torn.bag", "--json", store=tmp_path / "s", code=4)
+    assert "torn.bag is damaged" in done.err
+    (damage,) = done.json["damage"]
+    assert damage["file"].endswith("torn.bag")
+    assert 0 < damage["offset"] <= (logs / "torn.bag").stat().st_size
+    run("verify", store=tmp_path / "s")
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name",
+    ["real/compressed_image.bag", "odd/rosbag2/split_mcap", "real/auv_ros2_db3", "odd/protobuf.mcap"],
+)
+def test_real_logs(name: str, tmp_path: Path) -> None:
+    done = run("record", DATA / name, "--json", "--store", tmp_path / "s")
+    assert done.json["messages"] == done.json["messages_indexed"] > 0
+    assert json.loads(run("verify", "--json", store=tmp_path / "s").out)["findings"] == []

@@ -1,0 +1,114 @@
+"""Help, exit codes, speed of the start, and what is not imported for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hybridlog.cli.main import EXIT_CODES
+
+from .running import COMMAND, environment, run
+
+HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
+COMMANDS = "record ls info schema fetch export reindex verify rm demo".split()
+
+
+def imported(*arguments: object) -> set[str]:
+    """Top packages that a command imports."""
+    ended = subprocess.run(
+        [sys.executable, "-X", "importtime", *COMMAND[1:], *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        check=True,
+    )
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("import time:")]
+    return {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}
+
+
+def test_help_imports_nothing_heavy_and_is_fast() -> None:
+    assert not imported("--help") & HEAVY
+    assert not imported("fetch", "--help") & HEAVY
+    times = []
+    for _ in range(5):
+        began = time.monotonic()
+        run("--help")
+        times.append(time.monotonic() - began)
+        if times[-1] < 0.2:
+            return
+    # The bound holds on a quiet machine; a busy one gets some grace.
+    assert min(times) < 0.6, times
+
+
+def test_looking_imports_no_table_libraries(store: Path) -> None:
+    for command in ("ls", "info"):
+        assert not imported(command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
+
+
+def test_help_names_commands_and_exit_codes() -> None:
+    out = run("--help").out
+    for command in COMMANDS:
+        assert f"\n  {command} " in out
+        assert run(command, "--help").out.startswith("Usage: ")
+    for code, meaning in EXIT_CODES.items():
+        assert f"{code:>3}  {meaning}" in out
+    assert "..." not in out.split("Commands:")[1].split("The store is")[0]
+
+
+def test_every_option_has_help() -> None:
+    for command in COMMANDS:
+        options = run(command, "--help").out.split("Options:")[1]
+        for line in options.splitlines():
+            if line.startswith("  -") and len(line.rstrip()) < 36:
+                # The text of a long option stands in the next line.
+                following = options.splitlines()[options.splitlines().index(line) + 1]
+                assert following.startswith("   "), (command, line)
+
+
+def test_version() -> None:
+    from hybridlog import __version__
+
+    assert run("--version").out == f"hybridlog {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("nothing",), ("ls", "--nothing"), ("fetch",), ("fetch", "-t", "x", "--limit", "-1")],
+)
+def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
+    done = run(*arguments, code=2)
+    assert done.out == ""
+    assert "Error" in done.err
+
+
+def complete(words: str) -> list[str]:
+    """What bash would offer for the last word."""
+    ended = subprocess.run(
+        COMMAND,
+        capture_output=True,
+        text=True,
+        env=environment(
+            _HYBRIDLOG_COMPLETE="complete_bash",
+            COMP_WORDS=f"hybridlog {words}",
+            COMP_CWORD=str(len(words.split())),
+        ),
+        check=True,
+    )
+    assert ended.stderr == ""
+    return ended.stdout.split()
+
+
+def test_completion(store: Path) -> None:
+    assert complete(f"info --store {store} r") == ["robot"]
+    assert complete(f"verify --store {store} o") == ["odd"]
+    assert complete(f"fetch --store {store} --topic /base/s") == ["/base/scan"]
+    assert complete(f"fetch --store {store} --topic sca") == ["scan"]
+    # Two cameras have one, so the short name stands for none.
+    assert complete(f"fetch --store {store} --topic image_") == []
+    assert complete(f"fetch --store {store} --recording t") == ["torn"]
+    assert "--between" in complete("fetch --be")
+    assert complete("info --store /nowhere r") == []

@@ -1,0 +1,262 @@
+"""The rules on who may import whom, kept by reading every import of the project."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from tests.imports import PACKAGES, ROOT, Import, imports_of, modules
+
+MODULES = modules()
+IMPORTS = {name: imports_of(path, name) for name, path in MODULES.items()}
+
+HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zstandard")
+"""What no command may load before it needs it."""
+
+# Where each third-party package may be imported: a module, or a package and all below it.
+ALLOWED = {
+    "PIL": ("hybridlog.arrays",),
+    "bson": (
+        "hybridlog.reader",  # whole index documents, for people
+        "hybridlog.schema.json_codec",
+        "hybridlog.schema.object_rows",
+        "hybridlog.schema.protobuf_codec",
+        "hybridlog.schema.ros_codec",
+        "hybridlog_storage.bson_columns",
+        "hybridlog_storage.database",
+    ),
+    "google": ("hybridlog.schema.protobuf_codec",),
+    "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
+    "mcap": (
+        "hybridlog.export.mcap",
+        "hybridlog.sources",
+        "hybridlog_storage.chunk_builder",
+        "hybridlog_storage.mcap_content",
+        "hybridlog_storage.mcap_scan",
+        "hybridlog_storage.recovery",
+        "hybridlog_storage.segment_format",
+        "hybridlog_storage.segment_reader",
+        "hybridlog_storage.segment_writer",
+    ),
+    "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
+    "pandas": ("hybridlog.frames",),
+    "pyarrow": ("hybridlog.cli", "hybridlog.export", "hybridlog.frames", "hybridlog.tables"),
+    "pymongo": ("hybridlog_storage.database",),
+    "rich": ("hybridlog.cli",),
+    "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
+    "ruamel": ("hybridlog.sources.rosbag2_metadata",),
+    "sqlite3": ("hybridlog.sources.rosbag2_sqlite",),
+    "typer": ("hybridlog.cli",),
+    "zstandard": (
+        "hybridlog.sources",
+        "hybridlog_storage.compression",
+        "hybridlog_storage.segment_format",
+    ),
+}
+
+# Distributions that are called otherwise than what one imports.
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "bson": "pymongo",
+    "google": "mcap-protobuf-support",
+    "mcap_protobuf": "mcap-protobuf-support",
+    "ruamel": "ruamel.yaml",
+}
+
+# Modules of ours that only some may import when the program runs.
+WIRED_BY = {
+    "hybridlog_storage.mongod": ("hybridlog.store",),
+    "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.demo", "hybridlog.store"),
+}
+
+
+def _is(module: str, package: str) -> bool:
+    return module == package or module.startswith(f"{package}.")
+
+
+def _order(name: str) -> tuple[int, str]:
+    """Constants, then classes, then the rest: the order that ruff keeps."""
+    return (0 if name.isupper() else 1 if name[:1].isupper() else 2), name
+
+
+def _places(name: str, imports: list[Import]) -> str:
+    path = MODULES[name].relative_to(ROOT)
+    return ", ".join(f"{path}:{found.line}" for found in imports)
+
+
+def test_modules_are_found() -> None:
+    assert {"hybridlog", "hybridlog.store", "hybridlog_storage.database"} <= set(MODULES)
+    assert any(i.module == "numpy" for i in IMPORTS["hybridlog_storage.messages"])
+    typed = [i for i in IMPORTS["hybridlog_storage.messages"] if i.module == "numpy.typing"]
+    assert typed
+    assert all(i.typing for i in typed)
+
+
+def test_the_reader_of_imports_sees_all_kinds(tmp_path: Path) -> None:
+    path = tmp_path / "sample.py"
+    path.write_text(
+        "import a.b\n"
+        "from c import d\n"
+        "from . import e\n"
+        "from ..f import g\n"
+        "if TYPE_CHECKING:\n    import h\nelse:\n    import i\n"
+        "def run():\n    try:\n        import j\n    except ImportError:\n        pass\n"
+    )
+    found = {i.module: (i.typing, i.lazy) for i in imports_of(path, "top.package.sample")}
+    assert found == {
+        "a.b": (False, False),
+        "c": (False, False),
+        "c.d": (False, False),
+        "top.package": (False, False),
+        "top.package.e": (False, False),
+        "top.f": (False, False),
+        "top.f.g": (False, False),
+        "h": (True, False),
+        "i": (False, False),
+        "j": (False, True),
+    }
+
+
+def test_storage_never_imports_hybridlog() -> None:
+    for name in MODULES:
+        if _is(name, "hybridlog_storage"):
+            wrong = [i for i in IMPORTS[name] if _is(i.module, "hybridlog")]
+            assert not wrong, f"mechanism must not know policy: {_places(name, wrong)}"
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_third_party_packages_stay_where_they_belong(package: str) -> None:
+    for name, imports in IMPORTS.items():
+        wrong = [i for i in imports if _is(i.module, package) and not i.typing]
+        allowed = any(_is(name, place) for place in ALLOWED[package])
+        assert allowed or not wrong, (
+            f"{package} may be imported in {', '.join(ALLOWED[package])} only, "
+            f"not in {_places(name, wrong)}"
+        )
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_no_permission_outlives_its_need(package: str) -> None:
+    if package == "mcap_protobuf":
+        pytest.skip("mcap_protobuf is allowed where protobuf is read, and need not be used")
+    for place in ALLOWED[package]:
+        users = [
+            name
+            for name, imports in IMPORTS.items()
+            if _is(name, place) and any(_is(i.module, package) for i in imports)
+        ]
+        assert users, f"{place} does not import {package} any more: take it off the list"
+
+
+def test_only_known_packages_are_imported() -> None:
+    known = {*ALLOWED, "numpy", "hybridlog", "hybridlog_storage", *sys.stdlib_module_names}
+    for name, imports in IMPORTS.items():
+        wrong = [i for i in imports if i.module.partition(".")[0] not in known]
+        assert not wrong, f"say in ALLOWED where these belong: {_places(name, wrong)}"
+
+
+@pytest.mark.parametrize("package", sorted({*ALLOWED, "numpy"} - sys.stdlib_module_names))
+def test_what_is_imported_is_declared(package: str) -> None:
+    """A package that only comes along with another one goes when that changes its mind."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    optional = project["optional-dependencies"].values()
+    declared = {
+        re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0].lower()
+        for line in [*project["dependencies"], *(line for group in optional for line in group)]
+    }
+    assert DISTRIBUTIONS.get(package, package) in declared
+
+
+@pytest.mark.parametrize("target", sorted(WIRED_BY))
+def test_one_module_wires_the_parts(target: str) -> None:
+    for name, imports in IMPORTS.items():
+        wrong = [i for i in imports if _is(i.module, target) and not i.typing]
+        allowed = any(_is(name, p) if p != "hybridlog" else name == p for p in WIRED_BY[target])
+        assert allowed or not wrong, f"{target} is not for {_places(name, wrong)}"
+
+
+def test_no_circle_of_imports() -> None:
+    """Modules that load each other work or fail by who comes first."""
+    graph = {
+        name: {
+            i.module
+            for i in imports
+            if i.module in MODULES
+            # A package is loaded before its modules whoever asks.
+            and not _is(name, i.module)
+            and not i.typing
+            and not i.lazy
+        }
+        for name, imports in IMPORTS.items()
+    }
+    done: set[str] = set()
+
+    def visit(name: str, path: list[str]) -> None:
+        assert name not in path, " imports ".join([*path[path.index(name) :], name])
+        if name not in done:
+            for other in sorted(graph[name]):
+                visit(other, [*path, name])
+            done.add(name)
+
+    for name in graph:
+        visit(name, [])
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        "from hybridlog.cli import main; main()",
+        "import hybridlog",
+        "import hybridlog_storage",
+    ],
+)
+def test_starting_loads_nothing_heavy(start: str) -> None:
+    script = (
+        "import atexit, json, sys\n"
+        "sys.argv = ['hybridlog', '--help']\n"
+        "atexit.register(lambda: print(json.dumps(sorted(sys.modules)), file=sys.stderr))\n"
+        f"{start}\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = json.loads(done.stderr.splitlines()[-1])
+    assert any(_is(name, "hybridlog") or _is(name, "hybridlog_storage") for name in loaded)
+    assert [name for name in loaded if name in HEAVY] == []
+
+
+@pytest.mark.parametrize("package", [*PACKAGES, ROOT / "benchmarks"], ids=lambda p: p.name)
+def test_every_module_says_what_it_is_for(package: Path) -> None:
+    paths = sorted(package.rglob("*.py"))
+    assert paths
+    silent = [
+        str(path.relative_to(ROOT))
+        for path in paths
+        if not ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert silent == []
+
+
+def test_public_names_are_sorted_and_exist() -> None:
+    lists = 0
+    for name, path in MODULES.items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if not isinstance(node, ast.Assign):
+                continue
+            if [t.id for t in node.targets if isinstance(t, ast.Name)] != ["__all__"]:
+                continue
+            names = ast.literal_eval(node.value)
+            assert names == sorted(set(names), key=_order), f"__all__ of {name} is not sorted"
+            module = import_module(name)
+            assert [n for n in names if not hasattr(module, n)] == []
+            lists += 1
+    assert lists, "hybridlog itself has an __all__"

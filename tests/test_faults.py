@@ -1,0 +1,770 @@
+"""What is killed, filled up, lost or altered: nothing stored may be lost, nothing be wrong."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pymongo
+import pytest
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    SegmentError,
+    StoreError,
+)
+from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_writer import SegmentSettings
+
+import hybridlog as hl
+from hybridlog import maintenance
+from hybridlog.demo.config import RobotConfig
+from hybridlog.demo.write import write_bag
+from tests import independent
+
+COMMAND = [sys.executable, "-m", "hybridlog"]
+LIMIT_S = 120
+Message = tuple[str, int, bytes]
+"""Topic, log time, payload."""
+
+
+# Logs and stores.
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """About 40 MB of the simulated robot."""
+    path = tmp_path_factory.mktemp("robot") / "robot.bag"
+    return write_bag(path, duration_s=24.0).path
+
+
+@pytest.fixture(scope="module")
+def spoken(robot: Path) -> dict[str, list[Message]]:
+    """What the robot said, by topic, as `rosbags` reads it."""
+    found: dict[str, list[Message]] = defaultdict(list)
+    for message in independent.read_bag(robot):
+        found[message.topic].append(tuple(message))
+    return dict(found)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of a robot with small sensors."""
+    path = tmp_path_factory.mktemp("short") / "short.bag"
+    config = RobotConfig(image_size=(64, 48), cloud_columns=20, scan_beams=180)
+    return write_bag(path, duration_s=2.0, config=config).path
+
+
+@pytest.fixture(scope="module")
+def said(short: Path) -> Counter[Message]:
+    return Counter(tuple(m) for m in independent.read_bag(short))
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Iterator[Path]:
+    """A store without recordings, whose mongod runs throughout the test."""
+    place = tmp_path / "store"
+    with hl.open(place, create=True, require_database=True):
+        yield place
+
+
+@pytest.fixture
+def store(path: Path, short: Path) -> Iterator[hl.Store]:
+    """A store with the recording `short`, in several segments."""
+    with hl.open(path, require_database=True) as opened:
+        settings = SegmentSettings(chunk_size=16 << 10, segment_size=60_000)
+        report = opened.record(short, settings=settings)
+        assert report.entry.id == "short"
+        assert report.entry.segments > 2
+        yield opened
+
+
+def fetched(store: hl.Store, recording: str) -> list[hl.Message]:
+    (entry,) = store.select([recording])
+    topics = sorted({c.topic for c in entry.channels})
+    return list(store.query(topics, [entry.id])) if topics else []
+
+
+def content(messages: list[hl.Message]) -> Counter[Message]:
+    return Counter((m.topic, m.log_time_ns, m.raw) for m in messages)
+
+
+def run(
+    *arguments: object, store: Path, code: int, before: Callable[[], None] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own, which must end with this exit code."""
+    done = subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        env={**os.environ, "HYBRIDLOG_STORE": str(store)},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        preexec_fn=before,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
+    return done
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.001)
+
+
+# A recorder that is killed.
+
+
+def bytes_of(store: Path, recording: str) -> int:
+    try:
+        return sum(p.stat().st_size for p in (store / "recordings" / recording).iterdir())
+    except FileNotFoundError:
+        return 0
+
+
+def kill_recorder(store: Path, log: Path, name: str, after_bytes: int) -> None:
+    """Start to record, and kill -9 when so much lies on the disk."""
+    process = subprocess.Popen(
+        [*COMMAND, "record", str(log), "--again", "--quiet", "--name", name],
+        env={**os.environ, "HYBRIDLOG_STORE": str(store)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        wait_for(lambda: bytes_of(store, name) >= after_bytes or process.poll() is not None)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_killed_recorder_loses_nothing_that_was_written(
+    path: Path, robot: Path, spoken: dict[str, list[Message]]
+) -> None:
+    run("record", robot, "--quiet", "--name", "whole", store=path, code=0)
+    whole = bytes_of(path, "whole")
+    rng = random.Random(3)
+    moments = sorted([0, 1, whole - 1, *(rng.randrange(whole) for _ in range(7))])
+    torn = 0
+    for number, moment in enumerate(moments):
+        name = f"torn{number}"
+        kill_recorder(path, robot, name, moment)
+        with hl.open(path, require_database=True) as store:
+            if name not in store.directory.recording_ids():
+                assert moment <= 1
+                assert store.tended.recovered.get(name, []) in ([], store.tended.recovered.get(name))
+                continue
+            (entry,) = store.select([name])
+            assert entry.status in {"recovered", "complete"}
+            torn += entry.status == "recovered"
+            messages = fetched(store, name)
+            assert entry.messages == len(messages)
+            by_topic: dict[str, list[hl.Message]] = defaultdict(list)
+            for message in sorted(messages, key=lambda m: m.seq):
+                by_topic[message.topic].append(message)
+            for topic, kept in by_topic.items():
+                # A topic's messages lie in one run of chunks: what is kept is a beginning.
+                have = [(m.topic, m.log_time_ns, m.raw) for m in kept]
+                assert have == spoken[topic][: len(have)], (name, topic)
+            assert store.verify([name]).findings == []
+            store.remove(name)
+    assert torn >= 6
+    with hl.open(path, require_database=True) as store:
+        assert content(fetched(store, "whole")) == Counter(
+            m for part in spoken.values() for m in part
+        )
+
+
+def test_what_was_cut_short_can_be_recorded_again(path: Path, robot: Path) -> None:
+    run("record", robot, "--quiet", "--name", "whole", store=path, code=0)
+    whole = bytes_of(path, "whole")
+    with hl.open(path) as store:
+        store.remove("whole")
+    kill_recorder(path, robot, "robot", whole // 2)
+    refused = run("record", robot, "--quiet", store=path, code=8)
+    assert "cut short" in refused.stderr
+    assert "--again" in refused.stderr
+    run("record", robot, "--quiet", "--again", store=path, code=0)
+    with hl.open(path, require_database=True) as store:
+        part, again = sorted(store.recordings(), key=lambda r: r.created)
+        assert (part.status, again.status) == ("recovered", "complete")
+        assert 0 < part.messages < again.messages
+        assert store.verify().findings == []
+
+
+def test_the_index_may_be_ahead_of_the_file(store: hl.Store, said: Counter[Message]) -> None:
+    """Power fails: the system had not written the file yet, but MongoDB its documents."""
+    number, path = store.directory.segments("short")[-1]
+    with SegmentReader(path, number) as reader:
+        chunks = reader.summary().chunks
+    assert len(chunks) > 3
+    content_of_file = path.read_bytes()
+    path.with_name(path.name + ".open").write_bytes(content_of_file[: chunks[-2].offset + 20])
+    path.unlink()
+    assert store.database is not None
+    store.database.update("hybridlog.recordings", {"_id": "short"}, {"$set": {"status": "open"}})
+    with hl.open(store.directory.path, require_database=True) as opened:
+        assert list(opened.tended.recovered) == ["short"]
+        messages = fetched(opened, "short")
+        (entry,) = opened.select(["short"])
+        assert 0 < len(messages) < said.total()
+        assert not content(messages) - said
+        assert entry.messages == len(messages)
+        topics = sorted({m.topic for m in messages})
+        assert opened.query(topics).where({"_meta.seq": {"$gte": 0}}).count() == len(messages)
+        assert opened.verify().findings == []
+
+
+def test_a_chunk_without_arrival_numbers_comes_after_the_earlier_segments(
+    store: hl.Store, said: Counter[Message]
+) -> None:
+    number, path = store.directory.segments("short")[-1]
+    assert number > 0
+    before = {m.seq for m in fetched(store, "short")}
+    with SegmentReader(path, number) as reader:
+        first = reader.summary().chunks[0]
+        rest = {int(s) for c in reader.summary().chunks for s in reader.read_chunk(c).seq}
+    earlier = before - rest
+    assert store.database is not None
+    for name in [c for c in store.database.list_collections() if not c.startswith("hybridlog.")]:
+        store.database.delete(name, {"_meta.ref.seg": number})
+    store.database.delete("hybridlog.chunks", {"seg": number})
+    store.database.update("hybridlog.recordings", {"_id": "short"}, {"$set": {"status": "open"}})
+    cut = path.read_bytes()[: first.offset + first.length + 3]
+    path.with_name(path.name + ".open").write_bytes(cut)
+    path.unlink()
+    with hl.open(store.directory.path, require_database=True) as opened:
+        messages = fetched(opened, "short")
+        assert not content(messages) - said
+        numbers = [m.seq for m in messages]
+        assert len(set(numbers)) == len(numbers) > len(earlier)
+        assert min(set(numbers) - earlier) > max(earlier)
+        assert opened.verify().findings == []
+
+
+# MongoDB that is killed.
+
+
+def kill_mongod(store: Path) -> None:
+    """End the mongod of this store, as its own record names it, and nothing else."""
+    import json
+
+    pid = int(json.loads((store / "mongod/mongod.json").read_text())["mongod"])
+    command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    assert bytes(store / "mongod" / "data") in command
+    os.kill(pid, signal.SIGKILL)
+
+
+def test_mongod_killed_while_a_log_is_recorded(
+    tmp_path: Path, robot: Path, spoken: dict[str, list[Message]]
+) -> None:
+    place = tmp_path / "store"
+    killed = False
+
+    def progress(_done: int, messages: int) -> None:
+        nonlocal killed
+        if messages > 3000 and not killed:
+            killed = True
+            kill_mongod(place)
+
+    with hl.open(place, create=True, require_database=True) as store:
+        report = store.record(robot, progress=progress)
+        assert killed
+        assert report.failure is None
+        assert report.missed == 0
+        assert report.indexed == report.entry.messages == sum(map(len, spoken.values()))
+        assert content(fetched(store, "robot")) == Counter(
+            m for part in spoken.values() for m in part
+        )
+        assert store.verify().findings == []
+
+
+def test_mongod_killed_and_not_to_be_had_again(
+    tmp_path: Path, robot: Path, spoken: dict[str, list[Message]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "store"
+    killed = False
+
+    def progress(_done: int, messages: int) -> None:
+        nonlocal killed
+        if messages > 3000 and not killed:
+            killed = True
+            monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
+            kill_mongod(place)
+
+    whole = Counter(m for part in spoken.values() for m in part)
+    with hl.open(place, create=True, require_database=True) as store:
+        report = store.record(robot, progress=progress)
+        assert isinstance(report.failure, DatabaseError)
+        assert report.missed > 0
+        assert report.indexed + report.missed == report.entry.messages == whole.total()
+        # By time it can be fetched even now, out of the segments alone.
+        assert content(fetched(store, "robot")) == whole
+    monkeypatch.delenv("HYBRIDLOG_MONGOD")
+    with hl.open(place, require_database=True) as store:
+        assert store.tended.indexed["robot"] > 0
+        assert store.verify().findings == []
+        assert store.topic("/imu/data").where({"_meta.t": {"$gt": 0}}).count() == len(
+            spoken["/imu/data"]
+        )
+
+
+# A disk that is full.
+
+
+def at_most(limit: int) -> Callable[[], None]:
+    """Files of the process may not grow beyond this, as on a full disk."""
+
+    def set_limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    return set_limit
+
+
+def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
+    done = run("record", robot, "--quiet", store=path, code=7, before=at_most(5_000_000))
+    assert "No space left" in done.stderr
+    with hl.open(path, require_database=True) as store:
+        assert store.recordings() == []
+        assert list((path / "recordings").iterdir()) == []
+        assert store.database is not None
+        for name in store.database.list_collections():
+            if name != "hybridlog.store":
+                assert store.database.count(name, {}) == 0, name
+        assert not store.tended.recovered
+    run("record", robot, "--quiet", store=path, code=0)
+
+
+def data_end(segment: bytes) -> int:
+    """Where the data section ends: the record DataEnd."""
+    at = 8
+    while segment[at] != 0x0F:
+        at += 9 + int(struct.unpack_from("<Q", segment, at + 1)[0])
+    return at
+
+
+def test_a_disk_that_is_full_when_the_segment_is_sealed(path: Path, short: Path) -> None:
+    run("record", short, "--quiet", store=path, code=0)
+    sealed = (path / "recordings/short/000000.mcap").read_bytes()
+    limit = (data_end(sealed) + len(sealed)) // 2
+    run("rm", "short", "--yes", store=path, code=0)
+    done = run("record", short, "--quiet", store=path, code=7, before=at_most(limit))
+    assert "No space left" in done.stderr
+    assert list((path / "recordings").iterdir()) == []
+    run("record", short, "--quiet", store=path, code=0)
+    run("verify", store=path, code=0)
+
+
+def test_a_disk_that_is_full_when_a_crash_is_mended(
+    path: Path, short: Path, said: Counter[Message]
+) -> None:
+    run("record", short, "--quiet", store=path, code=0)
+    segment = path / "recordings/short/000000.mcap"
+    sealed = segment.read_bytes()
+    end = data_end(sealed)
+    segment.unlink()
+    segment.with_name("000000.mcap.open").write_bytes(sealed[:end])
+    for limit in (end + 1, (end + len(sealed)) // 2):
+        run("ls", store=path, code=7, before=at_most(limit))
+        assert not segment.exists()
+    run("ls", store=path, code=0)
+    with hl.open(path, require_database=True) as store:
+        assert content(fetched(store, "short")) == said
+        assert store.verify().findings == []
+
+
+# Segments that are lost or altered after sealing.
+
+
+@dataclass(frozen=True)
+class Place:
+    """A chunk of the recording `short`."""
+
+    number: int
+    path: Path
+    offset: int
+    length: int
+    first: int
+    last: int
+
+
+def place_in_the_middle(store: hl.Store) -> Place:
+    number, path = store.directory.segments("short")[1]
+    with SegmentReader(path, number) as reader:
+        chunks = reader.summary().chunks
+    chunk = chunks[len(chunks) // 2]
+    return Place(number, path, chunk.offset, chunk.length, chunk.first, chunk.last)
+
+
+def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int, int]]) -> None:
+    """Every chunk that is not among the lost ones can still be fetched."""
+    (entry,) = store.select(["short"])
+    topics = {c.id: c.topic for c in entry.channels}
+    got: set[int] = set()
+    for chunk in store.catalog.chunks("short"):
+        if (chunk.segment, chunk.offset) in lost:
+            continue
+        # Bounds that no other chunk of these topics can be needed for.
+        mine = [topics[c] for c in chunk.stats]
+        query = store.query(mine).where(
+            {"_meta.ref.chunk": chunk.offset, "_meta.ref.seg": chunk.segment}
+        )
+        found = list(query)
+        assert len(found) == sum(s.messages for s in chunk.stats.values())
+        assert not content(found) - said
+        got |= {m.seq for m in found}
+    assert got
+
+
+def reopened(store: hl.Store) -> hl.Store:
+    return hl.open(store.directory.path, require_database=True)
+
+
+def test_a_flipped_bit(store: hl.Store, said: Counter[Message]) -> None:
+    place = place_in_the_middle(store)
+    data = bytearray(place.path.read_bytes())
+    data[place.offset + place.length - 5] ^= 0x10
+    place.path.write_bytes(data)
+    with reopened(store) as opened:
+        findings = opened.verify().findings
+        assert any(
+            f.recording == "short" and place.path.name in f.place and str(place.offset) in f.place
+            for f in findings
+        )
+        with pytest.raises(SegmentError, match=rf"byte {place.offset} of .*{place.path.name}"):
+            fetched(opened, "short")
+        check_the_rest(opened, said, {(place.number, place.offset)})
+    done = run("verify", store=store.directory.path, code=1)
+    assert place.path.name in done.stdout
+
+
+def test_a_truncated_segment(store: hl.Store, said: Counter[Message]) -> None:
+    place = place_in_the_middle(store)
+    os.truncate(place.path, place.offset + 7)
+    lost = {
+        (c.segment, c.offset)
+        for c in store.catalog.chunks("short")
+        if c.segment == place.number and c.offset >= place.offset
+    }
+    with reopened(store) as opened:
+        assert any(place.path.name in f.place for f in opened.verify().findings)
+        with pytest.raises(SegmentError, match=rf"{place.path.name} ends at byte {place.offset + 7}"):
+            fetched(opened, "short")
+        check_the_rest(opened, said, lost)
+    run("verify", store=store.directory.path, code=1)
+
+
+def test_a_deleted_segment(store: hl.Store, said: Counter[Message]) -> None:
+    place = place_in_the_middle(store)
+    place.path.unlink()
+    lost = {
+        (c.segment, c.offset) for c in store.catalog.chunks("short") if c.segment == place.number
+    }
+    with reopened(store) as opened:
+        findings = opened.verify().findings
+        assert {f.recording for f in findings} == {"short"}
+        assert sum("not there" in f.problem for f in findings) == len(lost)
+        with pytest.raises(SegmentError, match=place.path.name):
+            fetched(opened, "short")
+        check_the_rest(opened, said, lost)
+    run("verify", store=store.directory.path, code=1)
+
+
+def test_a_recording_without_any_segment_is_told(store: hl.Store) -> None:
+    for _, path in store.directory.segments("short"):
+        path.unlink()
+    findings = store.verify().findings
+    assert {f.recording for f in findings} == {"short"}
+    done = run("ls", store=store.directory.path, code=0)
+    assert "short" in done.stderr
+    with reopened(store) as opened:
+        assert opened.recordings() == []
+
+
+def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -> None:
+    """Whatever bit of a segment flips: its messages come as they were, or an error does."""
+    number, path = store.directory.segments("short")[-1]
+    whole = path.read_bytes()
+
+    def read(where: Path) -> dict[int, list[tuple[int, str, int, int, bytes]]]:
+        found = {}
+        with SegmentReader(where, number) as reader:
+            summary = reader.summary()
+            for place in summary.chunks:
+                try:
+                    chunk = reader.read_chunk(place)
+                except SegmentError:
+                    continue
+                batch = chunk.batch
+                found[place.offset] = [
+                    (
+                        int(chunk.seq[row]),
+                        summary.channels[int(batch.channel[row])].topic,
+                        int(batch.log_time[row]),
+                        int(batch.publish_time[row]),
+                        bytes(batch.payload(row)),
+                    )
+                    for row in range(len(batch))
+                ]
+        return found
+
+    sound = read(path)
+    with SegmentReader(path, number) as reader:
+        chunks = reader.summary().chunks
+    rng = random.Random(1)
+    # All of the head, the last chunk's head and trailer, and the summary; samples elsewhere.
+    last = chunks[-1]
+    end = data_end(whole)
+    spots = {*range(0, len(whole), 997), *range(end - 120, end), *range(last.offset, last.offset + 60)}
+    trailer = range(last.offset + last.length, end)
+    spots |= {*rng.sample(trailer, min(150, len(trailer))), *rng.sample(range(end, len(whole)), 200)}
+    broken = tmp_path / path.name
+    for spot in sorted(spots):
+        data = bytearray(whole)
+        data[spot] ^= 1 << rng.randrange(8)
+        broken.write_bytes(data)
+        try:
+            found = read(broken)
+        except SegmentError:
+            continue
+        for offset, messages in found.items():
+            assert messages == sound[offset], f"byte {spot} of {len(whole)}, chunk {offset}"
+
+
+# An index that is altered behind our back.
+
+
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        lambda db: db["imu__data"].delete_one({}),
+        lambda db: db["imu__data"].update_one({}, {"$inc": {"header.seq": 1}}),
+        lambda db: db["imu__data"].update_one({}, {"$set": {"extra": 1}}),
+        lambda db: db["imu__data"].update_one({}, {"$inc": {"_meta.ref.off": 1}}),
+        lambda db: db["imu__data"].update_one({}, {"$set": {"_meta.ref.seg": 77}}),
+        lambda db: db["imu__data"].update_one({}, {"$set": {"_meta.rec": "other"}}),
+        lambda db: db["imu__data"].insert_one(
+            {**db["imu__data"].find_one({}), "_id": b"\xff" * 20}
+        ),
+        lambda db: db["stray"].insert_one({"_meta": {"rec": "short"}}),
+        lambda db: db.drop_collection("base__scan"),
+        lambda db: db["hybridlog.chunks"].delete_one({}),
+        lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"first": 1}}),
+        lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"ch.0.messages": 1}}),
+        lambda db: db["hybridlog.recordings"].update_one({}, {"$inc": {"channels.0.stats.last": 9}}),
+        lambda db: db["hybridlog.recordings"].update_one({}, {"$set": {"name": "another"}}),
+        lambda db: db["hybridlog.recordings"].update_one({}, {"$inc": {"channels.0.id": 1}}),
+        lambda db: db["hybridlog.recordings"].delete_one({}),
+        lambda db: db["hybridlog.schemas"].delete_one({}),
+        lambda db: db["hybridlog.schemas"].update_one({}, {"$set": {"data": b"int8 x"}}),
+    ],
+    ids=[
+        "deleted", "altered", "extended", "misplaced", "wrong-segment", "wrong-recording",
+        "doubled", "stray", "collection-dropped", "chunk-deleted", "chunk-altered",
+        "chunk-statistics", "recording-statistics", "recording-name", "recording-channels",
+        "recording-deleted", "schema-deleted", "schema-altered",
+    ],
+)  # fmt: skip
+def test_an_altered_index_is_found_and_mended(
+    shared: hl.Store, alter: Callable[[Any], Any]
+) -> None:
+    store = shared
+    uri = EmbeddedMongod(store.directory.mongod).start()
+    assert store.database is not None
+    with pymongo.MongoClient[dict[str, Any]](uri) as client:
+        alter(client[store.database.name])
+    assert store.verify().findings
+    store.reindex()
+    assert store.verify().findings == []
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory, short: Path) -> Iterator[hl.Store]:
+    """One store for all alterations: each test ends with a sound index."""
+    with hl.open(tmp_path_factory.mktemp("shared") / "store", create=True) as opened:
+        opened.record(short)
+        yield opened
+
+
+def test_verify_and_reindex_as_commands(store: hl.Store) -> None:
+    assert store.database is not None
+    store.database.delete("imu__data", {"_meta.seq": {"$lt": 100}})
+    path = store.directory.path
+    done = run("verify", store=path, code=1)
+    assert "imu__data" in done.stdout
+    run("reindex", store=path, code=0)
+    run("verify", store=path, code=0)
+
+
+# Stores and databases that are not what they should be.
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"\xff\xfe\x00garbage", "damaged"),
+        (b"format = [", "damaged"),
+        (b"", "format"),
+        (b'format = 2\nstore_id = "x"\n', "newer"),
+        (b"format = 1\n", "store_id"),
+        (b'format = 1\nstore_id = "x"\nmongo = 3\n', "mongo"),
+    ],
+)
+def test_settings_that_cannot_be_used(tmp_path: Path, text: bytes, words: str) -> None:
+    place = tmp_path / "store"
+    (place / "recordings").mkdir(parents=True)
+    (place / "hybridlog.toml").write_bytes(text)
+    done = run("ls", store=place, code=5)
+    assert words in done.stderr
+    assert (place / "hybridlog.toml").read_bytes() == text
+
+
+def test_the_database_of_another_store_is_refused(
+    path: Path, store: hl.Store, short: Path, tmp_path: Path
+) -> None:
+    with EmbeddedMongod(path / "mongod") as mongod:
+        uri = mongod.start()
+        other = tmp_path / "other"
+        with pytest.raises(StoreError, match="another store"):
+            hl.open(other, create=True, mongo=uri)
+        run("record", short, "--quiet", "--mongo", uri, store=other, code=5)
+    assert store.verify().findings == []
+    assert store.database is not None
+    assert store.database.count("imu__data", {}) == store.topic("/imu/data").count()
+
+
+# Several at once.
+
+
+def test_two_recorders_at_once_make_one_store(tmp_path: Path, short: Path, robot: Path) -> None:
+    place = tmp_path / "store"
+    logs = [short, robot, short]
+    processes = [
+        subprocess.Popen(
+            [*COMMAND, "record", str(log), "--again", "--quiet"],
+            env={**os.environ, "HYBRIDLOG_STORE": str(place)},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for log in logs
+    ]
+    said = [p.communicate(timeout=LIMIT_S)[1] for p in processes]
+    assert [p.returncode for p in processes] == [0, 0, 0], said
+    with hl.open(place, require_database=True) as store:
+        assert sorted(r.name for r in store.recordings()) == ["robot", "short", "short"]
+        assert len({r.key for r in store.recordings()}) == 3
+        for recording in store.recordings():
+            log = short if recording.name == "short" else robot
+            assert content(fetched(store, recording.id)) == Counter(
+                tuple(m) for m in independent.read_bag(log)
+            )
+        assert store.verify().findings == []
+
+
+class Writing:
+    """A recording held half way, as another process sees it."""
+
+    def __init__(self, path: Path, log: Path, **choices: Any) -> None:
+        self.entered, self.go = threading.Event(), threading.Event()
+        self.result: list[object] = []
+        self._thread = threading.Thread(target=self._record, args=(path, log, choices))
+
+    def _record(self, path: Path, log: Path, choices: dict[str, Any]) -> None:
+        def progress(_done: int, messages: int) -> None:
+            if messages > 200 and not self.entered.is_set():
+                self.entered.set()
+                self.go.wait(LIMIT_S)
+
+        try:
+            with hl.open(path, require_database=True) as store:
+                self.result.append(store.record(log, progress=progress, **choices))
+        except Exception as error:
+            self.result.append(error)
+        finally:
+            self.entered.set()
+
+    def __enter__(self) -> Writing:
+        self._thread.start()
+        assert self.entered.wait(LIMIT_S)
+        assert not self.result, self.result
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.go.set()
+        self._thread.join(LIMIT_S)
+
+
+def test_opening_leaves_a_running_recording_alone(path: Path, robot: Path) -> None:
+    with Writing(path, robot) as writing:
+        for _ in range(3):
+            with hl.open(path, require_database=True) as store:
+                assert not store.tended.recovered
+                assert not store.tended.removed
+    (report,) = writing.result
+    assert not isinstance(report, Exception), report
+    with hl.open(path, require_database=True) as store:
+        assert store.verify().findings == []
+
+
+def test_reindex_does_not_cost_a_running_recording_its_index(path: Path, robot: Path) -> None:
+    with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
+        # Either it refuses, or what it drops is made again.
+        try:
+            store.reindex()
+        except StoreError:
+            pass
+    (report,) = writing.result
+    assert not isinstance(report, Exception), report
+    with hl.open(path, require_database=True) as store:
+        assert store.verify().findings == []
+
+
+def test_a_running_recording_cannot_be_removed(path: Path, robot: Path) -> None:
+    with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
+        with pytest.raises(StoreError, match="being written"):
+            store.remove("robot")
+    (report,) = writing.result
+    assert not isinstance(report, Exception), report
+    with hl.open(path, require_database=True) as store:
+        assert [r.id for r in store.recordings()] == ["robot"]
+        assert store.verify().findings == []
+
+
+def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
+    path: Path, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process opens the store after the directory is made, before it is locked."""
+    from hybridlog_storage.directory import StoreDirectory
+
+    make = StoreDirectory.new_recording
+
+    def made(self: StoreDirectory, name: str) -> str:
+        recording = make(self, name)
+        with hl.open(path, require_database=True) as other:
+            maintenance.tend(other.directory, other.database_for("This"))
+        return recording
+
+    monkeypatch.setattr(StoreDirectory, "new_recording", made)
+    with hl.open(path, require_database=True) as store:
+        store.record(short)
+        assert store.verify().findings == []

