@@ -189,7 +189,7 @@ def _depth(form: str, data: bytes) -> NDArray[Any]:
 
 def _picture(data: bytes) -> NDArray[Any]:
     try:
-        from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+        from PIL import Image, UnidentifiedImageError
     except ImportError as error:
         raise MissingDependencyError(
             "compressed images need Pillow: pip install 'hybridlog[images]'"

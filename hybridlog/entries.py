@@ -21,9 +21,8 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 
 if TYPE_CHECKING:
-    from hybridlog_storage.directory import StoreDirectory
-
     from hybridlog.indexing import ChunkIndexer
+    from hybridlog_storage.directory import StoreDirectory
 
 
 def new_key(taken: Iterable[int]) -> int:

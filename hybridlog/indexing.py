@@ -12,6 +12,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.schema.column import Records, Scalars
 from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError
@@ -19,12 +22,10 @@ from hybridlog_storage.index_documents import DocumentAssembler, Origin
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_writer import StoredChunk
 
-from hybridlog.schema.codec import Codec, codec_for
-from hybridlog.schema.column import Records, Scalars
-
 if TYPE_CHECKING:
-    from hybridlog_storage.database import Database
     from numpy.typing import NDArray
+
+    from hybridlog_storage.database import Database
 
 ARRAY_LIMIT = 32
 STAMP = "header.stamp"
@@ -105,9 +106,7 @@ class ChunkIndexer:
             if part is None:
                 codec = codec_for(channel, array_limit=self._array_limit)
                 stamped = any(path.path == STAMP and path.type == "time" for path in codec.paths())
-                origin = Origin(
-                    self._recording, self._key, channel.topic, channel.has_publish_time
-                )
+                origin = Origin(self._recording, self._key, channel.topic, channel.has_publish_time)
                 part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped
             return part
 
@@ -207,9 +206,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
         yield int(ids[start]), order[start:end]
 
 
-def _stats(
-    batch: Batch, channel: Channel, stamped: Codec | None, unreadable: int
-) -> ChannelStats:
+def _stats(batch: Batch, channel: Channel, stamped: Codec | None, unreadable: int) -> ChannelStats:
     first, last = int(batch.log_time.min()), int(batch.log_time.max())
     stats = ChannelStats(
         messages=len(batch),

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Batch
-
     from hybridlog.query.plan import Lane
     from hybridlog.reader import Query
+    from hybridlog_storage.messages import Batch
 
 _TRANSIENT_LOCAL = re.compile(r"durability:\s*(?:1|transient_local)\b")
 _DEEPEST = 1000
@@ -49,9 +48,7 @@ def in_force(query: Query) -> Iterator[tuple[Batch, Sequence[Lane]]]:
         )
         if not topics:
             continue
-        before = replace(
-            query.store.query(topics, [recording.id]).between(0, begin), _reverse=True
-        )
+        before = replace(query.store.query(topics, [recording.id]).between(0, begin), _reverse=True)
         yield from _last(before, begin)
 
 

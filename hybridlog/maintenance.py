@@ -10,17 +10,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
+from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
+from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.index_documents import key_bound, recording_key
 from hybridlog_storage.recovery import Recovered, recover_segment
 from hybridlog_storage.segment_reader import SegmentReader
 
-from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
-from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
-
 if TYPE_CHECKING:
+    from hybridlog_storage.catalog import ChunkEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -64,9 +64,7 @@ def recover(directory: StoreDirectory, recording_id: str) -> list[Recovered]:
     return results
 
 
-def tend(
-    directory: StoreDirectory, database: Database, progress: Progress | None = None
-) -> Tended:
+def tend(directory: StoreDirectory, database: Database, progress: Progress | None = None) -> Tended:
     """Bring index and segments together after a crash, or after the database was lost."""
     tended = Tended()
     catalog = Catalog(database)
@@ -84,7 +82,7 @@ def tend(
                     chunks = catch_up(directory, database, recording_id, progress)
                     tended.indexed[recording_id] = chunks
     present = set(directory.recording_ids())
-    for recording_id, entry in known.items():
+    for recording_id in known:
         if recording_id not in present:
             catalog.remove_recording(recording_id, _topic_collections(database))
             tended.removed.append(recording_id)
@@ -106,8 +104,14 @@ def catch_up(
     catalog = Catalog(database)
     summaries = read_summaries(directory, recording_id)
     entry = entry_of(summaries[min(summaries)].recording)
+    is_open = database.find_one(RECORDINGS, {"_id": recording_id, "status": "open"}) is not None
     indexer = ChunkIndexer(recording_id, entry.key)
+    places = {(n, c.offset) for n, summary in summaries.items() for c in summary.chunks}
     entries = catalog.chunks(recording_id)
+    if any((c.segment, c.offset) not in places for c in entries) or is_open:
+        # A power cut may take back chunks whose index documents are on the disk already.
+        _drop_dangling(database, recording_id, summaries)
+        entries = catalog.chunks(recording_id)
     done = {(c.segment, c.offset) for c in entries}
     index = IndexWriter(indexer, database)
     added = 0
@@ -124,6 +128,21 @@ def catch_up(
     catalog.put_losses(recording_id, whole.end.get("losses", []))
     catalog.put_recording(whole)
     return added
+
+
+def _drop_dangling(
+    database: Database, recording_id: str, summaries: Mapping[int, SegmentSummary]
+) -> None:
+    """Remove what the database says of chunks that are not in the segments."""
+    of_document: list[dict[str, object]] = [{"_meta.ref.seg": {"$nin": list(summaries)}}]
+    of_entry: list[dict[str, object]] = [{"seg": {"$nin": list(summaries)}}]
+    for number, summary in summaries.items():
+        offsets = [place.offset for place in summary.chunks]
+        of_document.append({"_meta.ref.seg": number, "_meta.ref.chunk": {"$nin": offsets}})
+        of_entry.append({"seg": number, "_id.off": {"$nin": offsets}})
+    for collection in _topic_collections(database):
+        database.delete(collection, {"_meta.rec": recording_id, "$or": of_document})
+    database.delete(CHUNKS, {"rec": recording_id, "$or": of_entry})
 
 
 def reindex(
@@ -196,57 +215,92 @@ def _verify_recording(
     result: Verification,
     progress: Progress | None,
 ) -> None:
-    def found(place: str, problem: str) -> None:
-        result.findings.append(Finding(recording_id, place, problem))
-
     catalog = Catalog(database)
-    entries = {(c.segment, c.offset): c for c in catalog.chunks(recording_id)}
-    expected: dict[str, int] = {}
-    known = {r.id: r for r in catalog.recordings()}
-    if recording_id not in known:
-        found("catalog", "the recording is missing from the catalog; run `hybridlog reindex`")
+    check = _Check(database, recording_id, result)
+    check.entries = {(c.segment, c.offset): c for c in catalog.chunks(recording_id)}
+    chunks = list(check.entries.values())
     for number, path in directory.segments(recording_id):
         with SegmentReader(path, number) as reader:
             try:
-                summary = reader.summary()
+                check.segment(reader, progress)
             except SegmentError as error:
-                found(path.name, str(error))
-                continue
-            base = entry_of(summary.recording)
-            indexer = ChunkIndexer(recording_id, base.key)
-            messages = 0
-            for place in summary.chunks:
-                where = f"{path.name} byte {place.offset}"
-                try:
-                    chunk = reader.read_chunk(place)
-                except SegmentError as error:
-                    found(where, str(error))
-                    continue
-                result.chunks += 1
-                messages += len(chunk.batch)
-                if progress is not None:
-                    progress(recording_id, place.offset + place.length, reader.size)
-                documents, entry = indexer.documents_of(chunk, summary.channels)
-                for collection, want in _by_collection(documents).items():
-                    expected[collection] = expected.get(collection, 0) + len(want)
-                    problem = _compare(database, base.key, chunk, collection, want)
-                    if problem:
-                        found(f"{where}, collection {collection}", problem)
-                if entries.pop((number, place.offset), None) != entry:
-                    found(where, "its catalog entry is missing or differs")
-            result.messages += messages
+                check.found(path.name, str(error))
             result.bytes_read += reader.bytes_read
-            if messages != sum(summary.counts.values()):
-                found(path.name, f"{messages} messages; its statistics say otherwise")
-    for segment, offset in entries:
-        found(f"segment {segment} byte {offset}", "the catalog names a chunk that is not there")
-    for collection in _topic_collections(database):
-        have = database.count(collection, {"_meta.rec": recording_id})
-        if have != expected.get(collection, 0):
-            found(
-                f"collection {collection}",
-                f"{have} index documents, {expected.get(collection, 0)} messages in the segments",
-            )
+    check.rest()
+    known = {r.id: r for r in catalog.recordings()}
+    if recording_id not in known:
+        check.found("catalog", "the recording is missing; run `hybridlog reindex`")
+        return
+    if check.indexer is not None and not check.damaged:
+        whole = build_entry(directory, check.indexer, recording_id, chunks)
+        if known[recording_id] != whole:
+            check.found("catalog", "its entry differs from the segments; run `hybridlog reindex`")
+
+
+class _Check:
+    """Compares the segments of one recording with the database."""
+
+    def __init__(self, database: Database, recording_id: str, result: Verification) -> None:
+        self.entries: dict[tuple[int, int], ChunkEntry] = {}
+        self.indexer: ChunkIndexer | None = None
+        self.damaged = False
+        self._database = database
+        self._recording_id = recording_id
+        self._result = result
+        self._expected: dict[str, int] = {}
+
+    def found(self, place: str, problem: str) -> None:
+        self.damaged = True
+        self._result.findings.append(Finding(self._recording_id, place, problem))
+
+    def segment(self, reader: SegmentReader, progress: Progress | None) -> None:
+        """Every chunk of a segment, and the number of its messages."""
+        summary = reader.summary()
+        base = entry_of(summary.recording)
+        if self.indexer is None:
+            self.indexer = ChunkIndexer(self._recording_id, base.key)
+        messages = 0
+        for place in summary.chunks:
+            try:
+                chunk = reader.read_chunk(place)
+            except SegmentError as error:
+                self.entries.pop((reader.number, place.offset), None)
+                self.found(f"{reader.path.name} byte {place.offset}", str(error))
+                continue
+            self._chunk(reader.path.name, chunk, summary.channels, base.key)
+            messages += len(chunk.batch)
+            if progress is not None:
+                progress(self._recording_id, place.offset + place.length, reader.size)
+        self._result.messages += messages
+        if messages != sum(summary.counts.values()):
+            self.found(reader.path.name, f"{messages} messages; its statistics say otherwise")
+
+    def rest(self) -> None:
+        """What the database has beyond the segments."""
+        for segment, offset in self.entries:
+            place = f"segment {segment} byte {offset}"
+            self.found(place, "the catalog names a chunk that is not there")
+        for collection in _topic_collections(self._database):
+            have = self._database.count(collection, {"_meta.rec": self._recording_id})
+            want = self._expected.get(collection, 0)
+            if have != want:
+                problem = f"{have} index documents, {want} messages in the segments"
+                self.found(f"collection {collection}", problem)
+
+    def _chunk(
+        self, name: str, chunk: StoredChunk, channels: Mapping[int, Channel], key: int
+    ) -> None:
+        assert self.indexer is not None
+        self._result.chunks += 1
+        where = f"{name} byte {chunk.offset}"
+        documents, entry = self.indexer.documents_of(chunk, channels)
+        for collection, want in _by_collection(documents).items():
+            self._expected[collection] = self._expected.get(collection, 0) + len(want)
+            problem = _compare(self._database, key, chunk, collection, want)
+            if problem:
+                self.found(f"{where}, collection {collection}", problem)
+        if self.entries.pop((chunk.segment, chunk.offset), None) != entry:
+            self.found(where, "its catalog entry is missing or differs")
 
 
 def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:

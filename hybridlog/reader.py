@@ -20,22 +20,22 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import TimeError, TopicError, UsageError
-from hybridlog_storage.index_documents import key_bound
 
 from hybridlog.indexing import STAMP
 from hybridlog.query.plan import Chosen, Clock, Counters, Lane, Piece, Plan, Sweep, Target, Task
 from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Batch
     from numpy.typing import NDArray
 
     from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.messages import Batch
 
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
@@ -80,9 +80,7 @@ class Message:
         self.topic = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
         self.log_time_ns = int(batch.log_time[row])
-        self.publish_time_ns = (
-            int(batch.publish_time[row]) if channel.has_publish_time else None
-        )
+        self.publish_time_ns = int(batch.publish_time[row]) if channel.has_publish_time else None
         self.sequence = int(batch.sequence[row])
         self.seq = int(seq[row])
         self.recording = lane.recording.id
@@ -116,7 +114,7 @@ class Message:
         stamp = header.get("stamp") if isinstance(header, dict) else None
         return stamp if isinstance(stamp, int) else None
 
-    def decode(self) -> Any:  # noqa: ANN401 - its class is made from the definition
+    def decode(self) -> Any:
         """The whole message as an object, its attributes named as its fields.
 
         Raises:
@@ -262,11 +260,11 @@ class Query:
             TopicError: there is no such recording, or it lacks the topic.
         """
         chosen = tuple(r.id for r in self.store.select(names))
-        return self.store.query(self.topics, chosen)._like(self)
+        return self._in(self.topics, chosen)
 
     def only(self, topic: str) -> Query:
         """The same question about one of its topics."""
-        return self.store.query([topic], self.recording_ids)._like(self)
+        return self._in([topic], self.recording_ids)
 
     def just_at(self, moment: TimeLike) -> Query:
         """Only the message that was current at a time: the last one not after it.
@@ -279,8 +277,12 @@ class Query:
             now = parse_time(moment, start=start, end=end)
             if now < start:
                 continue
-            query = replace(self, recording_ids=(recording.id,))._with(
-                _bounds=(start, now + 1), _clock="log", _reverse=True, _limit=1
+            query = self._with(
+                recording_ids=(recording.id,),
+                _bounds=(start, now + 1),
+                _clock="log",
+                _reverse=True,
+                _limit=1,
             )
             if query.first() is not None:
                 return query
@@ -424,14 +426,13 @@ class Query:
 
     # How.
 
-    def _with(self, **changes: Any) -> Query:  # noqa: ANN401
+    def _with(self, **changes: Any) -> Query:
         return replace(self, counters=Counters(), **changes)
 
-    def _like(self, other: Query) -> Query:
-        """The other query's conditions on this one's topics and recordings."""
-        return replace(
-            other, topics=self.topics, recording_ids=self.recording_ids, counters=Counters()
-        )
+    def _in(self, topics: Sequence[str], recordings: Sequence[str]) -> Query:
+        """The same conditions on other topics and recordings."""
+        other = self.store.query(topics, recordings)
+        return self._with(topics=other.topics, recording_ids=other.recording_ids)
 
     def _recordings(self) -> list[RecordingEntry]:
         return [r for r in self.store.recordings() if r.id in self.recording_ids]
@@ -495,9 +496,7 @@ class Query:
             return
         topic = lane.channel.topic
         if self._clock == "header" and not any(p.path == STAMP for p in lane.codec.paths()):
-            raise TopicError(
-                f"{topic} has no {STAMP}: use the log clock, or another topic."
-            )
+            raise TopicError(f"{topic} has no {STAMP}: use the log clock, or another topic.")
         if self._clock == "publish" and not lane.channel.has_publish_time:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."

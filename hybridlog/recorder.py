@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from hybridlog.entries import build_entry, new_key, recording_metadata
+from hybridlog.indexing import ChunkIndexer, IndexWriter
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import (
@@ -28,16 +31,13 @@ from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 
-from hybridlog.entries import build_entry, new_key, recording_metadata
-from hybridlog.indexing import ChunkIndexer, IndexWriter
-
 if TYPE_CHECKING:
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
     from numpy.typing import NDArray
 
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.sources.base import Damage, Source
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
 
 OUR_NAMES = "hybridlog."
 
@@ -90,6 +90,7 @@ def record(
     source: Source,
     directory: StoreDirectory,
     database: Database,
+    *,
     fingerprint: str,
     options: RecordOptions,
     progress: Callable[[int, int], None] | None = None,

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
-
 from hybridlog.entries import build_entry, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer
+from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
 
 if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
@@ -57,7 +56,7 @@ class SegmentCatalog:
         channels: Sequence[int] | None = None,
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
-        longest: int | None = None,  # noqa: ARG002 - all entries are in memory
+        longest: int | None = None,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range.
 

@@ -6,8 +6,10 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
+from hybridlog import maintenance
+from hybridlog.query.topics import resolve
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.directory import StoreDirectory
@@ -20,19 +22,15 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.segment_reader import SegmentReader
 
-from hybridlog import maintenance
-from hybridlog.query.topics import resolve
-
 if TYPE_CHECKING:
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.messages import Channel
-    from hybridlog_storage.mongod import EmbeddedMongod
-
     from hybridlog.query.plan import Lane
     from hybridlog.reader import Query
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.segment_catalog import SegmentCatalog
     from hybridlog.sources.base import Source
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
 _MOST_OPEN_SEGMENTS = 256
@@ -114,7 +112,7 @@ class Store:
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._lock = threading.Lock()
 
-    def __enter__(self) -> Store:
+    def __enter__(self) -> Self:
         """The store itself."""
         return self
 
@@ -229,10 +227,9 @@ class Store:
 
     def lanes(self, recording: RecordingEntry) -> list[Lane]:
         """The channels of a recording, with what reads them."""
-        from hybridlog_storage.messages import Channel
-
         from hybridlog.query.plan import Lane
         from hybridlog.schema.codec import codec_for
+        from hybridlog_storage.messages import Channel
 
         lanes = self._lanes.get(recording.id)
         if lanes is None:
@@ -305,7 +302,9 @@ class Store:
         longest = None
         if recording.status != "open":
             wanted = set(channels)
-            longest = max((c.stats.longest for c in recording.channels if c.id in wanted), default=0)
+            longest = max(
+                (c.stats.longest for c in recording.channels if c.id in wanted), default=0
+            )
         return self.catalog.chunks(recording.id, channels, bounds, clock, longest)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
@@ -351,9 +350,9 @@ class Store:
                 source,
                 self.directory,
                 self.database_for("Recording a log"),
-                fingerprint(source.files),
-                options or RecordOptions(**choices),
-                progress,
+                fingerprint=fingerprint(source.files),
+                options=options or RecordOptions(**choices),
+                progress=progress,
             )
         if report.failure is not None:
             self._catch_up(report)
@@ -389,9 +388,7 @@ class Store:
             if recordings is None
             else [r.id for r in self.select(recordings)]
         )
-        return maintenance.verify(
-            self.directory, self.database_for("verify"), chosen, progress
-        )
+        return maintenance.verify(self.directory, self.database_for("verify"), chosen, progress)
 
     def remove(self, recording: str) -> None:
         """Delete a recording: first from the catalog, then its files."""

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from hybridlog_storage.errors import DefinitionError, UsageError
-from hybridlog_storage.messages import Batch
 
 from hybridlog.frames import TableBuilder
 from hybridlog.indexing import rows_by_channel
 from hybridlog.query.plan import Lane, Piece, Plan, Sweep
 from hybridlog.schema.column import Records, Strings
 from hybridlog.schema.document import take
+from hybridlog_storage.errors import DefinitionError, UsageError
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -147,7 +147,11 @@ def _decoded(
         decoded = lane.codec.columns(batch.buffer, batch.offset, batch.length, fields)
         good = decoded.rows
         yield Block(
-            lane.channel.topic, batch.log_time[good], seq[good], decoded.records, batch.payload_bytes
+            lane.channel.topic,
+            batch.log_time[good],
+            seq[good],
+            decoded.records,
+            batch.payload_bytes,
         )
 
 

@@ -19,9 +19,7 @@ class Seen(NamedTuple):
 def read(path: Path) -> list[Seen]:
     """Every message of a log, in no particular order."""
     if path.is_dir():
-        return [
-            m for p in sorted(path.iterdir()) if p.suffix in {".db3", ".mcap"} for m in read(p)
-        ]
+        return [m for p in sorted(path.iterdir()) if p.suffix in {".db3", ".mcap"} for m in read(p)]
     if path.suffix == ".mcap":
         return read_mcap(path)
     if path.suffix == ".db3":

@@ -19,20 +19,19 @@ from typing import Any
 
 import pymongo
 import pytest
+
+import hybridlog as hl
+from hybridlog import maintenance
+from hybridlog.demo.config import RobotConfig
+from hybridlog.demo.write import write_bag
 from hybridlog_storage.errors import (
     DatabaseError,
-    DiskFullError,
     SegmentError,
     StoreError,
 )
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import SegmentSettings
-
-import hybridlog as hl
-from hybridlog import maintenance
-from hybridlog.demo.config import RobotConfig
-from hybridlog.demo.write import write_bag
 from tests import independent
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
@@ -167,7 +166,10 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
         with hl.open(path, require_database=True) as store:
             if name not in store.directory.recording_ids():
                 assert moment <= 1
-                assert store.tended.recovered.get(name, []) in ([], store.tended.recovered.get(name))
+                assert store.tended.recovered.get(name, []) in (
+                    [],
+                    store.tended.recovered.get(name),
+                )
                 continue
             (entry,) = store.select([name])
             assert entry.status in {"recovered", "complete"}
@@ -464,7 +466,9 @@ def test_a_truncated_segment(store: hl.Store, said: Counter[Message]) -> None:
     }
     with reopened(store) as opened:
         assert any(place.path.name in f.place for f in opened.verify().findings)
-        with pytest.raises(SegmentError, match=rf"{place.path.name} ends at byte {place.offset + 7}"):
+        with pytest.raises(
+            SegmentError, match=rf"{place.path.name} ends at byte {place.offset + 7}"
+        ):
             fetched(opened, "short")
         check_the_rest(opened, said, lost)
     run("verify", store=store.directory.path, code=1)
@@ -531,9 +535,16 @@ def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -
     # All of the head, the last chunk's head and trailer, and the summary; samples elsewhere.
     last = chunks[-1]
     end = data_end(whole)
-    spots = {*range(0, len(whole), 997), *range(end - 120, end), *range(last.offset, last.offset + 60)}
+    spots = {
+        *range(0, len(whole), 997),
+        *range(end - 120, end),
+        *range(last.offset, last.offset + 60),
+    }
     trailer = range(last.offset + last.length, end)
-    spots |= {*rng.sample(trailer, min(150, len(trailer))), *rng.sample(range(end, len(whole)), 200)}
+    spots |= {
+        *rng.sample(trailer, min(150, len(trailer))),
+        *rng.sample(range(end, len(whole)), 200),
+    }
     broken = tmp_path / path.name
     for spot in sorted(spots):
         data = bytearray(whole)
@@ -548,8 +559,6 @@ def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -
 
 
 # An index that is altered behind our back.
-
-
 
 
 @pytest.mark.parametrize(
@@ -569,7 +578,9 @@ def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -
         lambda db: db["hybridlog.chunks"].delete_one({}),
         lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"first": 1}}),
         lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"ch.0.messages": 1}}),
-        lambda db: db["hybridlog.recordings"].update_one({}, {"$inc": {"channels.0.stats.last": 9}}),
+        lambda db: db["hybridlog.recordings"].update_one(
+            {}, {"$inc": {"channels.0.stats.last": 9}}
+        ),
         lambda db: db["hybridlog.recordings"].update_one({}, {"$set": {"name": "another"}}),
         lambda db: db["hybridlog.recordings"].update_one({}, {"$inc": {"channels.0.id": 1}}),
         lambda db: db["hybridlog.recordings"].delete_one({}),

@@ -22,9 +22,6 @@ import numpy as np
 import pymongo
 import pymongo.database
 import pytest
-from hybridlog_storage.errors import TimeError, TopicError
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -44,6 +41,9 @@ import hybridlog as hl
 from hybridlog.query.topics import matcher
 from hybridlog.reader import Query
 from hybridlog.recorder import RecordOptions
+from hybridlog_storage.errors import TimeError, TopicError
+from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.segment_writer import SegmentSettings
 
 BEGIN = 1_700_000_000 * 10**9
 STEP = 40_000_000
@@ -152,7 +152,8 @@ def drafts_of(seed: int, size: int) -> list[Draft]:
                 published=max(time - rng.randint(0, 3), 0),
                 stamp=max(time - rng.randint(0, 6), 0),
                 number=rng.randint(-3, 3),
-                text="".join(rng.choice("ab\u00e9\u4e2d\U0001f916 ") for _ in range(3)) + "x" * long,
+                text="".join(rng.choice("ab\u00e9\u4e2d\U0001f916 ") for _ in range(3))
+                + "x" * long,
                 count=rng.choice([0, 1, 2, ARRAY_LIMIT - 1, ARRAY_LIMIT, ARRAY_LIMIT + 1]),
                 torn=rng.random() < 0.05,
             )
@@ -217,9 +218,7 @@ def _serialized(spec: Spec, number: int, text: str, data: list[float], stamp: in
         name = "x/msg/Stamped"
         time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
         sequence = {"seq": 7} if spec.encoding == "ros1" else {}
-        values["header"] = types.types["std_msgs/msg/Header"](
-            stamp=time, frame_id="f", **sequence
-        )
+        values["header"] = types.types["std_msgs/msg/Header"](stamp=time, frame_id="f", **sequence)
     message = types.types[name](**values)
     write = types.serialize_ros1 if spec.encoding == "ros1" else types.serialize_cdr
     return bytes(write(message, name))
@@ -642,9 +641,7 @@ def check(store: hl.Store, model: dict[str, Recording], asked: Asked) -> None:
         assert got is want
         assert outcome(lambda: query_of(store, asked).count()) is want
         return
-    assert got == [
-        (m.topic, m.recording, m.seq, m.log_time, m.published, m.payload) for m in want
-    ]
+    assert got == [(m.topic, m.recording, m.seq, m.log_time, m.published, m.payload) for m in want]
     assert query_of(store, asked).count() == len(want)
     if len(asked.topics) == 1:
         assert list(map(plain, query_of(store, asked).documents())) == list(map(document, want))
@@ -793,7 +790,7 @@ def test_the_store_is_its_model(machine: type[Machine]) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=int(__import__("os").environ.get("N","15")),
+            max_examples=int(__import__("os").environ.get("N", "15")),
             stateful_step_count=20,
             deadline=None,
             phases=(Phase.generate,),

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hybridlog_storage.errors import AlreadyRecordedError, SourceError
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 import hybridlog as hl
+from hybridlog_storage.errors import AlreadyRecordedError, SourceError
 from tests import independent
 from tests.data import DATA, needs_data
 
@@ -152,9 +152,7 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     assert store.database is not None
     return {
         name: sorted(
-            document
-            for raw in store.database.find_raw(name)
-            for document in split_documents(raw)
+            document for raw in store.database.find_raw(name) for document in split_documents(raw)
         )
         for name in store.database.list_collections()
     }

@@ -17,7 +17,7 @@ from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
     HybridlogError,
-    SourceDamaged,
+    SourceDamagedError,
     SourceError,
     StoreError,
     TimeError,
@@ -103,9 +103,8 @@ def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
             raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
     if choices.mongo is not None:
         # The URI is written down in the store that is made, so it should be right.
-        from hybridlog_storage.database import Database
-
         from hybridlog.maintenance import STORE_MARK
+        from hybridlog_storage.database import Database
 
         with Database.connect(choices.mongo) as database:
             if database.find_one(STORE_MARK) is not None:
@@ -403,5 +402,5 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             f"{path} is damaged: {output.counted(report.entry.messages, 'message')} are stored, "
             f"{output.counted(len(report.damage), 'place')} could not be read."
         )
-        problems.append(SourceDamaged(str(path)))
+        problems.append(SourceDamagedError(str(path)))
     return problems

@@ -16,18 +16,18 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
+
+from hybridlog.indexing import STAMP, header_stamps
 from hybridlog_storage.copying import interleave
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segment_writer import StoredChunk
 
-from hybridlog.indexing import STAMP, header_stamps
-
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
-    from hybridlog_storage.messages import Batch, Channel
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.messages import Batch, Channel
 
 Clock = Literal["log", "publish", "header"]
 _LOOK_AHEAD = 4

@@ -111,15 +111,15 @@ def _open_plain(path: Path) -> Source:
     # Each reader brings libraries of its own; only the one that is needed is loaded.
     found, _ = sniff(path)
     if found is Format.BAG:
-        from hybridlog.sources.rosbag1 import Rosbag1Source  # noqa: PLC0415
+        from hybridlog.sources.rosbag1 import Rosbag1Source
 
         return Rosbag1Source(path)
     if found is Format.SQLITE:
-        from hybridlog.sources.rosbag2_sqlite import SqliteSource  # noqa: PLC0415
+        from hybridlog.sources.rosbag2_sqlite import SqliteSource
 
         return SqliteSource(path)
     if found is Format.MCAP:
-        from hybridlog.sources.mcap import McapSource  # noqa: PLC0415
+        from hybridlog.sources.mcap import McapSource
 
         return McapSource(path)
     raise _unknown(path, is_packed=False)

@@ -45,8 +45,8 @@ def parse_metadata(text: str) -> BagMetadata | None:
         What it says, or None when it is no YAML or not that of a bag.
     """
     # Hostile YAML may nest deeply; the safe loader makes nothing but plain values.
-    from ruamel.yaml import YAML  # noqa: PLC0415
-    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
 
     if len(text) > MAX_BYTES:
         return None

@@ -419,7 +419,7 @@ def _unreadable(path: Path, error: Exception) -> SourceError:
 
 @cache
 def _typestore(name: str) -> Typestore:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores(name))
 
@@ -435,7 +435,7 @@ def known_definition(type_name: str, distro: str = "") -> tuple[str, bytes]:
     Returns:
         Schema encoding and definition, both empty when the type is not known.
     """
-    from rosbags.typesys import Stores, TypesysError  # noqa: PLC0415
+    from rosbags.typesys import Stores, TypesysError
 
     parts = type_name.split("/")
     name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name

@@ -229,8 +229,8 @@ def _decoded(
 
 
 def _decode(document: bytes, position: int) -> dict[str, Any]:
-    import bson  # noqa: PLC0415
-    from bson.codec_options import CodecOptions, DatetimeConversion  # noqa: PLC0415
+    import bson
+    from bson.codec_options import CodecOptions, DatetimeConversion
 
     options: CodecOptions[dict[str, Any]] = CodecOptions(
         datetime_conversion=DatetimeConversion.DATETIME_AUTO

@@ -249,7 +249,9 @@ class Catalog:
         self._db.delete(LOSSES, {"rec": recording})
         for number, loss in enumerate(losses):
             key = {"rec": recording, "n": number}
-            self._db.replace(LOSSES, {"_id": key}, {"_id": key, "rec": recording, **dict(sorted(loss.items()))})
+            self._db.replace(
+                LOSSES, {"_id": key}, {"_id": key, "rec": recording, **dict(sorted(loss.items()))}
+            )
 
 
 def schema_hash(schema: Schema) -> str:

@@ -5,8 +5,6 @@ bytes in both directions, thousands at a time, and never become Python objects.
 pymongo is imported on first use, since it takes longer than most commands.
 """
 
-# ruff: noqa: PLC0415 - see above
-
 from __future__ import annotations
 
 import contextlib

@@ -41,7 +41,7 @@ class SourceError(HybridlogError):
     exit_code = 3
 
 
-class SourceDamaged(HybridlogError):
+class SourceDamagedError(HybridlogError):
     """An input file of which only a part could be read; that part is stored."""
 
     exit_code = 4

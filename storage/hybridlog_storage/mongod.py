@@ -361,7 +361,7 @@ class EmbeddedMongod:
         record = self._read_record()
         if sys.platform.startswith("linux") or record is None:
             return
-        from hybridlog_storage.database import shut_down  # noqa: PLC0415 - pymongo is slow
+        from hybridlog_storage.database import shut_down
 
         shut_down(_uri(record.socket))
 

@@ -193,8 +193,10 @@ def recover_segment(path: Path) -> Recovered:
     try:
         with path.open("rb") as file:
             for offset, item in scan(file, size=size):
-                whole = isinstance(item, ScannedChunk)
-                end = offset + item.length if whole else _record_end(fd, offset)
+                if isinstance(item, ScannedChunk):
+                    end = offset + item.length
+                else:
+                    end = _record_end(fd, offset)
                 rebuilder.take(offset, item, end)
         if not rebuilder.has_recording:
             segment.abandon()

@@ -22,8 +22,8 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
-from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.copying import windows
+from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
@@ -156,9 +156,7 @@ def message_indexes(
     records: dict[int, bytes] = {}
     for start, end in zip(starts, [*starts[1:], len(channels)], strict=True):
         data = entries[start:end].tobytes()
-        head = INDEX_HEAD.pack(
-            Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data)
-        )
+        head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data))
         records[int(channels[start])] = head + data
     return records
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -116,7 +116,7 @@ class SegmentReader:
         if hasattr(self, "_fd"):
             self.close()
 
-    def __enter__(self) -> SegmentReader:
+    def __enter__(self) -> Self:
         """The reader itself."""
         return self
 

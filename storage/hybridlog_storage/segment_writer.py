@@ -378,9 +378,7 @@ class PackedChunk:
     indexes: dict[int, bytes]
 
 
-def pack(
-    compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
-) -> PackedChunk:
+def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int) -> PackedChunk:
     """Compress a chunk and build its message indexes; runs on a worker thread."""
     compression, data = compressor.compress(batch.buffer)
     return PackedChunk(

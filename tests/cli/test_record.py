@@ -55,9 +55,7 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
         *("--between", "+1s", "+2s", "--chunk-size", "16KiB", "--compression", "lz4"),
         store=tmp_path / "s",
     )
-    wanted = [
-        m for m in seen if m.topic == "/imu/data" and 10**9 <= m.log_time - start < 2 * 10**9
-    ]
+    wanted = [m for m in seen if m.topic == "/imu/data" and 10**9 <= m.log_time - start < 2 * 10**9]
     found = run("info", "--json", store=tmp_path / "s").json[0]
     assert found["name"] == "my run/1"
     assert found["recording"] == "my-run-1"
@@ -83,7 +81,9 @@ def test_several_paths(logs: Path, tmp_path: Path) -> None:
     assert "nothing.bag: no such file" in done.err
     assert recordings(tmp_path / "s") == ["odd", "small"]
 
-    again = run("record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8)
+    again = run(
+        "record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8
+    )
     assert [item["exit_code"] for item in again.json if "error" in item] == [8]
     assert again.json[1]["recording"] == "robot"
 
@@ -131,7 +131,11 @@ def test_wrong_options(logs: Path, tmp_path: Path, options: tuple[str, ...], wor
 
 
 def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
-    files = {"empty.bag": b"", "text.mcap": b"hello, this is no log", "magic.bag": b"#ROSBAG V2.0\n"}
+    files = {
+        "empty.bag": b"",
+        "text.mcap": b"hello, this is no log",
+        "magic.bag": b"#ROSBAG V2.0\n",
+    }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
         done = run("record", tmp_path / name, store=tmp_path / "s", code=3)
@@ -162,7 +166,12 @@ def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
 @needs_data
 @pytest.mark.parametrize(
     "name",
-    ["real/compressed_image.bag", "odd/rosbag2/split_mcap", "real/auv_ros2_db3", "odd/protobuf.mcap"],
+    [
+        "real/compressed_image.bag",
+        "odd/rosbag2/split_mcap",
+        "real/auv_ros2_db3",
+        "odd/protobuf.mcap",
+    ],
 )
 def test_real_logs(name: str, tmp_path: Path) -> None:
     done = run("record", DATA / name, "--json", "--store", tmp_path / "s")

@@ -14,7 +14,7 @@ from hybridlog.cli.main import EXIT_CODES
 from .running import COMMAND, environment, run
 
 HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
-COMMANDS = "record ls info schema fetch export reindex verify rm demo".split()
+COMMANDS = ["record", "ls", "info", "schema", "fetch", "export", "reindex", "verify", "rm", "demo"]
 
 
 def imported(*arguments: object) -> set[str]:

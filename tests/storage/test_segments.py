@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings, StoredChunk
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 
 RECORDING = {
     "id": "r",
@@ -73,7 +74,7 @@ def expected(batches: Sequence[Sequence[Row]]) -> list[tuple[str, bytes, int, in
 rows_of = st.lists(
     st.tuples(
         st.integers(0, 2),
-        st.binary(max_size=80) | st.integers(0, 3000).map(lambda n: bytes(n)),
+        st.binary(max_size=80) | st.integers(0, 3000).map(bytes),
         st.integers(0, 2**62),
         st.integers(0, 2**62),
         st.integers(0, 2**32 - 1),
@@ -82,7 +83,9 @@ rows_of = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(batches=st.lists(rows_of, max_size=4), size=st.sampled_from([1024, 4096, 1 << 20]))
 def test_official_readers_see_every_message(
     tmp_path_factory: pytest.TempPathFactory, batches: list[list[Row]], size: int
@@ -208,5 +211,7 @@ def test_a_full_disk_is_said_to_be_full() -> None:
 
 def test_zero_messages_make_a_valid_segment(tmp_path: Path) -> None:
     (path,), _ = write(tmp_path, [])
-    assert list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages()) == []
+    assert (
+        list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages()) == []
+    )
     shutil.rmtree(tmp_path)
