@@ -121,9 +121,8 @@ def _record_one(
     settings: SegmentSettings,
     tags: dict[str, str],
 ) -> RecordReport:
-    from hybridlog.recorder import RecordOptions, record
+    from hybridlog.recorder import RecordOptions
     from hybridlog.sources.detect import open_source
-    from hybridlog.sources.fingerprint import fingerprint
 
     with open_source(path) as source:
         matcher = _matcher(choices)
@@ -136,18 +135,14 @@ def _record_one(
             settings=settings,
         )
         with progress_bar(path.name, source.size_bytes, quiet=choices.quiet) as bar:
-            report = record(
+            report = store.record(
                 source,
-                store.directory,
-                store.database_for("record"),
-                fingerprint(source.files),
                 options,
                 lambda read, messages: bar(read, output.counted(messages, "message")),
             )
         _check_not_empty(report, source, store, options)
     for pattern in matcher.unused() if matcher is not None else ():
         output.note(f"{path}: no topic fits {pattern!r}.")
-    store.refresh()
     return report
 
 
