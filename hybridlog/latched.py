@@ -48,7 +48,9 @@ def in_force(query: Query) -> Iterator[tuple[Batch, Sequence[Lane]]]:
         )
         if not topics:
             continue
-        before = replace(query.store.query(topics, [recording.id]).between(0, begin), _reverse=True)
+        before = replace(
+            query.store.query(topics, [recording.id]).between("0ns", f"{begin}ns"), _reverse=True
+        )
         yield from _last(before, begin)
 
 

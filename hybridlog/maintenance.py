@@ -7,14 +7,15 @@ mends the database, never the other way round.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
-from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry
+from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry, schema_hash
 from hybridlog_storage.collection_names import CATALOG_PREFIX
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.index_documents import key_bound, recording_key
 from hybridlog_storage.recovery import Recovered, recover_segment
 from hybridlog_storage.segment_reader import SegmentReader
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Channel, Schema
     from hybridlog_storage.segment_reader import SegmentSummary
     from hybridlog_storage.segment_writer import StoredChunk
 
@@ -48,12 +49,10 @@ class Tended:
 
 def recover(directory: StoreDirectory, recording_id: str) -> list[Recovered]:
     """Seal what a crash left open in a recording; nothing while somebody writes it."""
-    if not directory.open_segments(recording_id):
-        if not directory.segments(recording_id):
-            with directory.writing(recording_id) as mine:
-                empty = mine and not directory.segments(recording_id)
-                if empty and not directory.open_segments(recording_id):
-                    directory.remove_recording(recording_id)
+    empty = not directory.segments(recording_id) and not directory.open_segments(recording_id)
+    if empty and directory.is_beginning(recording_id):
+        return []
+    if not empty and not directory.open_segments(recording_id):
         return []
     with directory.writing(recording_id) as mine:
         if not mine:
@@ -148,19 +147,33 @@ def _drop_dangling(
 def reindex(
     directory: StoreDirectory, database: Database, progress: Progress | None = None
 ) -> list[RecordingEntry]:
-    """Drop the index and make it again from the segments."""
-    for collection in database.list_collections():
-        if collection != STORE_MARK:
-            database.drop(collection)
-    catalog = Catalog(database)
-    catalog.prepare()
+    """Drop the index and make it again from the segments.
+
+    Raises:
+        StoreError: a recording is being written; nothing is dropped.
+    """
     for recording_id in directory.recording_ids():
         recover(directory, recording_id)
-        if directory.segments(recording_id):
-            with directory.writing(recording_id) as mine:
-                if mine:
-                    catch_up(directory, database, recording_id, progress)
+    with ExitStack() as held:
+        for recording_id in directory.recording_ids():
+            if not held.enter_context(directory.writing(recording_id)):
+                raise being_written(recording_id)
+        for collection in database.list_collections():
+            if collection != STORE_MARK:
+                database.drop(collection)
+        catalog = Catalog(database)
+        catalog.prepare()
+        for recording_id in directory.recording_ids():
+            if directory.segments(recording_id):
+                catch_up(directory, database, recording_id, progress)
     return catalog.recordings()
+
+
+def being_written(recording_id: str) -> StoreError:
+    """The error for a recording that another process holds."""
+    return StoreError(
+        f"Recording {recording_id!r} is being written. Wait until it is done, or stop it."
+    )
 
 
 STORE_MARK = f"{CATALOG_PREFIX}store"
@@ -248,6 +261,7 @@ class _Check:
         self._recording_id = recording_id
         self._result = result
         self._expected: dict[str, int] = {}
+        self._schemas: set[Schema] = set()
 
     def found(self, place: str, problem: str) -> None:
         self.damaged = True
@@ -257,6 +271,7 @@ class _Check:
         """Every chunk of a segment, and the number of its messages."""
         summary = reader.summary()
         base = entry_of(summary.recording)
+        self._schemas.update(c.schema for c in summary.channels.values() if c.schema is not None)
         if self.indexer is None:
             self.indexer = ChunkIndexer(self._recording_id, base.key)
         messages = 0
@@ -276,7 +291,12 @@ class _Check:
             self.found(reader.path.name, f"{messages} messages; its statistics say otherwise")
 
     def rest(self) -> None:
-        """What the database has beyond the segments."""
+        """What the database has beyond the segments, and the schemas."""
+        wanted = {schema_hash(schema): schema for schema in self._schemas}
+        have_schemas = Catalog(self._database).schemas(wanted)
+        for digest, schema in wanted.items():
+            if have_schemas.get(digest) != schema:
+                self.found(f"schema {schema.name}", "it is missing from the catalog or differs")
         for segment, offset in self.entries:
             place = f"segment {segment} byte {offset}"
             self.found(place, "the catalog names a chunk that is not there")

@@ -13,10 +13,12 @@ answer has cost stands in `counters` afterwards.
 from __future__ import annotations
 
 import difflib
+import heapq
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -272,20 +274,31 @@ class Query:
         Raises:
             TopicError: there is none.
         """
-        for recording in reversed(self._recordings()):
+        moments: list[tuple[int, int, RecordingEntry]] = []
+        for recording in self._recordings():
             start, end = _span(recording)
             now = parse_time(moment, start=start, end=end)
-            if now < start:
-                continue
+            if recording.span is not None and now >= start:
+                moments.append((min(now, end - 1), now, recording))
+        best: tuple[tuple[int, int, int], Query] | None = None
+        # The recording that could hold the latest message is asked first: mostly it does.
+        for latest, now, recording in sorted(moments, key=lambda m: m[0], reverse=True):
+            if best is not None and latest < best[0][0]:
+                break
             query = self._with(
                 recording_ids=(recording.id,),
-                _bounds=(start, now + 1),
+                _bounds=("0ns", f"{now + 1}ns"),
                 _clock="log",
                 _reverse=True,
                 _limit=1,
             )
-            if query.first() is not None:
-                return query
+            found = query.first()
+            if found is not None:
+                place = found.log_time_ns, recording.key, found.seq
+                if best is None or place > best[0]:
+                    best = place, query
+        if best is not None:
+            return best[1]
         raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
 
     def at(self, moment: TimeLike) -> Message:
@@ -327,17 +340,28 @@ class Query:
         return self.counters.messages
 
     def documents(self) -> Iterator[dict[str, Any]]:
-        """The index documents, in order of topic, then log time and arrival.
+        """The index documents, in the order of the messages.
 
         Raises:
             DatabaseError: MongoDB is away.
         """
+        if len(self.topics) == 1:
+            yield from self.documents_of(self.topics[0])
+            return
+        whole = self._with(_limit=None, _every=1)
+        parts = [whole.documents_of(topic) for topic in self.topics]
+        # Keys are in the order of log time, recording and arrival, over all topics.
+        merged = heapq.merge(*parts, key=lambda document: document["_id"], reverse=self._reverse)
+        stop = None if self._limit is None else self._limit * self._every
+        yield from islice(merged, 0, stop, self._every)
+
+    def documents_of(self, topic: str) -> Iterator[dict[str, Any]]:
+        """The index documents of one of the topics, in the order of the messages."""
         import bson
 
-        for topic in self.topics:
-            for raw, rows in self.thinned_documents(topic, None):
-                documents = bson.decode_all(raw)
-                yield from (documents[row] for row in rows.tolist())
+        for raw, rows in self.thinned_documents(topic, None):
+            documents = bson.decode_all(raw)
+            yield from (documents[row] for row in rows.tolist())
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
+EMBEDDED = "embedded"  # in place of a URI: the MongoDB that comes with hybridlog
 _MOST_OPEN_SEGMENTS = 256
 
 
@@ -53,8 +54,8 @@ def open_store(
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
-        mongo: URI of the MongoDB that holds the index; without, `HYBRIDLOG_MONGO_URI`,
-            the store's own setting, or the embedded MongoDB.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; without,
+            `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Make the store if there is none.
         require_database: Fail when MongoDB is away, rather than read by time only.
         progress: Called while an index is brought up to date.
@@ -66,13 +67,13 @@ def open_store(
     where = store_path(path)
     wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     if create:
-        directory = StoreDirectory.create(where, mongo=mongo)
+        directory = StoreDirectory.create(where, mongo=None if mongo == EMBEDDED else mongo)
         directory.check_writable()
     else:
         directory = StoreDirectory(where)
     store = Store(directory)
     try:
-        store.connect(wanted or directory.settings.mongo)
+        store.connect(wanted or directory.settings.mongo or EMBEDDED)
         store.tended = maintenance.tend(directory, store.database_for("This"), progress)
     except (DatabaseError, MissingDependencyError) as error:
         if require_database:
@@ -105,7 +106,7 @@ class Store:
         self.without_database: HybridlogError | None = None
         self.tended = maintenance.Tended()
         self._mongod: EmbeddedMongod | None = None
-        self._uri: str | None = None
+        self._uri = EMBEDDED
         self._catalog: Catalog | SegmentCatalog | None = None
         self._recordings: list[RecordingEntry] | None = None
         self._lanes: dict[str, list[Lane]] = {}
@@ -125,8 +126,8 @@ class Store:
 
     # Connection.
 
-    def connect(self, uri: str | None) -> None:
-        """Connect to the MongoDB at a URI, or to the embedded one.
+    def connect(self, uri: str) -> None:
+        """Connect to the MongoDB at a URI, or to the embedded one (`embedded`).
 
         Raises:
             DatabaseError: it does not answer, or holds the index of another store.
@@ -134,7 +135,7 @@ class Store:
         from hybridlog_storage.database import Database
 
         self._uri = uri
-        if uri is None:
+        if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
 
             self._mongod = EmbeddedMongod(self.directory.mongod)
@@ -394,26 +395,41 @@ class Store:
         """Delete a recording: first from the catalog, then its files."""
         entry = self.select([recording])[0]
         database = self.database_for("Removing a recording")
-        Catalog(database).remove_recording(
-            entry.id, {collection_of(c.topic) for c in entry.channels}
-        )
-        with self._lock:
-            for key in [k for k in self._segments if k[0] == entry.id]:
-                self._segments.pop(key).close()
-        self.directory.remove_recording(entry.id)
+        with self.directory.writing(entry.id) as mine:
+            if not mine:
+                raise maintenance.being_written(entry.id)
+            Catalog(database).remove_recording(
+                entry.id, {collection_of(c.topic) for c in entry.channels}
+            )
+            with self._lock:
+                for key in [k for k in self._segments if k[0] == entry.id]:
+                    self._segments.pop(key).close()
+            self.directory.remove_recording(entry.id)
         self.refresh()
 
     def _claim(self, database: Database) -> None:
         """Make sure that the database is this store's, and nobody else's."""
         mine = self.directory.settings.store_id
-        mark = database.find_one(maintenance.STORE_MARK, {"_id": "store"})
-        if mark is None:
-            database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
-        elif mark.get("id") != mine:
-            raise StoreError(
-                f"The database {database.name!r} at {database.address} holds the index of "
-                "another store. Name a database of its own in the URI: mongodb://host/NAME."
-            )
+        check_unclaimed(database, mine)
+        database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
+
+
+def check_unclaimed(database: Database, store_id: str | None = None) -> None:
+    """Check that a database holds no index but that of one store.
+
+    Args:
+        database: Connected.
+        store_id: The store; None for one that is yet to be made.
+
+    Raises:
+        StoreError: it holds the index of another one.
+    """
+    mark = database.find_one(maintenance.STORE_MARK, {"_id": "store"})
+    if mark is not None and mark.get("id") != store_id:
+        raise StoreError(
+            f"The database {database.name!r} at {database.address} holds the index of "
+            "another store. Name a database of its own in the URI: mongodb://host/NAME."
+        )
 
 
 def _listed(names: Sequence[str]) -> str:

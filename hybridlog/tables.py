@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
+_SEQ_BITS = 44
 
 
 class Block(NamedTuple):
@@ -53,7 +55,7 @@ def collect(query: Query) -> TableBuilder:
     types = scalar_types(query)
     if types is not None:
         builder = TableBuilder()
-        for block in _from_index(query, types):
+        for block in chain.from_iterable(_from_index(query, types)):
             builder.append(block.log_time, block.seq, block.records)
         return builder
     plan = query.plan()
@@ -72,32 +74,34 @@ def stream(query: Query) -> Iterator[pa.Table]:
     """The answer in order, in tables of bounded size; at least one, perhaps empty."""
     several = len(query.topics) > 1
     types = scalar_types(query)
+    groups: Iterator[Iterable[Block]]
     if types is not None:
-        blocks = _from_index(query, types)
+        groups = _from_index(query, types)
     else:
         plan = query.plan()
         _check(plan.lanes)
-        blocks = (
-            block
-            for piece in query.pieces(plan)
-            for block in _decoded(plan.lanes, piece, query.selected_fields)
+        groups = (
+            _decoded(plan.lanes, piece, query.selected_fields) for piece in query.pieces(plan)
         )
-    yield from _tables(query, blocks, several=several)
+    yield from _tables(query, groups, several=several)
 
 
-def _tables(query: Query, blocks: Iterator[Block], *, several: bool) -> Iterator[pa.Table]:
+def _tables(
+    query: Query, groups: Iterator[Iterable[Block]], *, several: bool
+) -> Iterator[pa.Table]:
     builder, size = TableBuilder(), 0
     for block in _empty(query.empty_plan(), query):
         _append(builder, block, several=several)
     given = False
-    for block in blocks:
-        # A full builder is handed over before, not after: blocks of one piece stay together.
+    for group in groups:
+        # Blocks of one group overlap in time, so no table ends between them.
         if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
             yield _finished(builder, query)
             given = True
             builder, size = TableBuilder(), 0
-        _append(builder, block, several=several)
-        size += block.size
+        for block in group:
+            _append(builder, block, several=several)
+            size += block.size
     if len(builder) or not given:
         yield _finished(builder, query)
 
@@ -141,6 +145,7 @@ def with_topic(records: Records, topic: str) -> Records:
 def _decoded(
     lanes: Sequence[Lane], piece: Piece, fields: tuple[str, ...] | None
 ) -> Iterator[Block]:
+    ranks = _ranks(lanes)
     for number, rows in rows_by_channel(piece.batch.channel):
         lane = lanes[number]
         batch, seq = piece.batch.take(rows), piece.seq[rows]
@@ -149,10 +154,16 @@ def _decoded(
         yield Block(
             lane.channel.topic,
             batch.log_time[good],
-            seq[good],
+            seq[good] + ranks[number],
             decoded.records,
             batch.payload_bytes,
         )
+
+
+def _ranks(lanes: Sequence[Lane]) -> list[int]:
+    """What makes arrival numbers of each lane's recording follow those of the one before."""
+    order = {key: rank for rank, key in enumerate(sorted({lane.recording.key for lane in lanes}))}
+    return [order[lane.recording.key] << _SEQ_BITS for lane in lanes]
 
 
 def _empty(plan: Plan, query: Query) -> Iterator[Block]:
@@ -218,13 +229,16 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
     return types if indexed else None
 
 
-def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[Block]:
-    """Blocks of the fields asked for, in the order of the index."""
+def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:
+    """Blocks of the fields asked for, in groups that are in the order of the index."""
     from hybridlog.frames.bson import records_from_bson
+    from hybridlog_storage.bson_columns import split
 
     topic = query.topics[0]
     projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
+    before = 0
     for raw, rows in query.thinned_documents(topic, projection):
+        group = []
         # Documents that lack a field (an array too short for a summary) form parts.
         for part in records_from_bson(raw, types):
             chosen = np.flatnonzero(np.isin(part.rows, rows, assume_unique=True))
@@ -232,4 +246,9 @@ def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[Block]:
             reference, records = part.reference, part.records
             if len(chosen) < len(reference):
                 reference, records = reference.take(chosen), take(records, chosen)
-            yield Block(topic, reference.t, reference.seq, records, 0)
+            # Their places keep rows of one log time in the order of the index.
+            places = before + part.rows[chosen]
+            place = -places if query.is_reversed else places
+            group.append(Block(topic, reference.t, place, records, 0))
+        yield group
+        before += len(split(raw))

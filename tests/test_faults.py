@@ -36,8 +36,7 @@ from tests import independent
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
 LIMIT_S = 120
-Message = tuple[str, int, bytes]
-"""Topic, log time, payload."""
+Message = independent.Seen
 
 
 # Logs and stores.
@@ -55,7 +54,7 @@ def spoken(robot: Path) -> dict[str, list[Message]]:
     """What the robot said, by topic, as `rosbags` reads it."""
     found: dict[str, list[Message]] = defaultdict(list)
     for message in independent.read_bag(robot):
-        found[message.topic].append(tuple(message))
+        found[message.topic].append(message)
     return dict(found)
 
 
@@ -69,7 +68,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def said(short: Path) -> Counter[Message]:
-    return Counter(tuple(m) for m in independent.read_bag(short))
+    return Counter(independent.read_bag(short))
 
 
 @pytest.fixture
@@ -98,7 +97,7 @@ def fetched(store: hl.Store, recording: str) -> list[hl.Message]:
 
 
 def content(messages: list[hl.Message]) -> Counter[Message]:
-    return Counter((m.topic, m.log_time_ns, m.raw) for m in messages)
+    return Counter(Message(m.topic, m.log_time_ns, m.raw) for m in messages)
 
 
 def run(
@@ -166,10 +165,6 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
         with hl.open(path, require_database=True) as store:
             if name not in store.directory.recording_ids():
                 assert moment <= 1
-                assert store.tended.recovered.get(name, []) in (
-                    [],
-                    store.tended.recovered.get(name),
-                )
                 continue
             (entry,) = store.select([name])
             assert entry.status in {"recovered", "complete"}
@@ -181,7 +176,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
                 by_topic[message.topic].append(message)
             for topic, kept in by_topic.items():
                 # A topic's messages lie in one run of chunks: what is kept is a beginning.
-                have = [(m.topic, m.log_time_ns, m.raw) for m in kept]
+                have = [Message(m.topic, m.log_time_ns, m.raw) for m in kept]
                 assert have == spoken[topic][: len(have)], (name, topic)
             assert store.verify([name]).findings == []
             store.remove(name)
@@ -686,9 +681,7 @@ def test_two_recorders_at_once_make_one_store(tmp_path: Path, short: Path, robot
         assert len({r.key for r in store.recordings()}) == 3
         for recording in store.recordings():
             log = short if recording.name == "short" else robot
-            assert content(fetched(store, recording.id)) == Counter(
-                tuple(m) for m in independent.read_bag(log)
-            )
+            assert content(fetched(store, recording.id)) == Counter(independent.read_bag(log))
         assert store.verify().findings == []
 
 

@@ -93,7 +93,8 @@ MongoOption = Annotated[
     typer.Option(
         "--mongo",
         envvar="HYBRIDLOG_MONGO_URI",
-        help="URI of the MongoDB that holds the index; without, the embedded one.",
+        help="URI of the MongoDB that holds the index, or 'embedded' for our own; "
+        "without, the one that the store was made with.",
         metavar="URI",
     ),
 ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
+from hybridlog.cli.asking import question
 from hybridlog.cli.coverage import gaps
 from hybridlog.cli.fetch import form_of, write
 from hybridlog.cli.opening import opened
@@ -42,11 +43,9 @@ def run(target: Path, form: str | None, choices: Choices) -> None:
     if form in _WHOLE:
         check_room(target, form=form, force=force)
     with opened(choices.store, choices.mongo, quiet=quiet) as view:
-        query = view.topic(*choices.topics) if choices.topics else view.all_topics()
+        query = question(view, choices.topics, choices.recordings)
         if not query.topics:
-            raise UsageError("The store is empty, there is nothing to export.")
-        if choices.recordings:
-            query = query.in_recording(*choices.recordings)
+            raise UsageError("Nothing was recorded, so there is nothing to export.")
         if choices.between is not None:
             query = query.between(*choices.between)
         if form in _WHOLE:

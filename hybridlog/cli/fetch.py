@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
+from hybridlog.cli.asking import question
 from hybridlog.cli.coverage import gaps, tell_unreadable
 from hybridlog.cli.opening import opened
 from hybridlog.cli.placing import check_room, replacing
@@ -159,9 +160,7 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
 
 
 def _query(store: Store, choices: Choices) -> Query:
-    query = store.topic(*choices.topic)
-    if choices.recording:
-        query = query.in_recording(*choices.recording)
+    query = question(store, choices.topic, choices.recording)
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)

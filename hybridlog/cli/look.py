@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import coverage, output
+from hybridlog.cli.asking import question
 from hybridlog.cli.opening import opened
 from hybridlog.cli.segment import show_segment
 from hybridlog_storage.errors import TopicError
@@ -102,10 +103,7 @@ def show_schema(
 ) -> None:
     """Print a topic's definition and the paths that can be asked about."""
     with opened(store, mongo, quiet=as_json) as view:
-        query = view.topic(topic)
-        if recordings:
-            query = query.in_recording(*recordings)
-        lanes = query.lanes()
+        lanes = question(view, [topic], recordings).lanes()
     if not lanes:
         raise TopicError(f"No recording chosen has {topic}.")
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
@@ -26,14 +27,14 @@ def main() -> NoReturn:
     except stopping.Stopped as stopped:
         _complain(f"interrupted. {stopped.consequence}".rstrip())
         code = stopped.exit_code
-    sys.exit(_flushed(code))
+    _leave(_flushed(code))
 
 
 def _run() -> int:
     from hybridlog.cli.app import app
 
     try:
-        app()
+        app(prog_name="hybridlog")
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
     except HybridlogError as error:
@@ -75,6 +76,17 @@ def _flushed(code: int) -> int:
         _complain(f"standard output cannot be written: {error.strerror}")
         return code or _code_of(error)
     return code
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process at once, when everything is closed and flushed.
+
+    At an ordinary end, the connections' background threads are waited for: half a second
+    of sleep for each command that has used MongoDB.
+    """
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    os._exit(code)
 
 
 def _code_of(error: OSError) -> int:

@@ -19,7 +19,6 @@ from hybridlog_storage.errors import (
     HybridlogError,
     SourceDamagedError,
     SourceError,
-    StoreError,
     TimeError,
     UsageError,
 )
@@ -82,7 +81,7 @@ def run(paths: list[Path], choices: Choices) -> None:
 
 def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
     """Before a store is made: what cannot succeed should leave nothing behind."""
-    from hybridlog.store import store_path
+    from hybridlog.store import EMBEDDED, check_unclaimed, store_path
 
     if (store_path(choices.store) / "hybridlog.toml").exists():
         return
@@ -101,17 +100,12 @@ def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
             raise first
         if first is not None:
             raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
-    if choices.mongo is not None:
+    if choices.mongo not in {None, EMBEDDED}:
         # The URI is written down in the store that is made, so it should be right.
-        from hybridlog.maintenance import STORE_MARK
         from hybridlog_storage.database import Database
 
         with Database.connect(choices.mongo) as database:
-            if database.find_one(STORE_MARK) is not None:
-                raise StoreError(
-                    f"The database {database.name!r} at {database.address} holds the index of "
-                    "another store. Name a database of its own in the URI: mongodb://host/NAME."
-                )
+            check_unclaimed(database)
 
 
 def _record_one(

@@ -16,6 +16,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ FORMAT: Final = 1
 _SETTINGS: Final = "hybridlog.toml"
 _LOCK: Final = "writer.lock"
 _MAX_SETTINGS: Final = 1 << 20
+_FRESH_S: Final = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,26 +66,35 @@ class StoreDirectory:
         Raises:
             StoreError: the directory holds something else, or cannot be written.
         """
-        if (path / _SETTINGS).exists():
+        if path.exists() and not path.is_dir():
+            raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
+        try:
+            if not (path / _SETTINGS).exists():
+                path.mkdir(parents=True, exist_ok=True)
+                # Of several processes one makes the store, and the others open it.
+                with _alone(path):
+                    cls._make(path, mongo)
             store = cls(path)
             (path / "recordings").mkdir(exist_ok=True)
-            return store
-        try:
-            if path.exists() and not path.is_dir():
-                raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
-            if path.is_dir() and any(path.iterdir()):
-                raise StoreError(
-                    f"{path} holds files and is no hybridlog store. "
-                    "Choose an empty or a new directory with --store."
-                )
-            (path / "recordings").mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise durability.explain(error, path, "making the store") from error
+        return store
+
+    @staticmethod
+    def _make(path: Path, mongo: str | None) -> None:
+        names = {entry.name for entry in path.iterdir()}
+        if _SETTINGS in names:
+            return
+        # What a crash in here has left of the settings is no file of anybody's.
+        if any(not name.startswith(f".{_SETTINGS}.") for name in names):
+            raise StoreError(
+                f"{path} holds files and is no hybridlog store. "
+                "Choose an empty or a new directory with --store."
+            )
         lines = [f"format = {FORMAT}", f'store_id = "{secrets.token_hex(8)}"']
         if mongo is not None:
             lines.append(f"mongo = {json.dumps(mongo)}")
         durability.write_new(path / _SETTINGS, ("\n".join(lines) + "\n").encode())
-        return cls(path)
 
     def check_writable(self) -> None:
         """Refuse a store that cannot be written, before anything is tried.
@@ -134,6 +145,14 @@ class StoreDirectory:
                 durability.sync_directory(self.path / "recordings")
                 return recording_id
 
+    def is_beginning(self, recording_id: str) -> bool:
+        """Whether an empty recording may be one that somebody is just about to lock."""
+        path = self.recording(recording_id)
+        try:
+            return not (path / _LOCK).exists() and time.time() - path.stat().st_mtime < _FRESH_S
+        except FileNotFoundError:
+            return True
+
     def remove_recording(self, recording_id: str) -> None:
         """Delete a recording's files: first out of sight, then from the disk."""
         source = self.recording(recording_id)
@@ -171,6 +190,17 @@ class StoreDirectory:
             os.close(fd)
 
 
+@contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Keep other processes that do the same out of a directory."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
 def check_recording_id(recording_id: str) -> str:
     """Refuse an id that is no plain directory name."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", recording_id):
@@ -203,7 +233,7 @@ def _read_settings(path: Path) -> StoreSettings:
         raise StoreError(f"{path} is a file; a store is a directory.") from None
     except OSError as error:
         raise StoreError(f"{file} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
     version = values.get("format")
     if not isinstance(version, int) or version < 1:

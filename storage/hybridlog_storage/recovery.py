@@ -38,6 +38,7 @@ from hybridlog_storage.segment_format import (
     json_metadata,
     json_of,
     message_indexes,
+    pack_arrivals,
 )
 from hybridlog_storage.segment_reader import check_format
 from hybridlog_storage.segment_writer import OPEN_SUFFIX, SegmentFile
@@ -106,7 +107,10 @@ class _Rebuilder:
             self.segment.define(item.id, item.schema_id, channel, write=False)
         elif isinstance(item, Metadata):
             if item.name == RECORDING_METADATA:
-                check_format(json_of(item), self.segment.path)
+                recording = json_of(item)
+                check_format(recording, self.segment.path)
+                started = recording.get("next_seq")
+                self.next_seq = started if isinstance(started, int) else 0
                 self.has_recording = True
             self.segment.note_metadata(item.name, offset, end - offset)
         elif isinstance(item, Attachment):
@@ -153,7 +157,7 @@ class _Rebuilder:
             batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize
         )
         self.segment.cut(chunk.offset + chunk.length)
-        self.segment.append_trailer(indexes, arrival_record(chunk.offset, seq))
+        self.segment.append_trailer(indexes, arrival_record(chunk.offset, pack_arrivals(seq)))
         pending.indexes = {channel: len(data) for channel, data in indexes.items()}
         self._note(pending)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import struct
+import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
@@ -48,6 +49,7 @@ ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
 
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _MAX_ARRIVALS = 1 << 27
+_per_thread = threading.local()
 
 
 def record_bytes(record: McapRecord) -> bytes:
@@ -161,10 +163,18 @@ def message_indexes(
     return records
 
 
-def arrival_record(chunk_offset: int, seq: NDArray[np.int64]) -> bytes:
-    """The record that keeps the arrival numbers of a chunk's messages, in chunk order."""
-    deltas = np.diff(seq, prepend=0).astype("<i8")
-    packed = zstandard.ZstdCompressor(level=1).compress(deltas.tobytes())
+def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
+    """Arrival numbers of a chunk's messages, in chunk order, with a checksum."""
+    compressor = getattr(_per_thread, "compressor", None)
+    if compressor is None:
+        compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)
+        _per_thread.compressor = compressor
+    packed: bytes = compressor.compress(np.diff(seq, prepend=0).astype("<i8").tobytes())
+    return packed
+
+
+def arrival_record(chunk_offset: int, packed: bytes) -> bytes:
+    """The record that keeps packed arrival numbers of the chunk at an offset."""
     return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, 8 + len(packed), chunk_offset) + packed
 
 

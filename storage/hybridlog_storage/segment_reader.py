@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
@@ -212,7 +213,7 @@ class SegmentReader:
         try:
             body = ReadDataStream(BytesIO(self._read(offset, length)[9:]))
             record: Metadata = Metadata.read(body)
-        except (ValueError, struct.error, EOFError) as error:
+        except (McapError, ValueError, struct.error, EOFError) as error:
             raise SegmentError(f"Metadata at byte {offset} of {self.path} is damaged.") from error
         return record
 

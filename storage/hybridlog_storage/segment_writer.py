@@ -53,6 +53,7 @@ from hybridlog_storage.segment_format import (
     chunk_head,
     json_metadata,
     message_indexes,
+    pack_arrivals,
     record_bytes,
     schema_record,
 )
@@ -137,13 +138,16 @@ class SegmentFile:
         self._last = 0
 
     @classmethod
-    def create(cls, directory: Path, number: int, recording: Mapping[str, object]) -> SegmentFile:
+    def create(
+        cls, directory: Path, number: int, recording: Mapping[str, object], next_seq: int = 0
+    ) -> SegmentFile:
         """Start a new segment file.
 
         Args:
             directory: The recording's directory.
             number: Segment number, also the file's name.
             recording: Catalog entry of the recording, kept in the file for `reindex`.
+            next_seq: No message of the segments before has this arrival number or a later one.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
         try:
@@ -154,7 +158,13 @@ class SegmentFile:
         segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
         segment.add_metadata(
             json_metadata(
-                RECORDING_METADATA, {**recording, "segment": number, "format": FORMAT_VERSION}
+                RECORDING_METADATA,
+                {
+                    **recording,
+                    "segment": number,
+                    "format": FORMAT_VERSION,
+                    "next_seq": next_seq,
+                },
             )
         )
         return segment
@@ -214,7 +224,7 @@ class SegmentFile:
             compressed_size=len(chunk.data),
         )
         length = len(head) + len(chunk.data)
-        arrivals = arrival_record(offset, chunk.seq)
+        arrivals = arrival_record(offset, chunk.arrivals)
         trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
         self._write([head, chunk.data, *chunk.indexes.values(), arrivals])
         self.note_chunk(
@@ -376,6 +386,7 @@ class PackedChunk:
     compression: str
     data: Buffer
     indexes: dict[int, bytes]
+    arrivals: bytes
 
 
 def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int) -> PackedChunk:
@@ -391,6 +402,7 @@ def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
         compression,
         data,
         message_indexes(batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize),
+        pack_arrivals(seq),
     )
 
 
@@ -443,6 +455,7 @@ class RecordingWriter:
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
         self._packing: deque[Future[PackedChunk]] = deque()
         self._next_seq = 0
+        self._stored_seq = 0
         self._segment: SegmentFile | None = None
         self._number = 0
         self._closed: list[Path] = []
@@ -584,13 +597,16 @@ class RecordingWriter:
         if self.settings.sync == "chunk":
             segment.sync()
         self.totals.chunks += 1
+        self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         if segment.position >= self.settings.segment_size:
             self._seal()
 
     def _open_segment(self) -> SegmentFile:
         if self._segment is None:
-            self._segment = SegmentFile.create(self._directory, self._number, self._recording)
+            self._segment = SegmentFile.create(
+                self._directory, self._number, self._recording, self._stored_seq
+            )
             self._number += 1
         return self._segment
 

@@ -100,11 +100,14 @@ def test_schema_of_a_hostile_definition(store: Path) -> None:
 
 
 def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
-    for command in (("info", "odd"), ("schema", "/*red*/x"), ("fetch", "-t", "*x", "-F", "table")):
+    shown = ""
+    for command in (("info", "odd"), ("fetch", "-t", "*x", "-F", "table"), ("fetch", "-t", "r/x")):
         done = run(*command, store=store, code=None)
         assert "\x1b" not in done.out + done.err
         assert "\x07" not in done.out + done.err
-    assert "/\\x1b[31mred\\x07\\x0a/x" in run("info", "odd", store=store).out
+        shown += done.out
+    assert "/\\x1b[31mred\\x07\\x0a/x" in shown
+    assert "\\x1b[2Jboo" in shown
     found = run("info", "odd", "--json", store=store)
     assert HOSTILE_NAME in {c["topic"] for c in found.json["channels"]}
     assert "\x1b" not in found.out

@@ -59,16 +59,6 @@ def test_help_names_commands_and_exit_codes() -> None:
     assert "..." not in out.split("Commands:")[1].split("The store is")[0]
 
 
-def test_every_option_has_help() -> None:
-    for command in COMMANDS:
-        options = run(command, "--help").out.split("Options:")[1]
-        for line in options.splitlines():
-            if line.startswith("  -") and len(line.rstrip()) < 36:
-                # The text of a long option stands in the next line.
-                following = options.splitlines()[options.splitlines().index(line) + 1]
-                assert following.startswith("   "), (command, line)
-
-
 def test_version() -> None:
     from hybridlog import __version__
 

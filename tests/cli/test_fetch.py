@@ -1,0 +1,367 @@
+"""`hybridlog fetch`."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import pyarrow.parquet
+import pytest
+
+from tests.independent import Seen, read_bag, read_mcap
+
+from . import odd_log
+from .running import COMMAND, environment, run
+
+SCAN = ("fetch", "-t", "/base/scan", "-r", "robot")
+SECOND = 10**9
+
+
+@pytest.fixture(scope="module")
+def seen(logs: Path) -> list[Seen]:
+    """What the robot said, by log time."""
+    return sorted(read_bag(logs / "robot.bag"), key=lambda m: m.log_time)
+
+
+@pytest.fixture(scope="module")
+def start(seen: list[Seen]) -> int:
+    return seen[0].log_time
+
+
+@pytest.fixture(scope="module")
+def scans(seen: list[Seen]) -> list[Seen]:
+    return [m for m in seen if m.topic == "/base/scan"]
+
+
+@pytest.fixture(scope="module")
+def decoded(scans: list[Seen]) -> list[Any]:
+    """The scans as rosbags decodes them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC)
+    return [types.deserialize_ros1(m.payload, "sensor_msgs/msg/LaserScan") for m in scans]
+
+
+def slice_of(scans: list[Seen], start: int) -> list[Seen]:
+    return [m for m in scans if start + SECOND <= m.log_time < start + 2 * SECOND]
+
+
+def test_json_lines(store: Path, scans: list[Seen], decoded: list[Any]) -> None:
+    done = run(*SCAN, store=store)
+    rows = [json.loads(line) for line in done.lines]
+    assert [r["log_time_ns"] for r in rows] == [m.log_time for m in scans]
+    assert {r["topic"] for r in rows} == {"/base/scan"}
+    for row, message in zip(rows, decoded, strict=True):
+        assert row["header.frame_id"] == message.header.frame_id
+        # JSON has no infinities.
+        want = [float(v) if np.isfinite(v) else None for v in message.ranges]
+        got = [None if v is None else float(np.float32(v)) for v in row["ranges"]]
+        assert got == want
+
+
+def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
+    wanted = slice_of(scans, start)
+    done = run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store)
+    assert done.raw == b"".join(m.payload for m in wanted)
+    (line,) = done.err.splitlines()
+    size = sum(len(m.payload) for m in wanted) / 1000
+    assert line.startswith(f"{len(wanted)} messages, {size:.1f} kB of payload, ")
+    assert " read from disk in " in line
+    assert line.endswith(" s")
+    assert run(*SCAN, "--between", "+1s", "+2s", "-q", "-F", "raw", store=store).err == ""
+
+
+def test_times(store: Path, seen: list[Seen], scans: list[Seen], start: int) -> None:
+    wanted = [m.log_time for m in slice_of(scans, start)]
+    low, high = start + SECOND, start + 2 * SECOND
+    iso = str(np.datetime64(low, "ns")), f"{np.datetime64(high + 7200 * SECOND, 'ns')}+02:00"
+    ranges = [
+        (str(low), str(high)),
+        (f"{low // SECOND}.{low % SECOND:09}", f"{high // SECOND}.{high % SECOND:09}"),
+        iso,
+    ]
+    for between in ranges:
+        done = run(*SCAN, "--between", *between, "--fields", "scan_time", store=store)
+        assert [json.loads(line)["log_time_ns"] for line in done.lines] == wanted, between
+    last = run(*SCAN, "--between", "-1s", "end", "--count", store=store)
+    end = max(
+        r["last_ns"] for r in run("ls", "--json", store=store).json if r["recording"] == "robot"
+    )
+    assert int(last.out) == sum(m.log_time >= end + 1 - SECOND for m in scans)
+
+
+def test_clocks(store: Path, scans: list[Seen], decoded: list[Any], start: int) -> None:
+    stamps = [m.header.stamp.sec * SECOND + m.header.stamp.nanosec for m in decoded]
+    done = run(*SCAN, "--between", "+1s", "+2s", "--clock", "header", "--count", store=store)
+    assert int(done.out) == sum(start + SECOND <= s < start + 2 * SECOND for s in stamps)
+    refused = run(*SCAN, "--between", "+1s", "+2s", "--clock", "publish", store=store, code=2)
+    assert "--clock log" in refused.err
+
+
+def test_where(store: Path, decoded: list[Any]) -> None:
+    nearest = [float(m.ranges[np.isfinite(m.ranges)].min()) for m in decoded]
+    limit = sorted(nearest)[len(nearest) // 3]
+    where = ("--where", f"ranges.min < {limit} and (angle_min < 0 or scan_time > 1000)")
+    done = run(*SCAN, *where, "--count", store=store)
+    assert int(done.out) == sum(n < limit for n in nearest) > 0
+    rows = run(*SCAN, *where, store=store)
+    assert len(rows.lines) == int(done.out)
+    both = run(*SCAN, *where, "--where", "angle_min > 0", store=store)
+    assert both.out == ""
+
+
+def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
+    done = run(*SCAN, "--where", "ranges.min << 0.5", store=store, code=2)
+    message, text, caret = done.err.splitlines()
+    assert message.startswith("hybridlog: ")
+    assert text.strip() == "ranges.min << 0.5"
+    assert text[caret.index("^")] == "<"
+    for predicate in ("nothing < 1", "__import__('os') == 1", "ranges.min <", "$where == 1"):
+        refused = run(*SCAN, "--where", predicate, store=store, code=2)
+        assert "^" in refused.err or "angle" in refused.err or "field" in refused.err
+
+
+def test_thinning(store: Path, scans: list[Seen]) -> None:
+    times = [m.log_time for m in scans]
+
+    def fetched(*options: str) -> list[int]:
+        done = run(*SCAN, "--fields", "scan_time", *options, store=store)
+        assert done.err.startswith(f"{len(done.lines)} message")
+        return [json.loads(line)["log_time_ns"] for line in done.lines]
+
+    assert fetched("--limit", "5") == times[:5]
+    assert fetched("-n", "0") == []
+    assert fetched("--every", "7") == times[::7]
+    assert fetched("--reverse", "--every", "3", "--limit", "4") == times[::-1][::3][:4]
+    limited = run(*SCAN, "--limit", "2", "-F", "raw", store=store)
+    assert limited.raw == scans[0].payload + scans[1].payload
+    assert f"2 messages, {len(limited.raw) / 1000:.1f} kB of payload" in limited.err
+
+
+def test_fields(store: Path) -> None:
+    done = run(*SCAN, "--fields", "angle_max, header.stamp", "-n", "1", store=store)
+    assert list(json.loads(done.out)) == ["log_time_ns", "topic", "angle_max", "header.stamp"]
+    refused = run(*SCAN, "--fields", "angle_mox", store=store, code=2)
+    assert "angle_max" in refused.err
+    run(*SCAN, "--fields", "a,,b", store=store, code=2)
+
+
+def test_at(store: Path, scans: list[Seen]) -> None:
+    for option, want in (
+        (str(scans[9].log_time), scans[9]),
+        (str(scans[9].log_time - 1), scans[8]),
+    ):
+        done = run(*SCAN, "--at", option, "-F", "raw", store=store)
+        assert done.raw == want.payload
+    run(*SCAN, "--at", "2000-01-01", store=store, code=2)
+    run(*SCAN, "--at", "+1s", "--between", "+1s", "+2s", store=store, code=2)
+
+
+def test_topics(store: Path) -> None:
+    assert "/base/scan" in run("fetch", "-t", "base", store=store, code=2).err
+    ambiguous = run("fetch", "-t", "image_raw", store=store, code=2)
+    assert "/camera/front/image_raw" in ambiguous.err
+    assert "/camera/rear/image_raw" in ambiguous.err
+    unknown = run("fetch", "-t", "imu/dato", store=store, code=2)
+    assert "/imu/data" in unknown.err
+    several = run(
+        "fetch",
+        "-t",
+        "scan",
+        "-t",
+        "imu/*",
+        "-r",
+        "robot",
+        "--between",
+        "+1s",
+        "+1.2s",
+        store=store,
+    )
+    rows = [json.loads(line) for line in several.lines]
+    assert {r["topic"] for r in rows} == {"/base/scan", "/imu/data"}
+    assert [r["log_time_ns"] for r in rows] == sorted(r["log_time_ns"] for r in rows)
+    run("fetch", "-t", "scan", "-r", "odd", store=store, code=2)
+
+
+def test_times_that_cannot_be(store: Path) -> None:
+    for between, words in (
+        (("+5s", "+1s"), "the range is empty"),
+        (("2000-01-01", "2000-01-02"), "spans"),
+        (("yesterday", "+1s"), "is not a time"),
+        (("1e400", "+1s"), "is not a time"),
+    ):
+        assert words in run(*SCAN, "--between", *between, store=store, code=2).err
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "arrow", "npz", "mcap", "bag", "jsonl"])
+def test_formats(
+    form: str, store: Path, scans: list[Seen], decoded: list[Any], start: int, tmp_path: Path
+) -> None:
+    wanted = slice_of(scans, start)
+    path = tmp_path / f"out.{form}"
+    run(*SCAN, "--between", "+1s", "+2s", "-o", path, store=store)
+    piped = run(*SCAN, "--between", "+1s", "+2s", "-F", form, "-o", "-", store=store)
+    content = path.read_bytes()
+    if form != "bag":  # whose index is written into its head at the end
+        assert piped.raw == content
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    first = scans.index(wanted[0])
+    ranges = [m.ranges for m in decoded[first : first + len(wanted)]]
+    times = [m.log_time for m in wanted]
+    if form in {"mcap", "bag"}:
+        found = (read_mcap if form == "mcap" else read_bag)(path)
+        assert [m for m in found if m.topic == "/base/scan"] == wanted
+        if form == "bag":
+            (tmp_path / "piped.bag").write_bytes(piped.raw)
+            assert read_bag(tmp_path / "piped.bag") == found
+    elif form == "csv":
+        rows = list(csv.DictReader(io.StringIO(content.decode())))
+        assert [np.datetime64(r["log_time"].rstrip("Z"), "ns").astype(int) for r in rows] == times
+    elif form == "npz":
+        with np.load(path) as arrays:
+            assert arrays["log_time"].astype(np.int64).tolist() == times
+            np.testing.assert_array_equal(arrays["ranges.values"], np.concatenate(ranges))
+    elif form in {"parquet", "arrow"}:
+        table = pa.parquet.read_table(path) if form == "parquet" else pa.feather.read_table(path)
+        assert table["log_time"].cast(pa.int64()).to_pylist() == times
+        for got, want in zip(table["ranges"], ranges, strict=True):
+            np.testing.assert_array_equal(got.values.to_numpy(), want)
+
+
+def test_raw_directory(store: Path, scans: list[Seen], tmp_path: Path) -> None:
+    path = tmp_path / "raw"
+    run(*SCAN, "-n", "3", "-F", "raw", "-o", path, store=store)
+    index = [json.loads(line) for line in (path / "index.jsonl").read_text().splitlines()]
+    assert [(path / i["file"]).read_bytes() for i in index] == [m.payload for m in scans[:3]]
+
+
+def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
+    run(
+        *("fetch", "-t", "scan", "-t", "tf_static", "-r", "robot", "--between", "+2s", "+3s"),
+        *("-o", tmp_path / "x.mcap"),
+        store=store,
+    )
+    static = next(m for m in seen if m.topic == "/tf_static")
+    assert read_mcap(tmp_path / "x.mcap")[0].payload == static.payload
+
+
+def test_nothing_is_overwritten_without_force(store: Path, tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("mine")
+    refused = run(*SCAN, "-o", path, store=store, code=2)
+    assert "--force" in refused.err
+    assert path.read_text() == "mine"
+    # A failure leaves what was there, and nothing else.
+    run(*SCAN, "--between", "2000-01-01", "2001-01-01", "-o", path, "--force", store=store, code=2)
+    assert path.read_text() == "mine"
+    run(*SCAN, "-o", path, "--force", store=store)
+    assert path.read_text().startswith('"log_time"')
+    assert [p.name for p in tmp_path.iterdir()] == ["x.csv"]
+
+
+def test_a_directory_is_replaced_only_if_it_is_ours(store: Path, tmp_path: Path) -> None:
+    mine, ours = tmp_path / "mine", tmp_path / "ours"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("years")
+    raw = (*SCAN, "-n", "2", "-F", "raw", "--force", "-o")
+    assert "other things" in run(*raw, mine, store=store, code=2).err
+    run(*SCAN, "-o", mine, "-F", "csv", "--force", store=store, code=2)
+    assert (mine / "thesis.txt").read_text() == "years"
+    run(*raw, ours, store=store)
+    before = sorted(p.name for p in ours.rglob("*"))
+    bad = ("fetch", "-t", "scan", "--between", "2000-01-01", "2001-01-01", "-F", "raw", "-f", "-o")
+    run(*bad, ours, store=store, code=2)
+    assert sorted(p.name for p in ours.rglob("*")) == before
+    run(*SCAN, "-n", "1", "-F", "raw", "--force", "-o", ours, store=store)
+    assert len(list(ours.rglob("*.bin"))) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "ours"]
+
+
+def test_places_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
+    for path in (tmp_path / "no/such/x.csv", tmp_path, tmp_path / "x.unknown"):
+        run(*SCAN, "-o", path, store=store, code=2)
+    run(*SCAN, "-F", "table", "-o", tmp_path / "x", store=store, code=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_head_is_quiet(store: Path) -> None:
+    command = [*COMMAND, "fetch", "--store", str(store), "-t", "*image_raw", "-F", "raw"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.read(1)
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 0
+
+
+def test_a_full_disk_behind_standard_output(store: Path) -> None:
+    for command in (["fetch", "-t", "scan", "-F", "csv"], ["ls"]):
+        with Path("/dev/full").open("wb") as full:
+            ended = subprocess.run(
+                [*COMMAND, *command, "--store", str(store)],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                env=environment(),
+                check=False,
+            )
+        assert ended.returncode == 7
+        assert b"Traceback" not in ended.stderr
+
+
+def test_the_answer_says_how_complete_it_is(store: Path) -> None:
+    torn = run("fetch", "-t", "scan", "-r", "torn", "--count", store=store)
+    assert "torn is not complete" in torn.err
+    assert "`hybridlog info torn`" in torn.err
+    whole = run("fetch", "-t", "scan", "-r", "robot", "--count", store=store)
+    assert "complete" not in whole.err
+    # Where the time range does not meet a recording, its losses do not matter.
+    entries = {r["recording"]: r for r in run("ls", "--json", store=store).json}
+    robot, other = entries["robot"], entries["torn"]
+    assert other["last_ns"] < robot["start_ns"] or robot["last_ns"] < other["start_ns"]
+    between = (robot["start_ns"], robot["start_ns"] + SECOND)
+    apart = run("fetch", "-t", "scan", "--between", *between, "--count", store=store)
+    assert "torn" not in apart.err
+
+
+def test_topics_that_map_to_one_name(store: Path) -> None:
+    for topic, text in (("/a/b", "one"), ("/a__b", "two"), ("a/b", "three")):
+        rows = [json.loads(r) for r in run("fetch", "-t", topic, store=store).lines]
+        assert [(r["topic"], r["data"]) for r in rows] == [(topic, text)] * odd_log.PER_TOPIC
+
+
+def test_a_type_that_changes_midway(store: Path, tmp_path: Path) -> None:
+    rows = [json.loads(r) for r in run("fetch", "-t", "change", store=store).lines]
+    assert [str(r["data"]) for r in rows] == ["x"] * 3 + ["7"] * 3
+    run("fetch", "-t", "change", "-o", tmp_path / "x.mcap", store=store)
+    payloads = [m.payload for m in read_mcap(tmp_path / "x.mcap")]
+    assert payloads == [odd_log.text("x")] * 3 + [odd_log.number(7)] * 3
+
+
+@pytest.mark.parametrize("topic", ["code", "recursive", "cbor", "no_definition"])
+def test_what_is_no_table_is_still_exact(topic: str, store: Path) -> None:
+    refused = run("fetch", "-t", topic, store=store, code=1)
+    assert "--format raw" in refused.err
+    assert run("fetch", "-t", topic, "-F", "raw", store=store).raw
+
+
+def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> None:
+    done = run("fetch", "-t", "long", "-o", tmp_path / "x.csv", store=store)
+    assert f"{odd_log.PER_TOPIC} messages do not fit their definition" in done.err
+    exact = run("fetch", "-t", "long", "-F", "raw", store=store)
+    assert exact.raw == odd_log.claims_4_gb() * odd_log.PER_TOPIC
+
+
+def test_json_is_asked_as_it_stands(store: Path) -> None:
+    done = run("fetch", "-t", "json", "--where", "a == 1", "-n", "1", store=store)
+    assert json.loads(done.out)["b"] == [1, 2]
+    assert run("fetch", "-t", "json", "--where", "a == 2", store=store).out == ""

@@ -1,0 +1,117 @@
+"""`hybridlog reindex`, `verify`, `rm`, and stores that cannot be opened."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from tests.independent import read_bag
+
+from .running import recordings, run
+
+
+def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
+    count = len(read_bag(logs / "small.bag"))
+    done = run("verify", store=fresh)
+    assert "1 recording, " in done.out
+    assert f" {count} messages, " in done.out
+    assert done.out.endswith("all is well\n")
+    before = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
+    again = run("reindex", "--json", store=fresh).json
+    assert (again["recordings"], again["messages"]) == (1, count)
+    after = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
+    assert after == before != b""
+    assert run("verify", "small", "--json", store=fresh).json["findings"] == []
+    run("verify", "nothing", store=fresh, code=2)
+
+
+def test_verify_lists_what_is_off(fresh: Path) -> None:
+    (path,) = (fresh / "recordings/small").glob("*.mcap")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with hl.open(fresh) as store:
+        assert store.database is not None
+        store.database.delete("imu__data", {"_meta.seq": {"$lt": 20}})
+    done = run("verify", store=fresh, code=1)
+    findings = done.lines[:-1]
+    assert any("000000.mcap byte" in line for line in findings)
+    assert any("imu__data" in line for line in findings)
+    assert f"{len(findings)} problems" in done.lines[-1]
+    found = run("verify", "--json", store=fresh, code=1).json["findings"]
+    assert len(found) == len(findings)
+    assert run("verify", "--quiet", store=fresh, code=1).lines == findings
+
+
+def test_rm(logs: Path, fresh: Path) -> None:
+    run("record", logs / "odd.mcap", "--quiet", store=fresh)
+    refused = run("rm", "odd", store=fresh, code=2)
+    assert "--yes" in refused.err
+    run("rm", "nothing", "--yes", store=fresh, code=2)
+    assert recordings(fresh) == ["odd", "small"]
+    assert run("rm", "odd", "--yes", store=fresh).out == "deleted odd\n"
+    assert recordings(fresh) == ["small"]
+    assert "all is well" in run("verify", store=fresh).out
+    assert "/json" in run("fetch", "-t", "/json", store=fresh, code=2).err
+    run("rm", "small", "-y", store=fresh)
+    assert "is empty" in run("ls", store=fresh).err
+    run("record", logs / "odd.mcap", "--quiet", store=fresh)
+
+
+def test_no_store(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").write_text("x")
+    for name, words in (
+        ("nothing", "no such directory"),
+        ("empty", "hybridlog.toml"),
+        ("file", "is a file"),
+    ):
+        for command in (("ls",), ("fetch", "-t", "x"), ("verify",), ("info",)):
+            assert words in run(*command, store=tmp_path / name, code=5).err
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_recording_into_something_else(logs: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").write_text("x")
+    for name in ("file", "other"):
+        run("record", logs / "odd.mcap", store=tmp_path / name, code=5)
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "file", "other"]
+
+
+def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "s"
+    run("record", logs / "odd.mcap", "-q", store=store)
+    settings = store / "hybridlog.toml"
+    settings.write_text(settings.read_text().replace("format = 1", "format = 99"))
+    for command in (("ls",), ("record", logs / "small.bag"), ("fetch", "-t", "x")):
+        done = run(*command, store=store, code=5)
+        assert "format 99" in done.err
+        assert "newer hybridlog" in done.err
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
+    places = [fresh, fresh / "recordings", fresh / "mongod"]
+    for place in places:
+        place.chmod(0o500)
+    try:
+        run("record", logs / "odd.mcap", store=fresh, code=5)
+    finally:
+        for place in places:
+            place.chmod(0o700)
+
+
+def test_the_default_store_is_in_the_working_directory(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run("record", logs / "odd.mcap", "-q")
+    assert recordings(tmp_path / "hybridlog-store") == ["odd"]
+    assert "odd" in run("ls").out

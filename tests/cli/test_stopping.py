@@ -1,0 +1,216 @@
+"""Commands that are stopped, starved, or left without MongoDB."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from hybridlog_storage.mongod import find_mongod
+from tests.independent import read_bag
+
+from .running import COMMAND, environment, open_bytes, recordings, run, start, wait_for
+
+Server = tuple[str, subprocess.Popen[bytes]]
+
+# The strongest compression makes the robot's images take seconds.
+SLOW = ("--level", "19", "--again")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_stopped_record_leaves_nothing(
+    number: signal.Signals, logs: Path, fresh: Path, tmp_path: Path
+) -> None:
+    with (tmp_path / "out").open("wb") as output:
+        process = start(
+            *("record", logs / "odd.mcap", logs / "robot.bag", "--store", fresh, *SLOW),
+            output=output,
+        )
+        wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 100_000)
+        assert process.poll() is None
+        process.send_signal(number)
+        assert process.wait(60) == 128 + number
+    text = (tmp_path / "out").read_text()
+    assert f"Nothing of {logs / 'robot.bag'} is kept. 1 recording made before stay" in text
+    assert "Traceback" not in text
+    assert recordings(fresh) == ["odd", "small"]
+    assert {r["recording"] for r in run("ls", "--json", store=fresh).json} == {"odd", "small"}
+    assert "all is well" in run("verify", store=fresh).out
+
+
+def test_the_second_ctrl_c_waits_for_the_first(logs: Path, fresh: Path, tmp_path: Path) -> None:
+    with (tmp_path / "out").open("wb") as output:
+        process = start("record", logs / "robot.bag", "--store", fresh, *SLOW, output=output)
+        wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 100_000)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    assert recordings(fresh) == ["small"]
+    assert "Traceback" not in (tmp_path / "out").read_text()
+
+
+def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_path: Path) -> None:
+    with (tmp_path / "out").open("wb") as output:
+        process = start("record", logs / "robot.bag", "--store", fresh, *SLOW, output=output)
+        wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 200_000)
+        process.kill()
+        assert process.wait(60) == -signal.SIGKILL
+    done = run("ls", store=fresh)
+    assert "Recording robot was cut short by a crash:" in done.err
+    assert "cut short by a crash" in next(line for line in done.lines if line.startswith("robot"))
+    assert run("ls", store=fresh).err == ""
+    found = run("info", "robot", "--json", store=fresh).json
+    assert 0 < found["messages"] < len(read_bag(logs / "robot.bag"))
+    assert (
+        "robot is not complete"
+        in run("fetch", "-t", "imu/data", "-r", "robot", "--count", store=fresh).err
+    )
+    assert "all is well" in run("verify", store=fresh).out
+
+
+def test_a_file_that_was_being_written_goes_away(store: Path, tmp_path: Path) -> None:
+    target = tmp_path / "new.mcap"
+    with (tmp_path / "out").open("wb") as output:
+        process = start("export", target, "--store", store, "-r", "robot", output=output)
+        wait_for(lambda: process.poll() is not None or list(tmp_path.glob(".new.*")))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    assert f"{target} is not written" in (tmp_path / "out").read_text()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def limited(kilobytes: int) -> tuple[str, ...]:
+    """Files of this process cannot become larger."""
+    return ("sh", "-c", f'ulimit -f {kilobytes * 2}; exec "$@"', "sh")
+
+
+def run_limited(kilobytes: int, *arguments: object) -> tuple[int, str]:
+    ended = subprocess.run(
+        [*limited(kilobytes), *COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        check=False,
+    )
+    assert "Traceback" not in ended.stderr
+    return ended.returncode, ended.stderr
+
+
+def test_no_space(logs: Path, fresh: Path, tmp_path: Path) -> None:
+    code, text = run_limited(400, "record", logs / "robot.bag", "--store", fresh)
+    assert code == 7
+    assert "No space left" in text
+    assert recordings(fresh) == ["small"]
+    assert [r["recording"] for r in run("ls", "--json", store=fresh).json] == ["small"]
+    out = tmp_path / "out"
+    out.mkdir()
+    for form in ("mcap", "bag", "csv", "npz"):
+        code, text = run_limited(
+            *(
+                20,
+                "fetch",
+                "-t",
+                "scan",
+                "-t",
+                "imu/data",
+                "--store",
+                fresh,
+                "-o",
+                out / f"x.{form}",
+            )
+        )
+        assert (code, list(out.iterdir())) == (7, []), (form, text)
+
+
+@pytest.fixture
+def server(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Server]:
+    """The URI of a mongod of one's own, and its process."""
+    directory = tmp_path_factory.mktemp("db")
+    socket = directory / "s.sock"
+    (directory / "data").mkdir()
+    process = subprocess.Popen(
+        [
+            *(str(find_mongod()), "--dbpath", str(directory / "data"), "--nounixsocket"),
+            *("--bind_ip", str(socket), "--logpath", str(directory / "log")),
+            *("--wiredTigerCacheSizeGB", "0.25"),
+        ],
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        wait_for(lambda: socket.exists() or process.poll() is not None)
+        yield f"mongodb://{quote(str(socket), safe='')}/logs", process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_path: Path) -> None:
+    uri, process = server
+    store = tmp_path / "s"
+    with (tmp_path / "out").open("wb") as output:
+        recording = start(
+            *("record", logs / "robot.bag", "--store", store, "--mongo", uri, *SLOW), output=output
+        )
+        wait_for(lambda: recording.poll() is not None or open_bytes(store) > 100_000)
+        assert recording.poll() is None
+        process.kill()
+        # Recording goes on without the index; the exit code says that it is missing.
+        assert recording.wait(120) == 6
+    text = (tmp_path / "out").read_text()
+    assert "stored but not in the index" in text
+    assert "Traceback" not in text
+
+    # The store remembers its server; that one is away now.
+    seen = [m for m in read_bag(logs / "robot.bag") if m.topic == "/base/scan"]
+    began = time.monotonic()
+    done = run("fetch", "-t", "scan", "-F", "raw", store=store)
+    assert time.monotonic() - began < 30
+    assert done.raw == b"".join(m.payload for m in seen)
+    assert "MongoDB is away" in done.err
+    assert "robot" in run("ls", store=store).out
+    for command in (
+        ("fetch", "-t", "scan", "--where", "ranges.min < 1"),
+        ("reindex",),
+        ("verify",),
+    ):
+        assert "does not answer" in run(*command, store=store, code=6).err
+
+    # Another server is as good: the index is made anew from the segments.
+    run("reindex", "--mongo", "embedded", store=store)
+    assert "robot" in run("ls", store=store).out
+
+
+def test_a_server_that_is_not_there_makes_no_store(logs: Path, tmp_path: Path) -> None:
+    uri = "mongodb://user:secret@127.0.0.1:1/?serverSelectionTimeoutMS=300"
+    done = run("record", logs / "odd.mcap", "--mongo", uri, store=tmp_path / "s", code=6)
+    assert "does not answer" in done.err
+    assert "secret" not in done.err
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_database_of_another_store(server: Server, logs: Path, tmp_path: Path) -> None:
+    uri, _ = server
+    run("record", logs / "odd.mcap", "--mongo", uri, "-q", store=tmp_path / "one")
+    done = run("record", logs / "odd.mcap", "--mongo", uri, store=tmp_path / "two", code=5)
+    assert "another store" in done.err
+    assert not (tmp_path / "two").exists()
+
+
+def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "s"
+    with (tmp_path / "out").open("wb") as output:
+        both = [
+            start("record", logs / name, "--store", store, output=output)
+            for name in ("small.bag", "odd.mcap")
+        ]
+        codes = [process.wait(120) for process in both]
+    assert codes == [0, 0], (tmp_path / "out").read_text()
+    assert recordings(store) == ["odd", "small"]
+    assert "all is well" in run("verify", store=store).out

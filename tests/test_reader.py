@@ -1,0 +1,906 @@
+"""Questions to a store: what they answer, what they cost, and what they refuse."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import tracemalloc
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+import hybridlog as hl
+from hybridlog.demo.write import write_bag
+from hybridlog.latched import in_force
+from hybridlog.reader import Query
+from hybridlog.recorder import RecordOptions
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DefinitionError,
+    HybridlogError,
+    PayloadError,
+    TimeError,
+    TopicError,
+    UsageError,
+    WhereError,
+)
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.data import DATA, needs_data
+
+SECOND = 10**9
+NOWHERE = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
+LOGS = ["tilt_laser.bag", "auv_ros2.mcap", "compressed_image.bag", "luminar_pointcloud.bag"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Decoded:
+    """A message as `rosbags` decodes it."""
+
+    log_time: int
+    raw: bytes
+    message: Any
+
+
+Truth = dict[str, list[Decoded]]
+
+
+def decoded(path: Path, topics: list[str] | None = None) -> Truth:
+    """Messages of a log by topic, in order of log time."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    found: Truth = defaultdict(list)
+    with AnyReader([path], default_typestore=store) as reader:
+        chosen = [c for c in reader.connections if topics is None or c.topic in topics]
+        for connection, log_time, raw in reader.messages(chosen):
+            message = reader.deserialize(raw, connection.msgtype)
+            found[connection.topic].append(Decoded(log_time, bytes(raw), message))
+    return dict(found)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("reader")
+
+
+@pytest.fixture(scope="module")
+def store(base: Path) -> Iterator[hl.Store]:
+    """`robot` (four seconds of the simulated robot) and, where they are, real logs."""
+    write_bag(base / "robot.bag", duration_s=4.0)
+    with hl.open(base / "store", create=True, require_database=True) as opened:
+        opened.record(base / "robot.bag")
+        for name in LOGS if DATA.is_dir() else []:
+            opened.record(DATA / "real" / name, name=name.split(".")[0])
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def robot(base: Path, store: hl.Store) -> Truth:
+    return decoded(base / "robot.bag")
+
+
+def chunks_of(store: hl.Store, topic: str, begin: int = 0, end: int = 1 << 63) -> int:
+    """How many chunks hold a message of a topic in a time range, by the index documents."""
+    return len(
+        {
+            (d["_meta"]["rec"], d["_meta"]["ref"]["seg"], d["_meta"]["ref"]["chunk"])
+            for d in store.topic(topic).documents()
+            if begin <= d["_meta"]["t"] < end
+        }
+    )
+
+
+# What an answer costs.
+
+
+def test_a_count_reads_no_payload(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/base/scan")
+    assert query.count() == len(robot["/base/scan"]) == query.counters.messages
+    assert query.counters.chunks_read == query.counters.bytes_read == 0
+    near = query.where("range_min < 100").between("+1s", "+2s")
+    assert near.count() == sum(
+        SECOND <= m.log_time - start_of(store) < 2 * SECOND for m in robot["/base/scan"]
+    )
+    assert near.counters.chunks_read == near.counters.bytes_read == 0
+
+
+def start_of(store: hl.Store, recording: str = "robot") -> int:
+    (entry,) = store.select([recording])
+    assert entry.span is not None
+    return entry.span[0]
+
+
+def test_scalars_come_from_the_index_alone(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/base/scan").fields("header.seq", "range_min", "ranges.min")
+    frame = query.to_pandas()
+    assert query.counters.chunks_read == query.counters.bytes_read == 0
+    assert query.counters.documents_read == query.counters.messages == len(frame)
+    assert list(frame.columns) == ["header.seq", "range_min", "ranges.min"]
+    assert frame["header.seq"].tolist() == [m.message.header.seq for m in robot["/base/scan"]]
+    want = [m.message.ranges[np.isfinite(m.message.ranges)].min() for m in robot["/base/scan"]]
+    assert frame["ranges.min"].tolist() == pytest.approx(want, rel=1e-6)
+    assert frame.attrs["hybridlog"]["chunks_read"] == 0
+
+
+def test_documents_read_no_chunk(store: hl.Store) -> None:
+    query = store.topic("/imu/data")
+    assert len(list(query.documents())) == query.count()
+    assert query.counters.chunks_read == 0
+
+
+@pytest.mark.parametrize("topic", ["/base/scan", "/imu/data", "/camera/front/image_raw"])
+def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> None:
+    query = store.topic(topic)
+    assert [m.raw for m in query] == [m.raw for m in robot[topic]]
+    counters = query.counters
+    assert counters.chunks_read == chunks_of(store, topic)
+    assert counters.messages == len(robot[topic])
+    assert counters.payload_bytes == sum(len(m.raw) for m in robot[topic])
+    # The same again counts anew, not on top.
+    before = dataclasses.asdict(counters) | {"elapsed_s": 0}
+    list(query)
+    assert dataclasses.asdict(query.counters) | {"elapsed_s": 0} == before
+    backwards = query.reverse()
+    assert [m.raw for m in backwards] == [m.raw for m in reversed(robot[topic])]
+    assert backwards.counters.chunks_read == counters.chunks_read
+
+
+def test_all_topics_at_once_read_each_chunk_once(store: hl.Store) -> None:
+    query = store.all_topics().in_recording("robot")
+    (entry,) = store.select(["robot"])
+    times = [m.log_time_ns for m in query]
+    assert times == sorted(times)
+    assert query.counters.chunks_read == entry.chunks
+    assert query.counters.messages == entry.messages
+    assert query.counters.bytes_read <= entry.stored_bytes
+
+
+def test_a_slice_reads_only_chunks_with_its_times(store: hl.Store, robot: Truth) -> None:
+    start = start_of(store)
+    begin, end = start + SECOND, start + SECOND + 100_000_000
+    query = store.topic("/base/scan").between(begin, end)
+    want = [m.raw for m in robot["/base/scan"] if begin <= m.log_time < end]
+    assert [m.raw for m in query] == want != []
+    assert 0 < query.counters.chunks_read <= 3 < chunks_of(store, "/base/scan")
+
+
+def test_a_predicate_reads_only_chunks_with_an_answer(store: hl.Store, robot: Truth) -> None:
+    wanted = robot["/base/scan"][40].message.header.seq
+    query = store.topic("/base/scan").where(f"header.seq == {wanted}")
+    assert [m.raw for m in query] == [robot["/base/scan"][40].raw]
+    assert query.counters.chunks_read == 1
+    assert query.counters.documents_read == 1
+
+
+def test_one_message_reads_one_chunk(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/camera/front/image_raw").limit(1)
+    (message,) = query
+    assert message.raw == robot["/camera/front/image_raw"][0].raw
+    assert query.counters.messages == 1
+    assert query.counters.chunks_read <= 4
+
+
+# What it answers.
+
+
+def flat(message: Any, prefix: str = "") -> dict[str, Any]:
+    """Fields of a message by dotted path; times are nanoseconds."""
+    found: dict[str, Any] = {}
+    for name, value in values_of(message):
+        if is_time(value):
+            found[prefix + name] = nanoseconds(value)
+        elif dataclasses.is_dataclass(value):
+            found.update(flat(value, f"{prefix}{name}."))
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def values_of(message: Any) -> Iterator[tuple[str, Any]]:
+    """Names and values of a message, without the constants of its definition."""
+    for item in dataclasses.fields(message):
+        is_constant = len(item.name) > 1 and item.name.isupper()
+        if not item.name.startswith("__") and not is_constant:
+            yield item.name, getattr(message, item.name)
+
+
+def is_time(value: object) -> bool:
+    return type(value).__name__ in {
+        "builtin_interfaces__msg__Time",
+        "builtin_interfaces__msg__Duration",
+    }
+
+
+def nanoseconds(value: Any) -> int:
+    return int(value.sec) * SECOND + int(value.nanosec)
+
+
+def nested(value: Any) -> Any:
+    """A message within an array as Arrow gives it."""
+    if is_time(value):
+        return nanoseconds(value)
+    if dataclasses.is_dataclass(value):
+        return {name: nested(part) for name, part in values_of(value)}
+    if isinstance(value, np.ndarray | list):
+        return [nested(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def unstamped(value: Any) -> Any:
+    """Times of Arrow and pandas as nanoseconds, all the way down."""
+    if isinstance(value, pd.Timestamp | pd.Timedelta):
+        return value.value
+    if isinstance(value, dict):
+        return {k: unstamped(v) for k, v in value.items()}
+    if isinstance(value, list | np.ndarray):
+        return [unstamped(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def check_tables(query: Query, want: list[Decoded]) -> None:
+    rows = [flat(m.message) for m in want]
+    table, frame = query.to_arrow(), query.to_pandas()
+    assert table.column_names == ["log_time", *rows[0]]
+    assert list(frame.columns) == list(rows[0])
+    assert table["log_time"].cast("int64").to_pylist() == [m.log_time for m in want]
+    assert frame.index.astype("int64").tolist() == [m.log_time for m in want]
+    assert str(frame.index.dtype) == "datetime64[ns, UTC]"
+    for name in rows[0]:
+        expected = [nested(row[name]) for row in rows]
+        same(unstamped(table[name].to_pylist()), expected, name)
+        same([unstamped(v) for v in frame[name]], expected, name)
+
+
+def same(got: list[Any], want: list[Any], name: str) -> None:
+    # NaN equals NaN here, and nothing is rounded.
+    assert json.dumps(got) == json.dumps(want), name
+
+
+@pytest.mark.parametrize(
+    "topic",
+    ["/base/scan", "/imu/data", "/odom", "/joint_states", "/battery", "/tf", "/diagnostics",
+     "/camera/front/camera_info", "/cmd_vel", "/rosout"],
+)  # fmt: skip
+def test_tables_of_the_robot(store: hl.Store, robot: Truth, topic: str) -> None:
+    check_tables(store.topic(topic).in_recording("robot"), robot[topic])
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "topics"),
+    [
+        ("tilt_laser", ["/scan", "/imu_data", "/tf", "/info_gps", "/position_gps", "/temperature"]),
+        ("auv_ros2", ["/coug2/dvl/data", "/coug2/fix", "/coug2/modem_status", "/tf",
+                      "/coug2/extended_fix", "/coug2/kinematics/command"]),
+        ("luminar_pointcloud", ["/luminar_pointcloud", "/base_scan"]),
+    ],
+)  # fmt: skip
+def test_tables_of_real_logs(store: hl.Store, name: str, topics: list[str]) -> None:
+    path = next(DATA / "real" / log for log in LOGS if log.startswith(name))
+    truth = decoded(path, topics)
+    for topic in topics:
+        check_tables(store.topic(topic).in_recording(name), truth[topic])
+
+
+def test_tables_with_every_and_limit_and_reverse(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/odom").every(7).limit(5).reverse()
+    want = robot["/odom"][::-1][::7][:5]
+    check_tables(query, want)
+    numbers = query.fields("header.seq").to_pandas()["header.seq"].tolist()
+    assert numbers == [m.message.header.seq for m in want]
+
+
+def test_a_table_without_rows_has_all_columns(store: hl.Store, robot: Truth) -> None:
+    start = start_of(store)
+    query = store.topic("/battery").between(start, start + 1)
+    assert query.count() == 0
+    assert query.to_arrow().num_rows == 0
+    assert query.to_arrow().column_names == ["log_time", *flat(robot["/battery"][0].message)]
+    assert list(query.to_pandas().columns) == list(flat(robot["/battery"][0].message))
+    assert list(query) == []
+    assert query.first() is None
+
+
+def test_fields_choose_columns(store: hl.Store, robot: Truth) -> None:
+    frame = store.topic("/odom").fields("pose.pose.position", "header.stamp").to_pandas()
+    assert list(frame.columns) == [
+        *(f"pose.pose.position.{axis}" for axis in "xyz"),
+        "header.stamp",
+    ]
+    want = [m.message.pose.pose.position.x for m in robot["/odom"]]
+    assert frame["pose.pose.position.x"].tolist() == want
+    arrays = store.topic("/joint_states").fields("position").to_pandas()
+    assert list(arrays.columns) == ["position"]
+    for got, m in zip(arrays["position"], robot["/joint_states"], strict=True):
+        assert np.array_equal(got, m.message.position)
+
+
+def test_tables_of_several_topics(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/odom", "/cmd_vel").fields("header.seq", "linear.x").between("+1s", "+2s")
+    frame = query.to_pandas()
+    start = start_of(store)
+    want = sorted(
+        (m.log_time, topic, m.message)
+        for topic in ("/odom", "/cmd_vel")
+        for m in robot[topic]
+        if SECOND <= m.log_time - start < 2 * SECOND
+    )
+    assert frame["topic"].tolist() == [topic for _, topic, _ in want]
+    assert frame.index.astype("int64").tolist() == [time for time, _, _ in want]
+    for row, (_, topic, message) in zip(frame.to_dict("records"), want, strict=True):
+        if topic == "/odom":
+            assert row["header.seq"] == message.header.seq
+            assert pd.isna(row["linear.x"])
+        else:
+            assert pd.isna(row["header.seq"])
+            assert row["linear.x"] == message.linear.x
+
+
+def test_messages_decode_like_rosbags(store: hl.Store, robot: Truth) -> None:
+    for topic in ("/imu/data", "/tf", "/diagnostics", "/lidar/points"):
+        for got, want in zip(store.topic(topic).in_recording("robot"), robot[topic], strict=True):
+            same([nested(got.decode())], [nested(want.message)], topic)
+            assert got.log_time_ns == want.log_time
+            assert got.publish_time_ns is None
+            stamp = getattr(getattr(want.message, "header", None), "stamp", None)
+            assert got.header_stamp_ns == (None if stamp is None else nanoseconds(stamp))
+            assert got.type
+            assert topic in repr(got)
+
+
+def test_fields_of_a_message_are_its_document(store: hl.Store) -> None:
+    for topic in ("/base/scan", "/imu/data", "/tf", "/diagnostics"):
+        query = store.topic(topic).in_recording("robot").limit(20)
+        for message, document in zip(query, query.documents(), strict=True):
+            meta = document.pop("_meta")
+            document.pop("_id")
+            same([message.fields], [document], topic)
+            assert (meta["seq"], meta["t"]) == (message.seq, message.log_time_ns)
+
+
+def test_images_scans_and_clouds_as_arrays(store: hl.Store, robot: Truth) -> None:
+    images = store.topic("/camera/front/image_raw").limit(3).to_numpy()
+    assert isinstance(images, np.ndarray)
+    assert images.shape == (3, 240, 320, 3)
+    for image, m in zip(images, robot["/camera/front/image_raw"], strict=False):
+        assert image.tobytes() == m.message.data.tobytes()
+    (scan,) = store.topic("/base/scan").limit(1).to_numpy()
+    assert np.array_equal(
+        np.asarray(scan).reshape(-1)[: len(scan)], np.asarray(scan).reshape(-1)[: len(scan)]
+    )
+    cloud = store.topic("/lidar/points").first()
+    assert cloud is not None
+    points = cloud.to_numpy()
+    want = robot["/lidar/points"][0].message
+    assert points.size == want.width * want.height
+    xyz = np.frombuffer(want.data.tobytes(), np.float32).reshape(points.size, -1)[:, 0]
+    assert np.array_equal(np.asarray(points["x"]).reshape(-1), xyz, equal_nan=True)
+    first = store.topic("/imu/data").first()
+    assert first is not None
+    with pytest.raises(PayloadError):
+        first.to_numpy()
+
+
+# Which messages.
+
+
+def test_the_message_at_a_time(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/odom").in_recording("robot")
+    times = [m.log_time for m in robot["/odom"]]
+    for index in (0, 1, 57, len(times) - 1):
+        assert query.at(times[index]).raw == robot["/odom"][index].raw
+        assert query.at(times[index] + 1).raw == robot["/odom"][index].raw
+    assert query.at(times[57] - 1).raw == robot["/odom"][56].raw
+    assert query.at("end").raw == robot["/odom"][-1].raw
+    assert query.at(times[-1] + 3600 * SECOND).raw == robot["/odom"][-1].raw
+    with pytest.raises(TopicError, match="at or before"):
+        query.at(times[0] - 1)
+    with pytest.raises(TopicError, match="at or before"):
+        query.at(start_of(store) - 1)
+
+
+@pytest.mark.parametrize("epoch", [0, 1_700_000_000 * SECOND], ids=["simulated", "real"])
+def test_the_message_at_a_time_in_overlapping_recordings(tmp_path: Path, epoch: int) -> None:
+    """The current message is the last one of all, in whichever recording it is."""
+    long = [("/x", epoch + SECOND * t, {"n": t}) for t in range(1, 100)]
+    short = [("/x", epoch + SECOND * t + 5, {"n": -t}) for t in (10, 11)]
+    write_json(tmp_path / "long.mcap", long)
+    write_json(tmp_path / "short.mcap", short)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(tmp_path / "long.mcap")
+        store.record(tmp_path / "short.mcap")
+        query = store.topic("/x")
+        for now, want in ((5, 5), (10, 10), (11, 11), (12, 12), (50, 50), (99, 99)):
+            assert query.at(f"{epoch + now * SECOND}ns").fields == {"n": want}
+        assert query.at(f"{epoch + 10 * SECOND + 5}ns").fields == {"n": -10}
+        assert query.at(f"{epoch + 11 * SECOND + 6}ns").fields == {"n": -11}
+
+
+def write_json(
+    path: Path, messages: Sequence[tuple[str, int, object]], metadata: dict[str, str] | None = None
+) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, time, value in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", 0, metadata or {})
+            writer.add_message(channels[topic], time, json.dumps(value).encode(), time)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture(scope="module")
+def ties(base: Path) -> Iterator[hl.Store]:
+    """Two recordings with the same log times on two topics."""
+    paths = []
+    for name in ("one", "two"):
+        messages = [
+            (topic, SECOND * (100 + t // 2), {"who": name, "n": t, "topic": topic})
+            for t in range(6)
+            for topic in ("/x", "/y")
+        ]
+        paths.append(base / f"{name}.mcap")
+        write_json(paths[-1], messages)
+    with hl.open(base / "ties", create=True, require_database=True) as store:
+        for path in paths:
+            store.record(path)
+        yield store
+
+
+def test_ties_are_broken_by_recording_and_arrival(ties: hl.Store) -> None:
+    keys = {r.id: r.key for r in ties.recordings()}
+    query = ties.topic("/x")
+    got = [(m.log_time_ns, keys[m.recording], m.seq) for m in query]
+    assert got == sorted(got)
+    assert len(got) == 12
+    assert next(iter(query.reverse())).seq == list(query)[-1].seq
+    assert [d["n"] for d in query.documents()] == [m.fields["n"] for m in query]
+
+
+def test_tables_have_the_order_of_iteration(ties: hl.Store) -> None:
+    one, both = ties.topic("/x"), ties.topic("/x", "/y")
+    for query in (one, both, one.reverse(), both.every(3), one.limit(7).reverse()):
+        want = [(m.log_time_ns, m.recording, m.fields["n"]) for m in query]
+        frame = query.to_pandas()
+        assert list(zip(frame.index.astype("int64"), frame["who"], frame["n"], strict=True)) == want
+
+
+def test_a_limit_holds_for_documents_of_several_topics(ties: hl.Store) -> None:
+    query = ties.topic("/x", "/y").limit(3)
+    assert query.count() == len(list(query)) == 3
+    assert len(list(query.documents())) == 3
+
+
+def test_in_recording(ties: hl.Store) -> None:
+    query = ties.topic("/x").limit(3)
+    assert {m.recording for m in query.in_recording("two")} == {"two"}
+    assert len(list(query.in_recording("two"))) == 3
+    assert ties.topic("/x").in_recording("one", "two").count() == 12
+    assert [d["who"] for d in ties.topic("/x").in_recording("one").documents()] == ["one"] * 6
+    with pytest.raises(TopicError, match="There are"):
+        query.in_recording("three")
+
+
+@pytest.mark.parametrize(
+    ("begin", "end"),
+    [("+1s", "+2s"), ("-1s", None), (None, "+500ms"), ("+500ms", "-3s"), ("start", "end")],
+)
+def test_relative_times(store: hl.Store, robot: Truth, begin: str | None, end: str | None) -> None:
+    (entry,) = store.select(["robot"])
+    assert entry.span is not None
+    first, past = entry.span[0], entry.span[1] + 1
+    at = {
+        "+1s": first + SECOND, "+2s": first + 2 * SECOND,
+        "+500ms": first + SECOND // 2, "-1s": past - SECOND, "-3s": past - 3 * SECOND,
+        "start": first, "end": past,
+    }  # fmt: skip
+    low = first if begin is None else at[begin]
+    high = past if end is None else at[end]
+    query = store.topic("/odom").in_recording("robot").between(begin, end)
+    want = [m.raw for m in robot["/odom"] if low <= m.log_time < high]
+    assert [m.raw for m in query] == want != []
+    assert query.count() == len(want)
+
+
+def test_times_are_half_open(store: hl.Store, robot: Truth) -> None:
+    times = [m.log_time for m in robot["/odom"]]
+    query = store.topic("/odom").in_recording("robot")
+    for low, high in ((times[3], times[7]), (times[3] + 1, times[7] + 1)):
+        got = [m.log_time_ns for m in query.between(low, high)]
+        assert got == [t for t in times if low <= t < high]
+        assert query.between(low, high).count() == 4
+
+
+def test_the_header_clock(store: hl.Store, robot: Truth) -> None:
+    stamps = [nanoseconds(m.message.header.stamp) for m in robot["/imu/data"]]
+    # A nanosecond later, that log times, which are later still, give another answer.
+    low, high = stamps[100] + 1, stamps[200] + 1
+    query = store.topic("/imu/data").clock("header").between(low, high)
+    want = [m.raw for m, s in zip(robot["/imu/data"], stamps, strict=True) if low <= s < high]
+    assert [m.raw for m in query] == want != []
+    assert query.count() == len(want)
+    assert len(list(query.documents())) == len(want)
+    assert [m.raw for m in query.clock("log")] != want
+
+
+def test_a_header_that_can_be_read_in_a_message_that_cannot(tmp_path: Path) -> None:
+    """Iteration, count and documents must agree on a torn message."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    name = "geometry_msgs/msg/PointStamped"
+    definition, _ = types.generate_msgdef(name, ros_version=2)
+    t = types.types
+    with (tmp_path / "torn.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(name, "ros2msg", definition.encode())
+        channel = writer.register_channel("/p", "cdr", schema)
+        for second in range(1, 7):
+            header = t["std_msgs/msg/Header"](
+                stamp=t["builtin_interfaces/msg/Time"](second, 0), frame_id="f"
+            )
+            point = t["geometry_msgs/msg/Point"](1.0, 2.0, 3.0)
+            data = bytes(types.serialize_cdr(t[name](header=header, point=point), name))
+            data = data[:-5] if second == 4 else data
+            writer.add_message(channel, second * SECOND, data, second * SECOND)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(tmp_path / "torn.mcap")
+        query = store.topic("/p").clock("header").between("3000000000ns", "6000000000ns")
+        times = [m.log_time_ns // SECOND for m in query]
+        assert times == [3, 5]
+        assert query.count() == len(times)
+        assert [d["_meta"]["t"] // SECOND for d in query.documents()] == times
+        whole = store.topic("/p")
+        assert [m.seq for m in whole] == [0, 1, 2, 3, 4, 5]
+        torn = list(whole)[3]
+        assert torn.fields == {}
+        with pytest.raises(PayloadError):
+            torn.decode()
+        table = whole.to_arrow()
+        assert table["point.x"].to_pylist() == [1.0] * 5
+        assert whole.fields("point.x").to_arrow()["point.x"].drop_null().to_pylist() == [1.0] * 5
+        assert store.verify().findings == []
+
+
+@needs_data
+def test_the_publish_clock(store: hl.Store) -> None:
+    from mcap.reader import make_reader
+
+    topic = "/coug2/depth_data"
+    with (DATA / "real/auv_ros2.mcap").open("rb") as file:
+        published = [m.publish_time for _, _, m in make_reader(file).iter_messages([topic])]
+    query = store.topic(topic)
+    assert [m.publish_time_ns for m in query] == published
+    low, high = published[100], published[300]
+    sliced = query.clock("publish").between(low, high)
+    assert sliced.count() == len(list(sliced)) == sum(low <= p < high for p in published)
+    with pytest.raises(TopicError, match="publish"):
+        list(store.topic("/odom").clock("publish").between("+1s", "+2s"))
+
+
+def test_predicates_as_text_and_as_filters(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/odom").in_recording("robot")
+    half = float(np.median([m.message.pose.pose.position.x for m in robot["/odom"]]))
+    want = [m.raw for m in robot["/odom"] if m.message.pose.pose.position.x > half]
+    text = query.where(f"pose.pose.position.x > {half!r}")
+    by_filter = query.where({"pose.pose.position.x": {"$gt": half}})
+    for each in (text, by_filter):
+        assert [m.raw for m in each] == want != []
+        assert each.count() == len(want)
+        assert len(each.to_pandas()) == len(want)
+    both = text.where("header.seq >= 50")
+    assert [m.raw for m in both] == [
+        m.raw
+        for m in robot["/odom"]
+        if m.message.pose.pose.position.x > half and m.message.header.seq >= 50
+    ]
+    assert text.every(3).limit(4).count() == len(want[::3][:4])
+    assert [m.raw for m in text.every(3).limit(4)] == want[::3][:4]
+    assert [m.raw for m in text.reverse().limit(2)] == want[::-1][:2]
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("ask", "error", "words"),
+    [
+        (lambda s: s.topic("/nothing"), TopicError, "/base/scan"),
+        (lambda s: s.topic("od"), TopicError, "/odom"),
+        (lambda s: s.topic(), TopicError, "/base/scan"),
+        (lambda s: s.topic("/odom").fields("pose.pose.positon"), TopicError, "position"),
+        (lambda s: s.topic("/odom").in_recording("x"), TopicError, "robot"),
+        (lambda s: s.topic("/odom").clock("wall"), UsageError, "publish"),
+        (lambda s: s.topic("/odom").limit(-1), UsageError, "negative"),
+        (lambda s: s.topic("/odom").every(0), UsageError, "at least 1"),
+        (lambda s: s.topic("/odom").where("header.seq >"), WhereError, "header.seq"),
+        (lambda s: s.topic("/odom").where("nothing > 1"), HybridlogError, "nothing"),
+        (lambda s: s.topic("/odom").where({"$where": "1"}), WhereError, "where"),
+        (lambda s: list(s.topic("/odom").between("+2s", "+1s")), TimeError, "empty"),
+        (lambda s: list(s.topic("/odom").between("x", None)), TimeError, "x"),
+        (lambda s: list(s.topic("/odom").between("1999-01-01", "1999-01-02")), TimeError, "spans"),
+        (lambda s: s.topic("/odom").between("+1h", "+2h").count(), TimeError, "spans"),
+        (
+            lambda s: s.topic("/odom").between("1999-01-01", "2000-01-01").to_pandas(),
+            TimeError,
+            "spans",
+        ),
+        (
+            lambda s: list(s.topic("/cmd_vel").clock("header").between("+1s", "+2s")),
+            TopicError,
+            "header.stamp",
+        ),
+        (
+            lambda s: s.topic("/odom").clock("publish").between("+1s", "+2s").count(),
+            TopicError,
+            "publish",
+        ),
+    ],
+)
+def test_wrong_questions(
+    store: hl.Store, ask: Any, error: type[HybridlogError], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        ask(store)
+
+
+def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
+    with (tmp_path / "x.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/raw", "something", 0)
+        writer.add_message(channel, 5, b"abc", 5)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(tmp_path / "x.mcap")
+        query = store.topic("/raw")
+        with pytest.raises(DefinitionError, match="/raw"):
+            query.to_pandas()
+        (message,) = query
+        assert (message.raw, message.fields, message.type) == (b"abc", {}, "")
+        with pytest.raises(DefinitionError):
+            message.decode()
+
+
+# Without MongoDB, and without leave to write.
+
+
+def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> None:
+    with hl.open(base / "store", mongo=NOWHERE) as away:
+        assert away.database is None
+        assert isinstance(away.without_database, DatabaseError)
+        assert [r.id for r in away.recordings()] == [r.id for r in store.recordings()]
+        assert [r.messages for r in away.recordings()] == [r.messages for r in store.recordings()]
+        assert [r.span for r in away.recordings()] == [r.span for r in store.recordings()]
+        for topic in ("/odom", "/base/scan", "/tf_static"):
+            query = away.topic(topic).in_recording("robot")
+            assert [m.raw for m in query] == [m.raw for m in robot[topic]]
+            assert query.count() == len(robot[topic])
+        sliced = away.topic("/odom").in_recording("robot").between("+1s", "+2s")
+        same_slice = store.topic("/odom").in_recording("robot").between("+1s", "+2s")
+        assert [m.raw for m in sliced] == [m.raw for m in same_slice]
+        assert sliced.count() == same_slice.count()
+        assert sliced.every(3).count() == same_slice.every(3).count()
+        assert (
+            sliced.fields("header.seq")
+            .to_arrow()
+            .equals(same_slice.fields("header.seq").to_arrow())
+        )
+        stamped = sliced.clock("header")
+        assert [m.raw for m in stamped] == [m.raw for m in same_slice.clock("header")]
+        assert away.topic("/odom").at("end").raw == store.topic("/odom").at("end").raw
+        with pytest.raises(DatabaseError, match="predicate"):
+            list(sliced.where("header.seq > 3"))
+        with pytest.raises(DatabaseError):
+            sliced.where("header.seq > 3").count()
+        with pytest.raises(DatabaseError):
+            list(sliced.documents())
+        with pytest.raises(DatabaseError):
+            away.record(base / "robot.bag")
+        with pytest.raises(DatabaseError):
+            away.verify()
+        with pytest.raises(DatabaseError):
+            away.remove("robot")
+    with pytest.raises(DatabaseError):
+        hl.open(base / "store", mongo=NOWHERE, require_database=True)
+
+
+AS_A_READER = """
+import sys
+import hybridlog as hl
+from hybridlog_storage.errors import DatabaseError
+
+store, log = sys.argv[1:]
+with hl.open(store) as opened:
+    assert opened.database is None
+    query = opened.topic("/odom").in_recording("robot")
+    print(query.count(), sum(len(m.raw) for m in query))
+    try:
+        opened.record(log, again=True)
+    except DatabaseError:
+        print("refused")
+"""
+
+
+def test_a_store_that_cannot_be_written_can_be_read(
+    base: Path, store: hl.Store, robot: Truth
+) -> None:
+    # Root is stopped by no permission, so another user asks.
+    as_other: list[str] = []
+    if os.geteuid() == 0:
+        if not shutil.which("setpriv"):
+            pytest.skip("root may write everywhere, and setpriv is not there")
+        as_other = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+    python = [*as_other, sys.executable, "-c"]
+    if subprocess.run([*python, "import hybridlog"], capture_output=True, check=False).returncode:
+        pytest.skip("another user cannot run this Python")
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        shutil.copytree(base / "store", place / "store", ignore=shutil.ignore_patterns("mongod"))
+        shutil.copy(base / "robot.bag", place)
+        for path in [place, *place.rglob("*")]:
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        try:
+            done = subprocess.run(
+                [*python, AS_A_READER, str(place / "store"), str(place / "robot.bag")],
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+                cwd="/",
+                env={**os.environ, "HOME": "/nonexistent"},
+            )
+        finally:
+            for path in [place, *place.rglob("*")]:
+                path.chmod(0o755)
+    assert done.returncode == 0, done.stderr
+    size = sum(len(m.raw) for m in robot["/odom"])
+    assert done.stdout.split() == [str(len(robot["/odom"])), str(size), "refused"]
+
+
+# Latched messages.
+
+
+def test_latched_messages_come_before_a_slice(store: hl.Store, robot: Truth) -> None:
+    query = store.all_topics().in_recording("robot").between("+2s", "+3s")
+    begin = start_of(store) + 2 * SECOND
+    found = {}
+    for batch, lanes in in_force(query):
+        for row in range(len(batch)):
+            lane = lanes[int(batch.channel[row])]
+            found[lane.channel.topic] = bytes(batch.payload(row))
+            assert batch.log_time[row] == begin
+    assert found == {t: robot[t][0].raw for t in ("/map", "/tf_static")}
+    assert list(in_force(query.between(None, "+1s"))) == []
+    assert list(in_force(store.topic("/odom").in_recording("robot").between("+2s", "+3s"))) == []
+
+
+@pytest.mark.parametrize("epoch", [0, 1_700_000_000 * SECOND], ids=["simulated", "real"])
+def test_the_last_latched_message_of_each_connection(tmp_path: Path, epoch: int) -> None:
+    from rosbags.rosbag1 import Writer as BagWriter
+
+    types = get_typestore(Stores.ROS1_NOETIC)
+    text = types.types["std_msgs/msg/String"]
+    with BagWriter(tmp_path / "latched.bag") as bag:
+        connections = [
+            bag.add_connection(
+                "/state", "std_msgs/msg/String", typestore=types, callerid=who, latching=latching
+            )
+            for who, latching in (("/a", 1), ("/b", 1), ("/c", None))
+        ]
+        for time in range(1, 20):
+            which = time % 3
+            data = types.serialize_ros1(text(f"{which} {time}"), "std_msgs/msg/String")
+            bag.write(connections[which], epoch + time * SECOND, bytes(data))
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(tmp_path / "latched.bag")
+        query = store.topic("/state").between(f"{epoch + 11 * SECOND}ns", None)
+        found = [
+            bytes(batch.payload(row))[4:].decode()
+            for batch, _ in in_force(query)
+            for row in range(len(batch))
+        ]
+        # At 11 s: connection 0 said something last at 9, 1 at 10, and 2 does not latch.
+        assert sorted(found) == ["0 9", "1 10"]
+
+
+# Memory and threads.
+
+
+def test_memory_is_bounded_by_chunks_not_by_the_store(tmp_path: Path) -> None:
+    write_bag(tmp_path / "robot.bag", duration_s=25.0, topics=["/camera/front/image_raw"])
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        options = RecordOptions(settings=SegmentSettings(compression="none"))
+        report = store.record(tmp_path / "robot.bag", options)
+        size = report.entry.stored_bytes
+        assert size > 25_000_000
+        query = store.topic("/camera/front/image_raw")
+        for each in (query, query.reverse(), query.where("height > 0"), query.every(2)):
+            gc.collect()
+            tracemalloc.start()
+            total = sum(len(m.payload) for m in each)
+            _, peak = tracemalloc.get_traced_memory()
+            tracemalloc.stop()
+            assert total > 0
+            assert peak < size / 3, each
+
+
+def test_several_threads_share_a_store(store: hl.Store, robot: Truth) -> None:
+    topics = ["/odom", "/base/scan", "/imu/data", "/camera/front/image_raw"]
+    problems: list[object] = []
+
+    def ask(topic: str) -> None:
+        try:
+            for _ in range(3):
+                query = store.topic(topic).in_recording("robot")
+                assert [m.raw for m in query] == [m.raw for m in robot[topic]]
+                assert query.where("header.seq >= 0").count() == len(robot[topic])
+                assert len(query.to_pandas()) == len(robot[topic])
+        except BaseException as error:
+            problems.append(error)
+
+    threads = [threading.Thread(target=ask, args=(topic,)) for topic in topics]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert problems == []
+
+
+def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth) -> None:
+    with hl.open(base / "store", require_database=True) as other:
+        messages = list(other.topic("/odom").in_recording("robot").limit(10))
+    assert [m.raw for m in messages] == [m.raw for m in robot["/odom"][:10]]
+    stamps = [nanoseconds(m.message.header.stamp) for m in robot["/odom"][:10]]
+    assert [m.header_stamp_ns for m in messages] == stamps
+
+
+def test_a_query_is_a_value(store: hl.Store) -> None:
+    query = store.topic("/odom")
+    steps = [query.limit(1), query.every(2), query.reverse(), query.between("+1s", "+2s")]
+    assert all(s != query for s in steps)
+    assert query.count() == store.topic("/odom").count()
+    assert query.reverse().reverse() == query
+    assert all(a != b for a, b in pairwise(steps))
+
+
+def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:
+    """Parts of bounded size end between messages, on every topic at the same time."""
+    from hybridlog.tables import stream
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    count = 75_000
+    with (tmp_path / "many.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2")
+        definition, _ = types.generate_msgdef("std_msgs/msg/Int32", ros_version=2)
+        schema = writer.register_schema("std_msgs/msg/Int32", "ros2msg", definition.encode())
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in ("/x", "/y")]
+        for number in range(count):
+            for channel in channels:
+                payload = b"\0\1\0\0" + number.to_bytes(4, "little")
+                writer.add_message(channel, SECOND + number, payload, SECOND + number)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(tmp_path / "many.mcap", settings=SegmentSettings(chunk_size=1 << 20))
+        for query in (store.topic("/x", "/y"), store.topic("/x", "/y").reverse()):
+            parts = list(stream(query))
+            assert len(parts) > 1
+            numbers = [n for part in parts for n in part["data"].to_pylist()]
+            assert len(numbers) == 2 * count
+            assert numbers == sorted(numbers, reverse=query.is_reversed)
