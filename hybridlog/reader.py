@@ -24,7 +24,18 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from hybridlog.indexing import STAMP
-from hybridlog.query.plan import Chosen, Clock, Counters, Lane, Piece, Plan, Sweep, Target, Task
+from hybridlog.query.plan import (
+    Chosen,
+    Clock,
+    Counters,
+    Lane,
+    Piece,
+    Plan,
+    Sweep,
+    Target,
+    Task,
+    count_given,
+)
 from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
@@ -553,14 +564,12 @@ class Query:
             if self._limit is not None:
                 rows = rows[: self._limit - given]
             given += len(rows)
-            if len(rows) == count:
-                yield piece
-            elif len(rows):
-                yield Piece(piece.batch.take(rows), piece.seq[rows])
+            kept = piece if len(rows) == count else Piece(piece.batch.take(rows), piece.seq[rows])
+            count_given(plan.counters, kept.batch)
+            if len(rows):
+                yield kept
             if self._limit is not None and given >= self._limit:
                 break
-        if self._every > 1 or self._limit is not None:
-            plan.counters.messages = given
 
     def _filter(self, extra: Mapping[str, object]) -> dict[str, object]:
         parts = [dict(f) for f in (extra, *self._filters) if f]

@@ -172,7 +172,7 @@ class FloorPlan:
         dx, dy = np.cos(angle), np.sin(angle)
         best = np.full(len(x), _FAR)
         which = np.full(len(x), -1, np.int64)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for number, (x0, y0, x1, y1) in enumerate(self.segments):
                 if surfaces is not None and not surfaces[number]:
                     continue

@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -213,6 +214,7 @@ def run(
     if keep:
         _say(f"\nEverything is left in {directory}; ask more with --store {directory / STORE}\n")
         return 0
+    _await_mongod(directory / STORE)
     for path in made:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -221,6 +223,14 @@ def run(
     if fresh and not any(directory.iterdir()):
         directory.rmdir()
     return 0
+
+
+def _await_mongod(store: Path) -> None:
+    """The embedded mongod stays for some seconds after its last user, and writes."""
+    record = store / "mongod" / "mongod.json"
+    until = time.monotonic() + 60
+    while record.exists() and time.monotonic() < until:
+        time.sleep(0.1)
 
 
 def _take(step: Step, directory: Path) -> int:

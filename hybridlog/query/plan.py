@@ -55,6 +55,12 @@ class Counters:
     elapsed_s: float = 0.0
 
 
+def count_given(counters: Counters, batch: Batch) -> None:
+    """Messages were given out."""
+    counters.messages += len(batch)
+    counters.payload_bytes += batch.payload_bytes
+
+
 @dataclass(frozen=True, slots=True)
 class Lane:
     """One channel of one recording that a question is about.
@@ -176,7 +182,7 @@ class Sweep:
         self._reader_of = reader_of
 
     def pieces(self) -> Iterator[Piece]:
-        """All messages, in order."""
+        """All messages, in order; whoever gives them out counts them."""
         started = time.monotonic()
         plan = self._plan
         waiting: list[Piece] = []
@@ -187,8 +193,6 @@ class Sweep:
                 ready, waiting = self._split(waiting, following)
                 if ready:
                     whole = _in_order(ready, plan)
-                    plan.counters.messages += len(whole.batch)
-                    plan.counters.payload_bytes += whole.batch.payload_bytes
                     plan.counters.elapsed_s = time.monotonic() - started
                     yield whole
         finally:
@@ -199,8 +203,7 @@ class Sweep:
         plan = self._plan
         started = time.monotonic()
         for piece, _ in self._loaded():
-            plan.counters.messages += len(piece.batch)
-            plan.counters.payload_bytes += piece.batch.payload_bytes
+            count_given(plan.counters, piece.batch)
             if len(piece.batch):
                 yield piece
         plan.counters.elapsed_s = time.monotonic() - started

@@ -68,7 +68,7 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
     assert 0 < found["messages"] < len(read_bag(logs / "robot.bag"))
     assert (
         "robot is not complete"
-        in run("fetch", "-t", "imu/data", "-r", "robot", "--count", store=fresh).err
+        in run("fetch", "-t", "base/scan", "-r", "robot", "--count", store=fresh).err
     )
     assert "all is well" in run("verify", store=fresh).out
 
@@ -145,7 +145,7 @@ def server(
     )
     try:
         wait_for(lambda: socket.exists() or process.poll() is not None)
-        yield f"mongodb://{quote(str(socket), safe='')}/logs", process
+        yield f"mongodb://{quote(str(socket), safe='')}/logs?serverSelectionTimeoutMS=2000", process
     finally:
         process.kill()
         process.wait()
