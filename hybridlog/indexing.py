@@ -9,12 +9,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridlog.schema.codec import Codec, codec_for
-from hybridlog.schema.column import Records, Scalars
+from hybridlog.schema.column import header_stamps
 from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 ARRAY_LIMIT = 32
 STAMP = "header.stamp"
+_SENDERS = 2
+_PARCEL_BYTES = 4 << 20
+_PARCEL_CHUNKS = 32
 
 
 class Documents(NamedTuple):
@@ -36,13 +40,16 @@ class Documents(NamedTuple):
 
     Attributes:
         collection: Where they belong.
-        data: The documents, one after the other.
-        lengths: int64[n], bytes of each.
+        tables: uint8[k, width] each: a whole BSON document a row.
     """
 
     collection: str
-    data: bytes
-    lengths: NDArray[np.int64]
+    tables: list[NDArray[np.uint8]]
+
+    @property
+    def size(self) -> int:
+        """Bytes of all documents."""
+        return sum(table.size for table in self.tables)
 
 
 class ChunkIndexer:
@@ -72,18 +79,19 @@ class ChunkIndexer:
             codec, assembler, stamped = self._part(channel_id, channel)
             batch = chunk.batch.take(rows)
             unreadable = 0
-            pieces: list[bytes] = []
-            lengths: list[NDArray[np.int64]] = []
+            tables: list[NDArray[np.uint8]] = []
+            stamps = _Stamps()
             for group in codec.bodies(batch.buffer, batch.offset, batch.length):
+                if group.stamps is not None:
+                    stamps.add(batch.log_time[group.rows], group.stamps)
                 table = assembler.assemble(chunk, rows[group.rows], group.body, group.error)
-                pieces.append(table.tobytes())
-                lengths.append(np.full(len(table), table.shape[1], np.int64))
+                tables.append(table)
                 if group.error is not None:
                     unreadable += len(table)
-            documents.append(
-                Documents(collection_of(channel.topic), b"".join(pieces), np.concatenate(lengths))
-            )
-            stats[channel_id] = _stats(batch, channel, codec if stamped else None, unreadable)
+            if stamped and not stamps.any:
+                stamps.add_decoded(codec, batch)
+            documents.append(Documents(collection_of(channel.topic), tables))
+            stats[channel_id] = _stats(batch, channel, stamps, unreadable)
         entry = ChunkEntry(
             self._recording,
             chunk.segment,
@@ -111,11 +119,30 @@ class ChunkIndexer:
             return part
 
 
+@dataclass(slots=True)
+class _Parcel:
+    """What goes to the database in one go: documents of some chunks, and those chunks."""
+
+    documents: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
+    entries: list[ChunkEntry] = field(default_factory=list)
+    messages: int = 0
+    size: int = 0
+
+    def add(self, documents: list[Documents], entry: ChunkEntry, messages: int) -> None:
+        for part in documents:
+            self.documents.setdefault(part.collection, []).extend(part.tables)
+            self.size += part.size
+        self.entries.append(entry)
+        self.messages += messages
+
+
 class IndexWriter:
     """Sends chunks to the index in the background, so that recording need not wait.
 
-    A database that fails stops the index, never the recording: what was not indexed is
-    counted, and is made up for from the segments.
+    One thread makes documents, others send them; what is made while they are busy goes
+    in one parcel, so that a chunk of one image costs no round trip of its own. A database
+    that fails stops the index, never the recording: what was not indexed is counted, and
+    is made up for from the segments.
 
     Args:
         indexer: Makes the documents.
@@ -123,7 +150,7 @@ class IndexWriter:
         backlog: Most chunks waiting or under way before `submit` waits.
     """
 
-    def __init__(self, indexer: ChunkIndexer, database: Database, *, backlog: int = 6) -> None:
+    def __init__(self, indexer: ChunkIndexer, database: Database, *, backlog: int = 8) -> None:
         self.failure: DatabaseError | None = None
         self.indexed = 0
         """Messages whose index documents are in the database."""
@@ -136,7 +163,10 @@ class IndexWriter:
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(backlog)
-        self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-index")
+        self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
+        self._senders = ThreadPoolExecutor(_SENDERS, thread_name_prefix="hybridlog-send")
+        self._idle = threading.BoundedSemaphore(_SENDERS)
+        self._parcel = _Parcel()
         self._crash: BaseException | None = None
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
@@ -144,41 +174,63 @@ class IndexWriter:
         if self._crash is not None:
             raise self._crash
         self._room.acquire()
-        future = self._pool.submit(self._index, chunk, channels)
-        future.add_done_callback(self._done)
+        future = self._maker.submit(self._make, chunk, channels)
+        future.add_done_callback(self._made)
 
     def close(self) -> None:
         """Wait for all chunks; an error of our own (no database's) is raised here."""
-        self._pool.shutdown(wait=True)
+        if self._crash is None:
+            self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
+        self._maker.shutdown(wait=True)
+        self._senders.shutdown(wait=True)
         if self._crash is not None:
             raise self._crash
 
     def abandon(self) -> None:
         """Stop without indexing what still waits."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._maker.shutdown(wait=True, cancel_futures=True)
+        self._senders.shutdown(wait=True, cancel_futures=True)
 
-    def _index(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        count = len(chunk.batch)
+    def _make(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         if self.failure is not None:
             with self._lock:
-                self.missed += count
+                self.missed += len(chunk.batch)
             return
         documents, entry = self._indexer.documents_of(chunk, channels)
+        self._parcel.add(documents, entry, len(chunk.batch))
+        parcel = self._parcel
+        if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:
+            self._dispatch(wait=parcel.size >= _PARCEL_BYTES)
+
+    def _dispatch(self, *, wait: bool) -> None:
+        """Hand over what has been made, if a sender is free or has to be waited for."""
+        if self._parcel.entries and self._idle.acquire(blocking=wait):
+            parcel, self._parcel = self._parcel, _Parcel()
+            future = self._senders.submit(self._send, parcel)
+            future.add_done_callback(self._sent)
+
+    def _send(self, parcel: _Parcel) -> None:
         try:
-            for part in documents:
-                self._ensure(part.collection)
-                self._database.insert_raw(
-                    part.collection, part.data, len(part.lengths), lengths=part.lengths
-                )
-            self._catalog.put_chunk(entry)
+            if self.failure is None:
+                for collection, tables in parcel.documents.items():
+                    self._ensure(collection)
+                    lengths = [np.full(len(table), table.shape[1], np.int64) for table in tables]
+                    self._database.insert_raw(
+                        collection,
+                        b"".join(table.data for table in tables),
+                        sum(map(len, lengths)),
+                        lengths=np.concatenate(lengths),
+                    )
+                self._catalog.put_chunks(parcel.entries)
         except DatabaseError as error:
             with self._lock:
                 self.failure = self.failure or error
-                self.missed += count
-            return
         with self._lock:
-            self.indexed += count
-            self.entries.append(entry)
+            if self.failure is None:
+                self.indexed += parcel.messages
+                self.entries.extend(parcel.entries)
+            else:
+                self.missed += parcel.messages
 
     def _ensure(self, collection: str) -> None:
         with self._lock:
@@ -188,8 +240,15 @@ class IndexWriter:
         with self._lock:
             self._collections.add(collection)
 
-    def _done(self, future: Future[None]) -> None:
+    def _made(self, future: Future[None]) -> None:
         self._room.release()
+        self._done(future)
+
+    def _sent(self, future: Future[None]) -> None:
+        self._idle.release()
+        self._done(future)
+
+    def _done(self, future: Future[None]) -> None:
         if future.cancelled():
             return
         error = future.exception()
@@ -206,7 +265,44 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
         yield int(ids[start]), order[start:end]
 
 
-def _stats(batch: Batch, channel: Channel, stamped: Codec | None, unreadable: int) -> ChannelStats:
+class _Stamps:
+    """The header stamps of some messages, beside their log times."""
+
+    def __init__(self) -> None:
+        self._log_times: list[NDArray[np.int64]] = []
+        self._stamps: list[NDArray[np.int64]] = []
+
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self._stamps)
+
+    def add(self, log_time: NDArray[np.int64], stamps: NDArray[np.int64]) -> None:
+        if len(stamps):
+            self._log_times.append(log_time)
+            self._stamps.append(stamps)
+
+    def add_decoded(self, codec: Codec, batch: Batch) -> None:
+        """Read them from payloads whose index documents did not need them as numbers."""
+        decoded = codec.columns(batch.buffer, batch.offset, batch.length, {STAMP})
+        stamps = header_stamps(decoded.records)
+        if stamps is not None:
+            self.add(batch.log_time[decoded.rows], stamps)
+
+    def tell(self, stats: ChannelStats) -> None:
+        if not self.any:
+            return
+        stamps = np.concatenate(self._stamps)
+        skew = np.concatenate(self._log_times) - stamps
+        stats.stamped = len(stamps)
+        stats.first_stamp = int(stamps.min())
+        stats.last_stamp = int(stamps.max())
+        stats.skew_sum = float(skew.sum(dtype=np.float64))
+        stats.skew_min = int(skew.min())
+        stats.skew_max = int(skew.max())
+
+
+def _stats(batch: Batch, channel: Channel, stamps: _Stamps, unreadable: int) -> ChannelStats:
     first, last = int(batch.log_time.min()), int(batch.log_time.max())
     stats = ChannelStats(
         messages=len(batch),
@@ -219,22 +315,5 @@ def _stats(batch: Batch, channel: Channel, stamped: Codec | None, unreadable: in
     if channel.has_publish_time:
         stats.first_publish = int(batch.publish_time.min())
         stats.last_publish = int(batch.publish_time.max())
-    if stamped is not None:
-        decoded = stamped.columns(batch.buffer, batch.offset, batch.length, {STAMP})
-        stamps = header_stamps(decoded.records)
-        if stamps is not None and len(stamps):
-            skew = batch.log_time[decoded.rows] - stamps
-            stats.stamped = len(stamps)
-            stats.first_stamp = int(stamps.min())
-            stats.last_stamp = int(stamps.max())
-            stats.skew_sum = float(skew.sum(dtype=np.float64))
-            stats.skew_min = int(skew.min())
-            stats.skew_max = int(skew.max())
+    stamps.tell(stats)
     return stats
-
-
-def header_stamps(records: Records) -> NDArray[np.int64] | None:
-    """The header stamps of decoded messages, ns; None when they have no header."""
-    header = records.fields.get("header")
-    stamp = header.fields.get("stamp") if isinstance(header, Records) else None
-    return stamp.values if isinstance(stamp, Scalars) and stamp.kind == "time" else None

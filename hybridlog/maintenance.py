@@ -327,7 +327,9 @@ def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
     """Single documents; several channels of a chunk may share a topic."""
     found: dict[str, list[bytes]] = {}
     for part in documents:
-        found.setdefault(part.collection, []).extend(_split(part.data))
+        found.setdefault(part.collection, []).extend(
+            row.tobytes() for table in part.tables for row in table
+        )
     return found
 
 

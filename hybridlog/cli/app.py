@@ -171,7 +171,7 @@ def record(
     chunk_size: Annotated[
         str,
         typer.Option(help="Uncompressed size of a chunk, such as 512KiB.", metavar="SIZE"),
-    ] = "1MiB",
+    ] = "2MiB",
     compression: Annotated[
         Compression, typer.Option(help="Compression of chunks.")
     ] = Compression.ZSTD,

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from hybridlog.indexing import STAMP, header_stamps
+from hybridlog.indexing import STAMP
+from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segment_writer import StoredChunk

@@ -29,11 +29,14 @@ class BodyGroup(NamedTuple):
         rows: intp[k], rows of the input.
         body: uint8[k, width], BSON elements without the document's length and end.
         error: Why these payloads could not be read; the width is 0 then.
+        stamps: int64[k], header stamps, ns; None when there are none, or when they are
+            to be had from `Codec.columns` only.
     """
 
     rows: NDArray[np.intp]
     body: NDArray[np.uint8]
     error: str | None
+    stamps: NDArray[np.int64] | None = None
 
 
 class Codec(Protocol):

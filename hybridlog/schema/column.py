@@ -87,3 +87,10 @@ class Records:
 
 
 Column: TypeAlias = Scalars | Strings | Arrays | Records
+
+
+def header_stamps(records: Records) -> NDArray[np.int64] | None:
+    """The header stamps of decoded messages, ns; None when they have no header."""
+    header = records.fields.get("header")
+    stamp = header.fields.get("stamp") if isinstance(header, Records) else None
+    return stamp.values if isinstance(stamp, Scalars) and stamp.kind == "time" else None

@@ -12,6 +12,7 @@ import bson
 import numpy as np
 
 from hybridlog.schema.codec import BodyGroup, error_group
+from hybridlog.schema.column import header_stamps
 from hybridlog.schema.definition import (
     ArrayOf,
     FieldPath,
@@ -78,13 +79,15 @@ class RosCodec:
     ) -> Iterator[BodyGroup]:
         """Index bodies; see `Codec.bodies`."""
         decoded = self._reader.read(buffer, offset, length)
+        stamps = header_stamps(decoded.records)
         for group in bodies(decoded.records, array_limit=self._limit, max_bytes=_MAX_BYTES):
             rows = decoded.rows[group.rows]
             if isinstance(group, TooLarge):
                 text = f"the fields of {self._name} take more than {_MAX_BYTES >> 20} MiB"
                 yield error_group(rows, text)
             else:
-                yield BodyGroup(rows, group.body, None)
+                own = None if stamps is None else stamps[group.rows]
+                yield BodyGroup(rows, group.body, None, own)
         for bad in decoded.unreadable:
             text = f"the payload does not fit {self._name}: {bad.reason}"
             yield error_group(bad.rows, text)

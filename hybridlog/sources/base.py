@@ -163,7 +163,7 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
         if held and (size + len(batch.buffer) > BATCH_BYTES or rows + len(batch) > BATCH_MESSAGES):
             yield join(held)
             held, size, rows = [], 0, 0
-        if len(batch.buffer) * 2 > BATCH_BYTES or len(batch) * 2 > BATCH_MESSAGES:
+        if len(batch.buffer) * 8 > BATCH_BYTES or len(batch) * 2 > BATCH_MESSAGES:
             if held:
                 yield join(held)
                 held, size, rows = [], 0, 0

@@ -182,22 +182,23 @@ class Catalog:
             for d in self._db.find(SCHEMAS, {"_id": {"$in": list(hashes)}})
         }
 
-    def put_chunk(self, chunk: ChunkEntry) -> None:
-        """Note that a chunk is in its segment and its messages are in the index."""
-        key = {"rec": chunk.recording, "seg": chunk.segment, "off": chunk.offset}
-        self._db.replace(
+    def put_chunks(self, chunks: Sequence[ChunkEntry]) -> None:
+        """Note that chunks are in their segment and their messages are in the index."""
+        self._db.replace_all(
             CHUNKS,
-            {"_id": key},
-            {
-                "_id": key,
-                "rec": chunk.recording,
-                "seg": chunk.segment,
-                "len": chunk.length,
-                "trailer": chunk.trailer,
-                "first": chunk.first,
-                "last": chunk.last,
-                "ch": [{"c": c, **asdict(stats)} for c, stats in sorted(chunk.stats.items())],
-            },
+            [
+                {
+                    "_id": {"rec": chunk.recording, "seg": chunk.segment, "off": chunk.offset},
+                    "rec": chunk.recording,
+                    "seg": chunk.segment,
+                    "len": chunk.length,
+                    "trailer": chunk.trailer,
+                    "first": chunk.first,
+                    "last": chunk.last,
+                    "ch": [{"c": c, **asdict(stats)} for c, stats in sorted(chunk.stats.items())],
+                }
+                for chunk in chunks
+            ],
         )
 
     def chunks(

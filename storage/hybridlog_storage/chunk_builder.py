@@ -84,8 +84,12 @@ class ChunkBuilder:
         return whole, np.concatenate([seq for _, seq in pieces]), used
 
     def _grow(self, size: int) -> None:
-        if size > len(self._buffer):
-            self._buffer.extend(bytes(max(size, min(2 * size, 1 << 20)) - len(self._buffer)))
+        if size <= len(self._buffer):
+            return
+        # Fresh memory from the system is zero already, and only what is used is touched.
+        larger = bytearray(max(size, min(2 * size, 1 << 20)))
+        larger[: self._used] = memoryview(self._buffer)[: self._used]
+        self._buffer = larger
 
     def _lay_heads(self, batch: Batch, starts: NDArray[np.int64]) -> None:
         heads = np.empty(len(batch), MESSAGE_HEAD)

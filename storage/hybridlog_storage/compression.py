@@ -224,11 +224,10 @@ class Compressor:
             return True
         view = memoryview(data)
         step = (len(data) - self._sample_size) // (self._samples - 1) if self._samples > 1 else 0
-        packed = 0
-        for i in range(self._samples):
-            start = i * step
-            packed += len(self._pack(view[start : start + self._sample_size], 1))
-        return packed <= tried * self._keep_above
+        sample = b"".join(
+            view[i * step : i * step + self._sample_size] for i in range(self._samples)
+        )
+        return len(self._pack(sample, 1)) <= len(sample) * self._keep_above
 
     def _pack(self, data: Buffer, level: int) -> bytes:
         if self.name == "lz4":

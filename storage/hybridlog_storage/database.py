@@ -388,6 +388,17 @@ class Database:
         with _mapped(self._address):
             self._collection(collection).replace_one(dict(filter), dict(document), upsert=upsert)
 
+    def replace_all(self, collection: str, documents: Sequence[Mapping[str, object]]) -> None:
+        """Put each document in the place of the one with its `_id`, or insert it."""
+        from pymongo import ReplaceOne
+
+        if documents:
+            with _mapped(self._address):
+                self._collection(collection).bulk_write(
+                    [ReplaceOne({"_id": d["_id"]}, dict(d), upsert=True) for d in documents],
+                    ordered=False,
+                )
+
     def update(
         self,
         collection: str,

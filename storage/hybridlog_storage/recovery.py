@@ -164,8 +164,11 @@ class _Rebuilder:
     def _note(self, pending: _Pending) -> None:
         chunk = pending.scanned
         self.messages += len(pending.batch)
+        log_time = pending.batch.log_time
+        ids, counts = np.unique(pending.batch.channel, return_counts=True)
         self.segment.note_chunk(
-            pending.batch,
+            (int(log_time.min()), int(log_time.max())),
+            dict(zip(ids.tolist(), counts.tolist(), strict=True)),
             offset=chunk.offset,
             length=chunk.length,
             indexes=pending.indexes,

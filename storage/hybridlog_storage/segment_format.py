@@ -163,6 +163,11 @@ def message_indexes(
     return records
 
 
+def entries_of(index: bytes) -> int:
+    """Number of messages that a message index record lists."""
+    return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
+
+
 def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
     """Arrival numbers of a chunk's messages, in chunk order, with a checksum."""
     compressor = getattr(_per_thread, "compressor", None)

@@ -51,6 +51,7 @@ from hybridlog_storage.segment_format import (
     arrival_record,
     channel_record,
     chunk_head,
+    entries_of,
     json_metadata,
     message_indexes,
     pack_arrivals,
@@ -65,6 +66,7 @@ OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
 _MAX_CHANNELS = 65535
 _SHARED = -1
+_SYNC_STRIDE = 32 << 20  # bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +84,7 @@ class SegmentSettings:
             or never (the operating system decides).
     """
 
-    chunk_size: int = 1 << 20
+    chunk_size: int = 2 << 20
     chunk_span_ns: int = 200_000_000
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
@@ -228,7 +230,8 @@ class SegmentFile:
         trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
         self._write([head, chunk.data, *chunk.indexes.values(), arrivals])
         self.note_chunk(
-            chunk.batch,
+            (chunk.first, chunk.last),
+            {channel: entries_of(data) for channel, data in chunk.indexes.items()},
             offset=offset,
             length=length,
             indexes={channel: len(data) for channel, data in chunk.indexes.items()},
@@ -246,7 +249,8 @@ class SegmentFile:
 
     def note_chunk(
         self,
-        batch: Batch,
+        span: tuple[int, int],
+        counts: Mapping[int, int],
         *,
         offset: int,
         length: int,
@@ -255,13 +259,24 @@ class SegmentFile:
         compressed_size: int,
         uncompressed_size: int,
     ) -> None:
-        """List a chunk that is in the file; `indexes` has the bytes of each index record."""
+        """List a chunk that is in the file.
+
+        Args:
+            span: Log time of its first and its last message, ns.
+            counts: Messages of each channel.
+            offset: Byte at which it starts.
+            length: Bytes of the chunk record.
+            indexes: Bytes of each channel's message index record.
+            compression: MCAP name of the codec.
+            compressed_size: Bytes of compressed content.
+            uncompressed_size: Bytes of content.
+        """
         offsets: dict[int, int] = {}
         at = offset + length
         for channel, size in indexes.items():
             offsets[channel] = at
             at += size
-        first, last = int(batch.log_time.min()), int(batch.log_time.max())
+        first, last = span
         self._chunk_indexes.append(
             ChunkIndex(
                 chunk_length=length,
@@ -275,8 +290,7 @@ class SegmentFile:
                 uncompressed_size=uncompressed_size,
             )
         )
-        ids, counts = np.unique(batch.channel, return_counts=True)
-        for channel, count in zip(ids.tolist(), counts.tolist(), strict=True):
+        for channel, count in counts.items():
             self._counts[channel] = self._counts.get(channel, 0) + count
         self._first = first if self._first is None else min(self._first, first)
         self._last = max(self._last, last)
@@ -459,6 +473,8 @@ class RecordingWriter:
         self._segment: SegmentFile | None = None
         self._number = 0
         self._closed: list[Path] = []
+        self._synced = 0
+        self._syncing: Future[None] | None = None
 
     def append(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Take a batch; `batch.channel` indexes `channels`.
@@ -470,28 +486,27 @@ class RecordingWriter:
             return
         seq = np.arange(self._next_seq, self._next_seq + len(batch), dtype=np.int64)
         self._next_seq += len(batch)
-        present, inverse = np.unique(batch.channel, return_inverse=True)
-        known = [
-            self._channel(channels[index], batch, inverse == row)
-            for row, index in enumerate(present.tolist())
-        ]
-        ids = np.array([k.channel_id for k in known], np.int32)[inverse]
-        cluster = np.array([k.cluster for k in known], np.int64)[inverse]
+        present = np.flatnonzero(np.bincount(batch.channel)).tolist()
+        ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
+        for index in present:
+            known = self._channel(channels[index], batch, index)
+            ids[index], cluster[index] = known.channel_id, known.cluster
         own = Batch(
             batch.buffer,
             batch.offset,
             batch.length,
-            ids,
+            ids[batch.channel],
             batch.log_time,
             batch.publish_time,
             batch.sequence,
         )
-        clusters = np.unique(cluster).tolist()
-        for key in clusters:
-            if len(clusters) == 1:
-                self._fill(key, own, seq)
-            else:
-                rows = np.flatnonzero(cluster == key)
+        clusters = sorted({int(cluster[index]) for index in present})
+        if len(clusters) == 1:
+            self._fill(clusters[0], own, seq)
+        else:
+            cluster_of = cluster[batch.channel]
+            for key in clusters:
+                rows = np.flatnonzero(cluster_of == key)
                 self._fill(key, own.take(rows), seq[rows])
         self.totals.messages += len(batch)
         self.totals.payload_bytes += batch.payload_bytes
@@ -534,7 +549,7 @@ class RecordingWriter:
             self._segment.abandon()
             self._segment = None
 
-    def _channel(self, channel: Channel, batch: Batch, rows: NDArray[np.bool_]) -> _Known:
+    def _channel(self, channel: Channel, batch: Batch, index: int) -> _Known:
         known = self._known.get(channel)
         if known is None:
             if len(self._known) >= _MAX_CHANNELS:
@@ -543,7 +558,7 @@ class RecordingWriter:
             if channel.schema is not None:
                 schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
             channel_id = len(self._known) + 1
-            mean = float(batch.length[rows].mean())
+            mean = float(batch.length[batch.channel == index].mean())
             cluster = channel_id if mean >= self.settings.large_payload else _SHARED
             known = self._known[channel] = _Known(channel_id, schema_id, cluster)
             self.channels[channel_id] = channel
@@ -596,11 +611,26 @@ class RecordingWriter:
         stored = segment.append_chunk(chunk)
         if self.settings.sync == "chunk":
             segment.sync()
+        elif self.settings.sync == "seal":
+            self._sync_behind(segment)
         self.totals.chunks += 1
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         if segment.position >= self.settings.segment_size:
             self._seal()
+
+    def _sync_behind(self, segment: SegmentFile) -> None:
+        """Force long segments to the disk as they grow, so that sealing them takes no time."""
+        if segment.position - self._synced >= _SYNC_STRIDE and self._syncing is None:
+            self._synced = segment.position
+            self._syncing = self._pool.submit(segment.sync)
+        elif self._syncing is not None and self._syncing.done():
+            self._finish_sync()
+
+    def _finish_sync(self) -> None:
+        syncing, self._syncing = self._syncing, None
+        if syncing is not None:
+            syncing.result()
 
     def _open_segment(self) -> SegmentFile:
         if self._segment is None:
@@ -612,6 +642,8 @@ class RecordingWriter:
 
     def _seal(self) -> None:
         segment = self._open_segment()
+        self._finish_sync()
+        self._synced = 0
         self._closed.append(segment.seal(sync=self.settings.sync != "never"))
         self.totals.stored_bytes += segment.position
         self.totals.segments += 1

@@ -86,10 +86,10 @@ def places(chunks: Sequence[ChunkEntry]) -> set[tuple[int, int]]:
 def test_chunks_come_back(catalog: Catalog) -> None:
     written = entries(40)
     for entry in written:
-        catalog.put_chunk(entry)
+        catalog.put_chunks([entry])
     found = [c for r in ("run-0", "run-1") for c in catalog.chunks(r)]
     assert sorted(found, key=lambda c: c.offset) == written
-    catalog.put_chunk(replace(written[0], length=5))
+    catalog.put_chunks([replace(written[0], length=5)])
     again = {c.offset: c for c in catalog.chunks("run-0")}
     assert again[0].length == 5
     assert len(again) == 20
@@ -99,7 +99,7 @@ def test_chunks_come_back(catalog: Catalog) -> None:
 def test_chunks_of_a_time_range(catalog: Catalog, clock: str) -> None:
     written = entries(60)
     for entry in written:
-        catalog.put_chunk(entry)
+        catalog.put_chunks([entry])
     mine = [c for c in written if c.recording == "run-1"]
     suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
     rng = random.Random(2)
@@ -185,7 +185,7 @@ def test_a_recording_is_removed_without_a_trace(catalog: Catalog, database: Data
     for name in ("r", "r2"):
         catalog.put_recording(recording(name, 1))
         catalog.put_losses(name, [{"cause": "a"}])
-        catalog.put_chunk(replace(entries(1)[0], recording=name))
+        catalog.put_chunks([replace(entries(1)[0], recording=name)])
         database.ensure_collection("topic")
         document = {"_id": name.encode(), "_meta": {"rec": name}}
         database.replace("topic", {"_id": name.encode()}, document)
