@@ -18,10 +18,15 @@ _HEAD = MESSAGE_HEAD.itemsize
 
 
 class ChunkBuilder:
-    """Collects messages until its owner takes them as one chunk."""
+    """Collects messages until its owner takes them as one chunk.
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
+    Args:
+        capacity: Bytes at which its owner takes them, about.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._buffer = np.empty(0, np.uint8)
         self._used = 0
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self.first_log_time = 0
@@ -44,12 +49,12 @@ class ChunkBuilder:
         starts = ends - batch.length - _HEAD
         self._grow(int(ends[-1]))
         self._lay_heads(batch, starts)
-        copy_payloads(batch, self._buffer, starts + _HEAD)
+        copy_payloads(batch, self._buffer.data, starts + _HEAD)
         self._used = int(ends[-1])
         self._pieces.append(
             (
                 Batch(
-                    self._buffer,
+                    self._buffer.data,
                     starts + _HEAD,
                     batch.length,
                     batch.channel,
@@ -69,9 +74,9 @@ class ChunkBuilder:
             the content's size in bytes (the batch's buffer may be longer).
         """
         buffer, used, pieces = self._buffer, self._used, self._pieces
-        self._buffer, self._used, self._pieces = bytearray(), 0, []
+        self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]
-        content = memoryview(buffer)[:used]
+        content = memoryview(buffer.data)[:used]
         whole = Batch(
             content,
             np.concatenate([b.offset for b in batches]),
@@ -86,9 +91,11 @@ class ChunkBuilder:
     def _grow(self, size: int) -> None:
         if size <= len(self._buffer):
             return
-        # Fresh memory from the system is zero already, and only what is used is touched.
-        larger = bytearray(max(size, min(2 * size, 1 << 20)))
-        larger[: self._used] = memoryview(self._buffer)[: self._used]
+        # Memory that is not used is not touched either, so where payloads are large there
+        # is room for the whole chunk at once, and nothing is copied twice.
+        large = size * 8 > self._capacity
+        larger = np.empty(max(size, self._capacity if large else 2 * size), np.uint8)
+        larger[: self._used] = self._buffer[: self._used]
         self._buffer = larger
 
     def _lay_heads(self, batch: Batch, starts: NDArray[np.int64]) -> None:
@@ -99,4 +106,4 @@ class ChunkBuilder:
         heads["sequence"] = batch.sequence
         heads["log_time"] = batch.log_time
         heads["publish_time"] = batch.publish_time
-        windows(self._buffer, _HEAD)[starts] = heads.view(f"V{_HEAD}")
+        windows(self._buffer.data, _HEAD)[starts] = heads.view(f"V{_HEAD}")

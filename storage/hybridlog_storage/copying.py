@@ -22,7 +22,7 @@ def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
     )
 
 
-def copy_payloads(batch: Batch, target: bytearray, starts: NDArray[np.int64]) -> None:
+def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[np.int64]) -> None:
     """Copy each payload of a batch to its place in a buffer that is large enough."""
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
         source = memoryview(batch.buffer)

@@ -566,7 +566,9 @@ class RecordingWriter:
 
     def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
         """Lay messages into a cluster's chunk, closing chunks at their bounds."""
-        builder = self._clusters.setdefault(key, ChunkBuilder())
+        builder = self._clusters.get(key)
+        if builder is None:
+            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
         start, total = 0, len(batch)
         while start < total:
