@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog import maintenance
+from hybridlog.query.chunk_lists import ChunkLists
 from hybridlog.query.topics import resolve
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
@@ -111,6 +112,7 @@ class Store:
         self._recordings: list[RecordingEntry] | None = None
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
+        self._chunk_lists = ChunkLists()
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -199,6 +201,7 @@ class Store:
         """Forget what was read of the catalog."""
         self._recordings = None
         self._lanes.clear()
+        self._chunk_lists.clear()
 
     def select(self, names: Sequence[str]) -> list[RecordingEntry]:
         """Recordings by id, by name, or by the beginning of an id when it is unambiguous.
@@ -300,13 +303,17 @@ class Store:
         clock: str,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range."""
-        longest = None
-        if recording.status != "open":
-            wanted = set(channels)
-            longest = max(
-                (c.stats.longest for c in recording.channels if c.id in wanted), default=0
-            )
-        return self.catalog.chunks(recording.id, channels, bounds, clock, longest)
+        if recording.status == "open":
+            return self.catalog.chunks(recording.id, channels, bounds, clock)
+        wanted = set(channels)
+        longest = max((c.stats.longest for c in recording.channels if c.id in wanted), default=0)
+
+        def fetch(within: tuple[int, int] | None) -> list[ChunkEntry]:
+            return self.catalog.chunks(recording.id, channels, within, clock, longest)
+
+        if bounds is None or clock != "log":
+            return fetch(bounds)
+        return self._chunk_lists.find(recording.id, channels, bounds, fetch)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a sealed segment, kept open. Thread safe."""

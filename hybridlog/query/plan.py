@@ -356,6 +356,8 @@ def _rows(piece: Piece, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Piece:
 
 def _in_order(pieces: list[Piece], plan: Plan) -> Piece:
     """Put pieces into one, sorted by log time, recording and arrival."""
+    if len(pieces) == 1 and not plan.reverse and _is_in_order(pieces[0]):
+        return pieces[0]
     keys = np.array([lane.recording.key for lane in plan.lanes], np.int64)
     times = np.concatenate([p.batch.log_time for p in pieces])
     lanes = np.concatenate([p.batch.channel for p in pieces])
@@ -366,6 +368,11 @@ def _in_order(pieces: list[Piece], plan: Plan) -> Piece:
     if len(pieces) == 1:
         return _rows(pieces[0], order)
     return Piece(interleave([p.batch for p in pieces], order), seq[order])
+
+
+def _is_in_order(piece: Piece) -> bool:
+    """Whether a piece of one chunk is sorted; its log times alone can tell mostly."""
+    return bool((piece.batch.log_time[1:] > piece.batch.log_time[:-1]).all())
 
 
 def _groups(tasks: list[Task], most: int = 50_000) -> Iterator[list[Task]]:

@@ -23,6 +23,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
+from hybridlog_storage.compression import decompress
 from hybridlog_storage.copying import windows
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
@@ -192,15 +193,11 @@ def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
     if len(body) < 8 or count > _MAX_ARRIVALS:
         raise SegmentError("the record of arrival numbers is damaged")
     try:
-        raw = zstandard.ZstdDecompressor().decompress(
-            memoryview(body)[8:], max_output_size=count * 8
-        )
-    except zstandard.ZstdError as error:
+        raw = decompress("zstd", memoryview(body)[8:], count * 8)
+    except SegmentError as error:
         raise SegmentError(f"the record of arrival numbers is damaged: {error}") from error
-    if len(raw) != count * 8:
-        raise SegmentError(f"arrival numbers of {len(raw) // 8} messages, {count} expected")
     (chunk_offset,) = struct.unpack_from("<Q", body)
-    return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8")).astype(np.int64)
+    return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8"), dtype=np.int64)
 
 
 def message_starts(trailer: Buffer) -> NDArray[np.int64]:
