@@ -23,6 +23,8 @@ _LONG_BLOCK = 1 << 16
 # Rows of equal length are copied together when that pays for finding them.
 _MAX_GROUPS = 32
 _ROWS_A_GROUP = 16
+# From here on it pays to look whether rows are equally far apart.
+_EVEN_ROWS = 16
 
 
 class Source:
@@ -38,11 +40,23 @@ class Source:
         self.buffer = memoryview(buffer).cast("B")
         self.order = order
         self._length = len(self.buffer)
+        self._base: NDArray[np.int64] | None = None
+        self._stride = 0
 
     def _gather(
         self, dtype: str | np.dtype[np.generic], size: int, base: NDArray[np.int64], delta: int
     ) -> NDArray[np.generic]:
-        view: NDArray[np.generic] = np.ndarray(
+        if base is not self._base:
+            # Many gathers follow from one base: whether it is even is looked up once.
+            self._base, self._stride = base, _even_stride(base)
+        view: NDArray[np.generic]
+        if self._stride:
+            start = int(base[0]) + delta
+            view = np.ndarray(
+                base.shape, dtype, buffer=self.buffer, offset=start, strides=(self._stride,)
+            )
+            return view.copy()
+        view = np.ndarray(
             (self._length - delta - size + 1,),
             dtype,
             buffer=self.buffer,
@@ -222,3 +236,11 @@ def concatenate(first: _AnyColumn, second: _AnyColumn) -> _AnyColumn:
 
 def _join_offsets(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([first, second[1:] + first[-1]])
+
+
+def _even_stride(base: NDArray[np.int64]) -> int:
+    """The distance of offsets that are all equally far apart, 0 for others."""
+    if len(base) < _EVEN_ROWS:
+        return 0
+    stride = int(base[1] - base[0])
+    return stride if stride > 0 and bool((base[1:] - base[:-1] == stride).all()) else 0
