@@ -11,8 +11,7 @@ import numpy as np
 from hybridlog.frames import TableBuilder
 from hybridlog.indexing import rows_by_channel
 from hybridlog.query.plan import Lane, Piece, Plan, Sweep
-from hybridlog.schema.column import Records, Strings
-from hybridlog.schema.document import take
+from hybridlog.schema.column import Records, Strings, take
 from hybridlog_storage.errors import DefinitionError, UsageError
 from hybridlog_storage.messages import Batch
 

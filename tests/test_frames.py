@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hybridlog.frames import TableBuilder
 from hybridlog.frames import arrow as arrow_module
 from hybridlog.frames.array_column import ArrayColumn, ArrayDtype
-from hybridlog.frames.bson import index_columns, records_from_bson, reference_columns
+from hybridlog.frames.bson import records_from_bson, reference_columns
 from hybridlog.frames.ragged import Ragged, RaggedBuilder
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 from hybridlog_storage.errors import StoreError
@@ -670,26 +670,6 @@ def test_meta_and_id_on_request() -> None:
     assert list(part.records.fields) == ["_id", "a", "_meta"]
     (part,) = records_from_bson(document(4, a=1), {})
     assert list(part.records.fields) == ["a"]
-
-
-def test_index_columns_leave_out_unreadable_messages() -> None:
-    types = {"a.b": "float32", "s": "string"}
-    batch = b"".join(
-        document(n, **({"a": {"b": float(n)}, "s": "x" * (n % 3)} if n % 4 else {}))
-        for n in range(40)
-    )
-    reference, records = index_columns(batch, types)
-    kept = [n for n in range(40) if n % 4]
-    assert reference.seq.tolist() == kept
-    assert records.rows == len(kept)
-    inner = records.fields["a"]
-    assert isinstance(inner, Records)
-    assert inner.fields["b"].values.tolist() == kept  # type: ignore[union-attr]
-    assert inner.fields["b"].values.dtype == np.float32  # type: ignore[union-attr]
-    for nothing in (b"", document(0)):
-        reference, records = index_columns(nothing, types)
-        assert len(reference) == len(records) == 0
-        assert isinstance(records.fields["s"], Strings)
 
 
 def test_dates_are_times() -> None:

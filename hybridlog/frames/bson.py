@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 
-from hybridlog.frames.ragged import Ragged
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
 from hybridlog_storage.bson_columns import BsonStringArrays, BsonStrings, read_columns
 from hybridlog_storage.errors import StoreError
 
@@ -167,48 +166,6 @@ def records_from_bson(
         for rows, columns in _joined(members):
             parts.append(BsonPart(rows, references.take(rows), _nested(columns, len(rows))))
     return tuple(sorted(parts, key=lambda part: int(part.rows[0])))
-
-
-def index_columns(batch: bytes, types: Mapping[str, WireType]) -> tuple[ReferenceColumns, Records]:
-    """Certain fields of the index documents of a batch, in document order.
-
-    Documents that lack one of the fields are left out: those are of messages whose
-    payload could not be read.
-
-    Args:
-        batch: Documents one after the other, projected to these fields and to
-            `_meta.t` and `_meta.seq`.
-        types: Wire type by dotted path.
-
-    Raises:
-        StoreError: A document is malformed, or the values of a field are of kinds that
-            make no column.
-    """
-    members = []
-    pieces = _pieces(read_columns(batch))
-    for piece in pieces:
-        if all(piece.columns.get(path) is not None for path in types):
-            columns = {path: _column(piece.columns[path], types[path]) for path in types}
-            members.append((piece.rows, columns))
-    references = _references(pieces)
-    if not members:
-        nothing = {path: _empty(wanted) for path, wanted in types.items()}
-        return references.take(np.empty(0, np.intp)), _nested(nothing, 0)
-    joined = _joined(members)
-    if len(joined) > 1:
-        raise StoreError(
-            "the index documents of one topic hold values of different kinds in one of "
-            f"{', '.join(types)}; rebuild the index with `hybridlog reindex`"
-        )
-    rows, columns = joined[0]
-    return references.take(rows), _nested(columns, len(rows))
-
-
-def _empty(wanted: WireType) -> Column:
-    if wanted == "string":
-        return Strings(np.empty(0, np.uint8), np.zeros(1, np.int64))
-    dtype = _dtype(wanted)
-    return _typed(np.empty(0, np.int64 if dtype is None else dtype), wanted)
 
 
 def _dtype(wanted: WireType) -> np.dtype[Any] | None:
@@ -381,7 +338,7 @@ def _joined(
         rows = np.concatenate([rows for rows, _ in alike])
         order = np.argsort(rows)
         columns = {
-            path: _take(_concatenated([each[path] for _, each in alike]), order) for path in paths
+            path: take(_concatenated([each[path] for _, each in alike]), order) for path in paths
         }
         joined.append((rows[order], columns))
     return joined
@@ -416,20 +373,6 @@ def _concatenated(columns: Sequence[Any]) -> Column:
             np.concatenate([c.data[int(c.offset[0]) : int(c.offset[-1])] for c in columns]), offset
         )
     return Arrays(_concatenated([column.values for column in columns]), offset)
-
-
-def _take(column: Column, order: NDArray[np.intp]) -> Column:
-    """A column in another order."""
-    if isinstance(column, Scalars):
-        return Scalars(column.values[order], column.kind)
-    if isinstance(column, Records):
-        return Records({n: _take(c, order) for n, c in column.fields.items()}, len(order))
-    if isinstance(column, Strings):
-        data, offset = Ragged.from_offsets(column.data, column.offset).take(order).compact()
-        return Strings(data, offset)
-    numbers = np.arange(len(column.values), dtype=np.intp)
-    places, offset = Ragged.from_offsets(numbers, column.offset).take(order).compact()
-    return Arrays(_take(column.values, places), offset)
 
 
 def _nested(columns: Mapping[str, Column], rows: int) -> Records:

@@ -13,11 +13,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog.schema.column import LONG, Arrays, Records, Scalars, Strings, offsets, ranges, take
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
@@ -30,16 +30,11 @@ _DOUBLE, _STRING, _DOCUMENT, _ARRAY, _BOOL, _NULL, _INT32, _INT64 = 1, 2, 3, 4, 
 _SLAB = 32 << 20
 """Bytes of bodies made at once."""
 
-_LONG = 64
-"""Mean elements a row from which rows are copied one by one."""
-
 _UNROLL = 16
 """Rows for each element of a list that is written with operations of its own."""
 
 
 _RESERVED = ("_id", "_meta")
-
-_T = TypeVar("_T", bound=np.generic)
 
 
 class Bodies(NamedTuple):
@@ -126,52 +121,6 @@ def top_level_names(names: Iterable[str]) -> list[str]:
     return spelled
 
 
-# --- rows of columns ------------------------------------------------------------------
-
-
-def take(column: Records, rows: NDArray[np.intp]) -> Records:
-    """The chosen rows of a record column, in that order."""
-    return Records({name: _take(c, rows) for name, c in column.fields.items()}, len(rows))
-
-
-def _take(column: Column, rows: NDArray[np.intp]) -> Column:
-    if isinstance(column, Scalars):
-        return Scalars(column.values[rows], column.kind)
-    if isinstance(column, Records):
-        return take(column, rows)
-    counts = np.diff(column.offset)[rows]
-    start, offset = column.offset[:-1][rows], _offsets(counts)
-    if isinstance(column, Strings):
-        return Strings(_pick(column.data, start, counts), offset)
-    values = column.values
-    if isinstance(values, Scalars):
-        picked = Scalars(_pick(values.values, start, counts), values.kind)
-        return Arrays(picked, offset, column.width)
-    return Arrays(_take(values, _ranges(start, counts)), offset, column.width)
-
-
-def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
-    """`data[start[i]:start[i] + count[i]]` of all i, one after the other."""
-    if int(count.sum()) <= _LONG * len(count):
-        return data[_ranges(start, count)]
-    # An index of eight bytes an element would be larger than what it picks.
-    ends = (start + count).tolist()
-    return np.concatenate([data[a:b] for a, b in zip(start.tolist(), ends, strict=True)])
-
-
-def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.intp]:
-    """All of `start[i]`, `start[i] + 1`, ... `start[i] + count[i] - 1`, one after the other."""
-    done = np.cumsum(count) - count
-    total = int(count.sum())
-    return (np.repeat(start - done, count) + np.arange(total)).astype(np.intp, copy=False)
-
-
-def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    offset = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=offset[1:])
-    return offset
-
-
 def _spread(value: _Each, rows: int) -> NDArray[np.int64]:
     """One number a row, whether it is the same for all or not."""
     if isinstance(value, int):
@@ -254,11 +203,11 @@ class _List:
         if self.count is not None and isinstance(self.child.width, int):
             self.width = 5 + self.count * (2 + self.child.width) + _digits_before(self.count)
         else:
-            self.width = 5 + np.diff(_offsets(self.element_widths())[_offsets(self.counts)])
+            self.width = 5 + np.diff(offsets(self.element_widths())[offsets(self.counts)])
 
     def index(self) -> NDArray[np.int64]:
         """Position of each element in its row."""
-        return _ranges(np.zeros_like(self.counts), self.counts)
+        return ranges(np.zeros_like(self.counts), self.counts)
 
     def element_widths(self) -> NDArray[np.int64]:
         """Bytes of each element with its type, key and NUL."""
@@ -368,7 +317,7 @@ def _text(column: Strings) -> _Text:
     raw = data.tobytes()
     # Whether a string is valid must not depend on its neighbours, so each string that
     # is not plain ASCII is checked on its own.
-    high = _offsets((data >= 0x80).astype(np.int64))
+    high = offsets((data >= 0x80).astype(np.int64))
     odd = np.flatnonzero(high[start + length] > high[start])
     mended: dict[int, bytes] = {}
     for row in odd.tolist():
@@ -402,10 +351,10 @@ def _array(column: Arrays, limit: int) -> _Node:
     if not short.any():
         return _summary(column, counts)
     some = np.flatnonzero(short)
-    part = _take(column, some)
+    part = take(column, some)
     assert isinstance(part, Arrays)
     lists = _List(_node(part.values, limit), counts[short])
-    part = _take(column, np.flatnonzero(~short))
+    part = take(column, np.flatnonzero(~short))
     assert isinstance(part, Arrays)
     return _Either(short, lists, _summary(part, counts[~short]))
 
@@ -607,8 +556,8 @@ def _put(node: _Node, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
 
 
 def _put_text(node: _Text, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
-    if int(node.length.sum()) <= _LONG * len(at):
-        out[_ranges(at, node.length)] = node.data[_ranges(node.start, node.length)]
+    if int(node.length.sum()) <= LONG * len(at):
+        out[ranges(at, node.length)] = node.data[ranges(node.start, node.length)]
         return
     places = zip(at.tolist(), node.start.tolist(), node.length.tolist(), strict=True)
     for to, begin, length in places:
@@ -619,8 +568,8 @@ def _put_elements(node: _List, out: NDArray[np.uint8], at: NDArray[np.int64]) ->
     index = node.index()
     if len(index) == 0:
         return
-    begin = _offsets(node.element_widths())
-    first = _offsets(node.counts)[:-1]
+    begin = offsets(node.element_widths())
+    first = offsets(node.counts)[:-1]
     places = begin[:-1] + np.repeat(at - begin[first], node.counts)
     digits = _digits(index)
     tags = node.child.tag

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hybridlog.schema.column import Records
-from hybridlog.schema.wire_gather import Source, concatenate, take
+from hybridlog.schema.column import Records, take
+from hybridlog.schema.wire_gather import Source, concatenate
 from hybridlog.schema.wire_program import Wire, compile_type
 from hybridlog.schema.wire_scan import MisfitError, Scanner
 from hybridlog.schema.wire_walk import Walker

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.column import AnyColumn, Arrays, Column, Records, Scalars, Strings
 from hybridlog.schema.definition import Instant, Primitive
 
 if TYPE_CHECKING:
@@ -175,13 +175,6 @@ def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
     return np.arange(rows + 1, dtype=np.int64) * width
 
 
-def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Offsets of rows of so many elements each: int64[n + 1], starting with 0."""
-    result = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=result[1:])
-    return result
-
-
 def within(counts: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of each element within its row: 0, 1, ..., counts[0] - 1, 0, 1, ..."""
     index = np.arange(int(offset[-1]), dtype=np.int64)
@@ -189,27 +182,7 @@ def within(counts: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.i
     return index
 
 
-_AnyColumn = TypeVar("_AnyColumn", bound=Column)
-
-
-def take(column: Column, rows: NDArray[np.int64]) -> Column:
-    """The chosen rows of a column, in the order chosen."""
-    if isinstance(column, Scalars):
-        return Scalars(column.values[rows], column.kind)
-    if isinstance(column, Records):
-        return Records(
-            {name: take(inner, rows) for name, inner in column.fields.items()}, len(rows)
-        )
-    counts = np.diff(column.offset)[rows]
-    offset = offsets(counts)
-    chosen = within(counts, offset)
-    chosen += np.repeat(column.offset[:-1][rows], counts)
-    if isinstance(column, Strings):
-        return Strings(column.data[chosen], offset)
-    return Arrays(take(column.values, chosen), offset, column.width)
-
-
-def concatenate(first: _AnyColumn, second: _AnyColumn) -> _AnyColumn:
+def concatenate(first: AnyColumn, second: AnyColumn) -> AnyColumn:
     """The rows of one column, then those of another of the same type."""
     result: Column
     if isinstance(first, Scalars) and isinstance(second, Scalars):
@@ -231,7 +204,7 @@ def concatenate(first: _AnyColumn, second: _AnyColumn) -> _AnyColumn:
             {name: concatenate(first.fields[name], second.fields[name]) for name in first.fields},
             first.rows + second.rows,
         )
-    return cast("_AnyColumn", result)
+    return cast("AnyColumn", result)
 
 
 def _join_offsets(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Column, Scalars, Strings
+from hybridlog.schema.column import Arrays, Column, Scalars, Strings, offsets
 from hybridlog.schema.wire_gather import (
     Source,
     empty_fixed,
     even_offsets,
-    offsets,
     within,
 )
 from hybridlog.schema.wire_program import (

@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from zstandard import ZstdError
 
-from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog.schema.column import Arrays, Records, Scalars, Strings, take
 from hybridlog.schema.definition import (
     ArrayOf,
     MessageType,
@@ -31,7 +31,6 @@ from hybridlog.schema.definition import (
     standard_type,
 )
 from hybridlog.schema.wire import WireReader
-from hybridlog.schema.wire_gather import take
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Schema
 from tests.data import DATA, needs_data
