@@ -415,6 +415,11 @@ class Query:
         return self._every
 
     @property
+    def most(self) -> int | None:
+        """What was given to `limit`, None for all; 1 after `just_at`."""
+        return self._limit
+
+    @property
     def is_unthinned(self) -> bool:
         """Whether every message that fits is wanted: neither `limit` nor `every`."""
         return self._limit is None and self._every == 1

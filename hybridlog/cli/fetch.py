@@ -75,7 +75,7 @@ def run(choices: Choices) -> None:
         if choices.count:
             output.say(str(query.count()))
         elif form == "table":
-            query = print_answer(query, choices.limit)
+            query = print_answer(query)
         elif path is None:
             tell_unreadable(write(query, form, sys.stdout.buffer, quiet=True))
         else:

@@ -26,18 +26,18 @@ class _Answer(NamedTuple):
     rows: list[list[str]]
 
 
-def print_answer(query: Query, limit: int | None) -> Query:
+def print_answer(query: Query) -> Query:
     """Print messages for people to read, long arrays in short.
 
     Args:
-        query: The question.
-        limit: The limit it has; without one, the first messages are shown.
+        query: The question; without a limit, its first messages are shown.
 
     Returns:
         The question that was answered, with its counters.
     """
     from hybridlog.tables import stream
 
+    limit = query.most
     # One more than is shown tells whether there is more.
     asked = query if limit is not None else query.limit(SCREEN_ROWS + 1)
     shown = 0

@@ -136,6 +136,16 @@ def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
     assert re.search(r"ranges +\[\S+, \S+, … \d+ in all\]", text)
 
 
+def test_the_message_at_a_time_is_one_on_a_terminal(store: Path) -> None:
+    command = ("fetch", "-t", "scan", "-r", "robot", "--at", "+3s")
+    code, shown = on_terminal(*command, "--store", store)
+    assert code == 0
+    text = plain(shown)
+    assert len(re.findall(r"(?m)^\d{4}-\S+Z  /base/scan$", text)) == 1
+    assert "--limit" not in text
+    assert re.search(r"(?m)^1 message, ", text)
+
+
 def test_binary_formats_are_kept_off_the_terminal(store: Path) -> None:
     for form in ("mcap", "parquet", "raw"):
         code, shown = on_terminal("fetch", "-t", "scan", "-F", form, "--store", store)
