@@ -36,7 +36,7 @@ from hybridlog.query.plan import (
     Task,
     count_given,
 )
-from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
+from hybridlog.query.times import TIME_LIMIT, TimeLike, format_time, parse_range, parse_time
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.index_documents import key_bound
@@ -439,7 +439,7 @@ class Query:
         for recording in self._recordings():
             bounds = self._bounds_in(recording) if self._clock == "log" else None
             start, end = _span(recording)
-            if bounds is not None and start < bounds[0] < end:
+            if bounds is not None and start < bounds[0] < min(end, bounds[1]):
                 yield recording, bounds[0]
 
     def size_hint(self) -> int:
@@ -488,22 +488,23 @@ class Query:
         return types or None
 
     def _bounds_in(self, recording: RecordingEntry) -> tuple[int, int] | None:
-        """The time range in one recording, ns; None for all of it."""
+        """The time range in one recording, ns; None for all of it.
+
+        It may be empty: `2025-01-01` to `end` is, in a recording of the year before.
+        """
         if self._bounds is None:
             return None
         start, end = _span(recording)
         begin, stop = self._bounds
-        return parse_range(
-            0 if begin is None else begin,
-            (1 << 63) - 1 if stop is None else stop,
-            start=start,
-            end=end,
+        return (
+            0 if begin is None else parse_time(begin, start=start, end=end),
+            TIME_LIMIT - 1 if stop is None else parse_time(stop, start=start, end=end),
         )
 
     def _targets(self, lanes: list[Lane]) -> list[Target]:
         targets = []
         wanted = set(self.topics)
-        outside: list[str] = []
+        outside: list[tuple[RecordingEntry, tuple[int, int]]] = []
         for recording in self._recordings():
             mine: dict[int, int] = {}
             for lane in self.store.lanes(recording):
@@ -514,22 +515,38 @@ class Query:
             if not mine:
                 continue
             bounds = self._bounds_in(recording)
-            if bounds is not None and self._clock == "log":
-                start, end = _span(recording)
-                if bounds[0] >= end or bounds[1] <= start:
-                    outside.append(
-                        f"{recording.id} spans {format_time(start)} to {format_time(end)}"
-                    )
-                    continue
+            if bounds is not None and self._is_outside(bounds, recording):
+                outside.append((recording, bounds))
+                continue
             chunks = self.store.chunks(recording, list(mine), bounds, self._clock)
             targets.append(Target(recording, mine, bounds, chunks))
         if outside and not targets:
-            assert self._bounds is not None
-            raise TimeError(
-                f"Nothing was recorded between {self._bounds[0]} and {self._bounds[1]}: "
-                f"{'; '.join(outside[:5])}."
-            )
+            raise self._holds_nothing(outside)
         return targets
+
+    def _is_outside(self, bounds: tuple[int, int], recording: RecordingEntry) -> bool:
+        """Whether a range is empty, or by the log clock beside a recording."""
+        start, end = _span(recording)
+        beside = self._clock == "log" and (bounds[0] >= end or bounds[1] <= start)
+        return beside or bounds[0] >= bounds[1]
+
+    def _holds_nothing(
+        self, outside: Sequence[tuple[RecordingEntry, tuple[int, int]]]
+    ) -> TimeError:
+        """Why a range holds nothing: it ends before it begins, or lies beside all recordings."""
+        assert self._bounds is not None
+        begin, stop = self._bounds
+        if all(low >= high for _, (low, high) in outside):
+            start, end = _span(outside[-1][0])
+            try:
+                parse_range(0 if begin is None else begin, stop, start=start, end=end)
+            except TimeError as error:
+                return error
+        spans = []
+        for recording, _ in outside[:5]:
+            start, end = _span(recording)
+            spans.append(f"{recording.id} spans {format_time(start)} to {format_time(end)}")
+        return TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")
 
     def _check_clock(self, lane: Lane) -> None:
         if self._bounds is None:

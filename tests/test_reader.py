@@ -517,6 +517,33 @@ def test_relative_times(store: hl.Store, robot: Truth, begin: str | None, end: s
     assert query.count() == len(want)
 
 
+def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
+    """`2025-01-01` to `end` leaves out what was recorded before, and is no mistake."""
+    first, later = 1_600_000_000 * SECOND, 1_700_000_000 * SECOND
+    for name, epoch in (("first", first), ("later", later)):
+        write_json(tmp_path / f"{name}.mcap", [("/x", epoch + SECOND * t, {}) for t in range(5)])
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        for name in ("first", "later"):
+            store.record(tmp_path / f"{name}.mcap")
+        query = store.topic("/x")
+        for begin, end, want in (
+            (1_650_000_000, "end", [later + SECOND * t for t in range(5)]),
+            ("+3s", 1_650_000_000, [first + SECOND * 3, first + SECOND * 4]),
+            ("2023-01-01", "-3s", [later, later + SECOND]),
+        ):
+            asked = query.between(begin, end)
+            assert [m.log_time_ns for m in asked] == want
+            assert asked.count() == len(list(asked.documents())) == len(want)
+            assert len(asked.to_pandas()) == len(want)
+        for begin, end, words in (
+            ("2030-01-01", "end", "empty"),
+            ("-1s", "+1s", "empty"),
+            (1_650_000_000, 1_650_000_001, "later spans"),
+        ):
+            with pytest.raises(TimeError, match=words):
+                list(query.between(begin, end))
+
+
 def test_times_are_half_open(store: hl.Store, robot: Truth) -> None:
     times = [m.log_time for m in robot["/odom"]]
     query = store.topic("/odom").in_recording("robot")

@@ -97,8 +97,8 @@ def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
     start, end = entry.span[0], entry.span[1] + 1
     try:
         low, high = parse_range(*between, start=start, end=end)
-    except TimeError:
-        return True
+    except TimeError:  # empty in this recording: nothing of the answer is from there
+        return False
     return high > start and (low < end or entry.status == "recovered")
 
 

@@ -331,6 +331,12 @@ def test_the_answer_says_how_complete_it_is(store: Path) -> None:
     between = (robot["start_ns"], robot["start_ns"] + SECOND)
     apart = run("fetch", "-t", "scan", "--between", *between, "--count", store=store)
     assert "torn" not in apart.err
+    if other["last_ns"] < robot["start_ns"]:
+        between = (robot["start_ns"], "end")
+    else:
+        between = ("start", robot["last_ns"] + 1)
+    apart = run("fetch", "-t", "scan", "--between", *between, "--count", store=store)
+    assert "torn" not in apart.err
 
 
 def test_topics_that_map_to_one_name(store: Path) -> None:
