@@ -11,8 +11,6 @@ from pathlib import Path
 
 from hybridlog_storage.errors import UsageError
 
-_RAW_INDEX = "index.jsonl"
-
 
 def check_room(path: Path, *, form: str, force: bool) -> None:
     """Refuse to overwrite without --force, and what we did not write even with it.
@@ -28,7 +26,7 @@ def check_room(path: Path, *, form: str, force: bool) -> None:
         inside = next(path.iterdir(), None)
         if inside is None:
             return
-        if not (path / _RAW_INDEX).is_file():
+        if not _holds_payloads(path):
             raise UsageError(f"{path} is a directory that holds other things; name a new one.")
     elif form == "raw":
         raise UsageError(f"{path} is a file; payloads go into a directory.")
@@ -61,6 +59,15 @@ def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
             aside.rename(path)
         raise
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def _holds_payloads(path: Path) -> bool:
+    from hybridlog.export.raw import holds_payloads
+
+    try:
+        return holds_payloads(path)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def _is_device(path: Path) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
@@ -27,6 +28,39 @@ if TYPE_CHECKING:
 
 INDEX = "index.jsonl"
 """The file that says which message each payload is. No topic's directory has a dot."""
+
+
+_LONGEST_LINE = 1 << 20
+_PAYLOAD = re.compile(r"[0-9]+(-[0-9]+)?\.bin")
+
+
+def holds_payloads(directory: Path) -> bool:
+    """Whether a directory was written here, and nothing has been added to it since.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    index = directory / INDEX
+    if not index.is_file() or not _is_index(index):
+        return False
+    for entry in directory.iterdir():
+        if entry.name == INDEX:
+            continue
+        if entry.is_symlink() or not entry.is_dir():
+            return False
+        if not all(_PAYLOAD.fullmatch(file.name) for file in entry.iterdir()):
+            return False
+    return True
+
+
+def _is_index(path: Path) -> bool:
+    with path.open("rb") as file:
+        first = file.readline(_LONGEST_LINE)
+    try:
+        line = json.loads(first or b"{}")
+    except ValueError:
+        return False
+    return isinstance(line, dict) and (not first or {"file", "log_time_ns"} <= line.keys())
 
 
 def open_raw_writer(target: Target) -> BatchWriter:

@@ -281,6 +281,14 @@ def test_a_directory_is_replaced_only_if_it_is_ours(store: Path, tmp_path: Path)
     assert sorted(p.name for p in ours.rglob("*")) == before
     run(*SCAN, "-n", "1", "-F", "raw", "--force", "-o", ours, store=store)
     assert len(list(ours.rglob("*.bin"))) == 1
+    # What was added to ours, or looks like ours, is not deleted.
+    for note in (ours / "notes.txt", next(ours.rglob("*.bin")).with_name("notes.txt")):
+        note.write_text("months")
+        assert "other things" in run(*raw, ours, store=store, code=2).err
+        note.unlink()
+    (mine / "thesis.txt").rename(mine / "index.jsonl")
+    assert "other things" in run(*raw, mine, store=store, code=2).err
+    assert (mine / "index.jsonl").read_text() == "years"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "ours"]
 
 
