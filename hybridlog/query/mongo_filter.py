@@ -34,6 +34,8 @@ Stat = Literal["n", "min", "max", "mean"]
 _Kind = Literal["number", "string", "bool", "time", "date", "other"]
 
 _OPERATORS = {"==": "$eq", "!=": "$ne", "<": "$lt", "<=": "$lte", ">": "$gt", ">=": "$gte"}
+_EXTREMES = {"<": "min", "<=": "min", ">": "max", ">=": "max"}
+"""The element of an array that satisfies an order if any does."""
 _STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 _SHOWN = 10
 _INF = float("inf")
@@ -125,11 +127,13 @@ class _Target:
         kind: Kind of the values there.
         stat: Set when the path asks for the summary of an array.
         base: Type of that array's elements.
+        array: Whether the path is an array of numbers, none of its elements.
     """
 
     kind: _Kind
     stat: Stat | None = None
     base: str = ""
+    array: bool = False
 
 
 class _Compiler:
@@ -156,7 +160,11 @@ class _Compiler:
         path = node.field.path
         match node:
             case Compare(order=order, value=value):
-                return {path: _comparison(_OPERATORS[order], value)}
+                test = _comparison(_OPERATORS[order], value)
+                # A long array is there as its summary.
+                extreme = _EXTREMES.get(order) if target.array else None
+                paths = [path, f"{path}.{extreme}"] if extreme else [path]
+                return _any_of([{p: test} for p in paths])
             case Member(values=values, negated=negated):
                 return _membership(path, values, negated=negated)
             case Exists(present=present):
@@ -175,7 +183,9 @@ class _Compiler:
         if not types.known and names[0] != "_meta":
             return _Target("other")
         if path in types.types:
-            return _Target(_KINDS.get(types.types[path].split("[", 1)[0], "other"))
+            kind = _KINDS.get(types.types[path].split("[", 1)[0], "other")
+            numbers = kind in {"number", "time"} and types.types[path].endswith("]")
+            return _Target(kind, array=numbers and isinstance(asked.parts[-1], str))
         parent, last = ".".join(names[:-1]), names[-1]
         if path not in types.inner and parent in types.arrays and isinstance(asked.parts[-1], str):
             base = types.types.get(parent, "").split("[", 1)[0]
@@ -187,6 +197,8 @@ class _Compiler:
         raise self._unknown(asked, path)
 
     def _check(self, node: Condition, target: _Target) -> None:
+        if not isinstance(node, Exists):
+            self._check_leaf(node.field)
         match node:
             case Compare(value=value, position=position):
                 self._check_value(target, value, position)
@@ -197,6 +209,18 @@ class _Compiler:
                 raise error_at(self._text, position, f"the field is a {target.kind}, not a string")
             case _:
                 pass
+
+    def _check_leaf(self, asked: Field) -> None:
+        """Refuse a comparison with a message, which has fields and no value of its own."""
+        path = ".".join(part for part in asked.parts if isinstance(part, str))
+        if path not in self._types.inner or path == "_meta":
+            return
+        below = [name for name in self._types.types if name.startswith(f"{path}.")]
+        leaves = [name for name in below if name not in self._types.inner]
+        names = ", ".join(leaves[:_SHOWN]) + (" …" if len(leaves) > _SHOWN else "")
+        raise self._fail(
+            asked, f"{path} is a message, not a value; ask for one of its fields: {names}"
+        )
 
     def _check_value(self, target: _Target, value: Value, position: int) -> None:
         kind = target.kind
@@ -342,6 +366,10 @@ class _Test:
         }
         operator = {"min": "$min", "max": "$max", "mean": "$avg"}[self.stat]
         return {operator: finite}
+
+
+def _any_of(filters: list[Filter]) -> Filter:
+    return filters[0] if len(filters) == 1 else {"$or": filters}
 
 
 def _comparison(operator: str, value: Value) -> Filter:

@@ -200,6 +200,10 @@ def test_limits() -> None:
         ("a.min ~ 'a'", "not a string"),
         ("names.min < 5", "no field names.min"),
         ("a.median < 5", "no field a.median"),
+        ("o > 5", "o is a message.*: o.y"),
+        ("m == 5", "m is a message.*: m.v, m.q"),
+        ("o in [1]", "o is a message"),
+        ("m[0] ~ 'a'", "m is a message"),
     ],
 )
 def test_types(where: str, message: str) -> None:
@@ -441,7 +445,10 @@ def holds(question: Question, document: Document) -> bool:
         case "compare", ["!=", value]:
             return bool(found) and not any(compares(item, "==", value) for item in values)
         case "compare", [order, value]:
-            return any(compares(item, order, value) for item in values)
+            end = "min" if order in {"<", "<="} else "max"
+            ends = [leaf[end] for leaf in found if isinstance(leaf, dict) and end in leaf]
+            ends = ends if order != "==" else []
+            return any(compares(item, order, value) for item in (*values, *ends))
         case "in", [wanted]:
             return any(compares(item, "==", value) for item in values for value in wanted)
         case "not in", [wanted]:
