@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import coverage, output
 from hybridlog.cli.asking import question
+from hybridlog.cli.observed import observed_fields
 from hybridlog.cli.opening import opened
 from hybridlog.cli.segment import show_segment
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
+    from hybridlog.query.plan import Lane
+    from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
+_READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 _STATUS = {
     "open": "being recorded",
     "damaged": "source damaged",
@@ -102,37 +106,17 @@ def show_schema(
     as_json: bool,
 ) -> None:
     """Print a topic's definition and the paths that can be asked about."""
-    with opened(store, mongo, quiet=as_json) as view:
-        lanes = question(view, [topic], recordings).lanes()
-    if not lanes:
-        raise TopicError(f"No recording chosen has {topic}.")
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
-    for lane in lanes:
-        schema = lane.channel.schema
-        key = (lane.channel.topic, lane.recording.id if schema is None else repr(schema))
-        if key in seen:
-            seen[key]["recordings"].append(lane.recording.id)
-            continue
-        text = None
-        if schema is not None and schema.encoding in {
-            "ros1msg",
-            "ros2msg",
-            "ros2idl",
-            "jsonschema",
-        }:
-            text = bytes(schema.data).decode("utf-8", "replace")
-        seen[key] = {
-            "topic": lane.channel.topic,
-            "type": schema.name if schema is not None else None,
-            "message_encoding": lane.channel.message_encoding,
-            "schema_encoding": schema.encoding if schema is not None else None,
-            "definition": text,
-            "recordings": [lane.recording.id],
-            "not_indexed": lane.codec.reason,
-            "fields": [
-                {"path": p.path, "type": p.type, "array": p.array} for p in lane.codec.paths()
-            ],
-        }
+    with opened(store, mongo, quiet=as_json) as view:
+        for lane in question(view, [topic], recordings).lanes():
+            schema = lane.channel.schema
+            key = (lane.channel.topic, lane.recording.id if schema is None else repr(schema))
+            if key in seen:
+                seen[key]["recordings"].append(lane.recording.id)
+            else:
+                seen[key] = _of_channel(view, lane)
+    if not seen:
+        raise TopicError(f"No recording chosen has {topic}.")
     if as_json:
         output.print_json(list(seen.values()))
         return
@@ -146,11 +130,41 @@ def show_schema(
             output.say(f"not indexed: {item['not_indexed']}")
         if item["fields"]:
             output.say()
+            if item["observed"]:
+                output.say("No definition fixes the fields. The first messages have these:")
             output.print_table(
                 [("field", "left"), ("type", "left"), ("asked as", "left")],
-                [(f["path"], f["type"], _asked_as(f)) for f in item["fields"]],
+                [
+                    (f["path"], f["type"], f["path"] if item["observed"] else _asked_as(f))
+                    for f in item["fields"]
+                ],
             )
         output.say()
+
+
+def _of_channel(store: Store, lane: Lane) -> dict[str, Any]:
+    channel, codec = lane.channel, lane.codec
+    schema = channel.schema
+    text = None
+    if schema is not None and schema.encoding in _READABLE:
+        text = bytes(schema.data).decode("utf-8", "replace")
+    fields: list[dict[str, object]] = [
+        {"path": p.path, "type": p.type, "array": p.array} for p in codec.paths()
+    ]
+    observed = codec.indexed and not fields
+    if observed:
+        fields = observed_fields(store.query([channel.topic], [lane.recording.id]))
+    return {
+        "topic": channel.topic,
+        "type": schema.name if schema is not None else None,
+        "message_encoding": channel.message_encoding,
+        "schema_encoding": schema.encoding if schema is not None else None,
+        "definition": text,
+        "recordings": [lane.recording.id],
+        "not_indexed": codec.reason,
+        "observed": observed,
+        "fields": fields,
+    }
 
 
 def _asked_as(field: dict[str, Any]) -> str:

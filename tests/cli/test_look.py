@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+
+from mcap.writer import Writer
 
 from tests.independent import read_bag
 
@@ -97,6 +100,44 @@ def test_schema_of_a_hostile_definition(store: Path) -> None:
     done = run("schema", "code", store=store)
     assert "not indexed" in done.out
     assert "__import__" in done.out
+
+
+def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path: Path) -> None:
+    (found,) = run("schema", "json", "--json", store=store).json
+    assert found["observed"]
+    assert [(f["path"], f["type"]) for f in found["fields"]] == [
+        ("a", "integer"),
+        ("b", "integer[]"),
+    ]
+    messages = [
+        {"wind": {"speed": 1, "odd name": None}, "gusts": [{"v": 1}, {"v": 2}]},
+        {"wind": {"speed": 0.5}, "gusts": [], "ok": True},
+        [1, 2],
+    ]
+    with (tmp_path / "weather.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/weather", "json", 0)
+        for time, message in enumerate(messages):
+            writer.add_message(channel, time, json.dumps(message).encode(), time)
+        writer.add_message(channel, 9, b"{", 9)
+        writer.finish()  # type: ignore[no-untyped-call]
+    run("record", tmp_path / "weather.mcap", store=tmp_path / "s")
+    (found,) = run("schema", "weather", "--json", store=tmp_path / "s").json
+    fields = {f["path"]: (f["type"], f["array"]) for f in found["fields"]}
+    assert fields == {
+        "wind": ("object", False),
+        "wind.speed": ("number", False),
+        "wind.`odd name`": ("null", False),
+        "gusts": ("array|object[]", True),
+        "gusts[].v": ("integer", True),
+        "ok": ("bool", False),
+    }
+    for path in fields:
+        where = ("--where", f"{path} exists", "--count")
+        assert int(run("fetch", "-t", "weather", *where, store=tmp_path / "s").out) > 0
+    shown = run("schema", "weather", store=tmp_path / "s").out
+    assert "No definition fixes the fields" in shown
 
 
 def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
