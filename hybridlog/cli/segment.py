@@ -24,6 +24,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
         )
     if not path.is_file():
         raise StoreError(f"{path} is no file; a segment is a file that ends in .mcap.")
+    _check_magic(path)
     number = int(stem) if stem.isascii() and stem.isdigit() else 0
     with SegmentReader(path, number) as reader:
         summary = reader.summary()
@@ -74,3 +75,19 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             for c in channels
         ],
     )
+
+
+def _check_magic(path: Path) -> None:
+    """Tell a log from a damaged segment."""
+    from hybridlog_storage.mcap_scan import MAGIC
+
+    try:
+        with path.open("rb") as file:
+            begins = file.read(len(MAGIC))
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+    if begins != MAGIC:
+        raise StoreError(
+            f"{path} is no segment of a hybridlog store. If it is a log, `hybridlog record {path}` "
+            "takes it into one."
+        )

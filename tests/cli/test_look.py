@@ -70,7 +70,10 @@ def test_info_of_a_segment(logs: Path, store: Path) -> None:
     assert found["recording"]["id"] == "robot"
     assert sum(c["messages"] for c in found["channels"]) == len(read_bag(logs / "robot.bag"))
     assert "/base/scan" in run("info", path).out
-    run("info", logs / "odd.mcap", code=5)
+    for log in ("odd.mcap", "robot.bag"):
+        refused = run("info", logs / log, code=5)
+        assert "is no segment of a hybridlog store" in refused.err
+        assert "restore" not in refused.err
 
 
 def test_a_recording_that_is_not_there(store: Path) -> None:
