@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.cli.output import counted, note
+from hybridlog.cli.output import counted, note, unfit
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
 def tell_unreadable(missing: int) -> None:
     """Say how many messages are in no table because they have no fields to read."""
     if missing > 0:
+        are = "is" if missing == 1 else "are"
         note(
-            f"{counted(missing, 'message')} do not fit their definition and are not in this "
-            "answer; --format raw, mcap or bag has them as they came."
+            f"{unfit(missing)} and {are} not in this answer; --format raw, mcap or bag has what "
+            "came."
         )

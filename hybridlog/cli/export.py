@@ -121,7 +121,7 @@ def _make(directory: Path) -> bool:
 
 def _tell(path: Path, query: Query, missing: int, *, quiet: bool) -> None:
     """A line a file; what is not in it is said in any case."""
-    left_out = f" ({missing} left out: they do not fit their definition)" if missing else ""
+    left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
         output.note(
             f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}, "

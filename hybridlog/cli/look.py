@@ -266,24 +266,27 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     if not entry.channels:
         return
     output.say()
+    narrow = output.is_narrow()
+    columns: list[output.Column] = [
+        ("topic", "left"),
+        ("type", "left"),
+        ("messages", "right"),
+        ("Hz", "right"),
+        ("log - header", "right"),
+        ("note", "left"),
+    ]
+    if not narrow:
+        columns.insert(4, ("payload", "right"))
     output.print_table(
+        columns,
         [
-            ("topic", "left"),
-            ("type", "left"),
-            ("messages", "right"),
-            ("Hz", "right"),
-            ("payload", "right"),
-            ("log - header", "right"),
-            ("note", "left"),
-        ],
-        [
-            _channel_row(c, indexed=index is not None)
+            _channel_row(c, indexed=index is not None, narrow=narrow)
             for c in sorted(entry.channels, key=lambda c: c.topic)
         ],
     )
 
 
-def _channel_row(channel: ChannelEntry, *, indexed: bool) -> tuple[str, ...]:
+def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[str]:
     stats = channel.stats
     rate = _rate(channel)
     notes = []
@@ -296,13 +299,16 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool) -> tuple[str, ...]:
     skew = "-" if indexed else "?"
     if stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
-    return (
+    kind = channel.type or channel.message_encoding
+    cells = [
         channel.topic,
-        channel.type or channel.message_encoding,
+        kind.rpartition("/")[2] if narrow else kind,
         str(stats.messages),
         f"{rate:.2f}" if rate is not None else "-",
-        # Segments do not say it of themselves.
-        output.size(stats.payload_bytes) if indexed else "?",
         skew,
         "; ".join(notes),
-    )
+    ]
+    if not narrow:
+        # Segments do not say it of themselves.
+        cells.insert(4, output.size(stats.payload_bytes) if indexed else "?")
+    return cells

@@ -136,6 +136,12 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     return f"{number} {what if number == 1 else plural or what + 's'}"
 
 
+def unfit(messages: int) -> str:
+    """That so many messages cannot be read: `1 message does not fit its definition`."""
+    verb = "does not fit its" if messages == 1 else "do not fit their"
+    return f"{counted(messages, 'message')} {verb} definition"
+
+
 def short_time(ns: int, *, minutes: bool = False) -> str:
     """A time in UTC to the second, or to the minute, for lists."""
     from hybridlog.query.times import format_time
@@ -145,10 +151,14 @@ def short_time(ns: int, *, minutes: bool = False) -> str:
 
 
 def short_duration(ns: int) -> str:
-    """A length of time to four digits or, from a second on, to the millisecond."""
+    """A length of time to four digits; from a second on to the ms, from a day on to the hour."""
     from hybridlog.query.times import format_duration
 
-    step = 10 ** max(0, len(str(abs(ns))) - 4) if abs(ns) < 10**9 else 10**6
+    step = 10**6
+    if abs(ns) < 10**9:
+        step = 10 ** max(0, len(str(abs(ns))) - 4)
+    elif abs(ns) >= 86_400 * 10**9:
+        step = 3_600 * 10**9
     return format_duration(round(ns / step) * step)
 
 

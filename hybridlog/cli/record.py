@@ -369,8 +369,8 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             output.note(f"{channel.topic}: not indexed beyond time: {channel.reason}")
         if channel.stats.unreadable:
             output.note(
-                f"{channel.topic}: {output.counted(channel.stats.unreadable, 'message')} do not "
-                "fit their definition; they are stored, their fields are not indexed"
+                f"{channel.topic}: {output.unfit(channel.stats.unreadable)}; stored, without "
+                "fields in the index"
             )
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"

@@ -371,6 +371,8 @@ def test_what_is_no_table_is_still_exact(topic: str, store: Path) -> None:
 def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> None:
     done = run("fetch", "-t", "long", "-o", tmp_path / "x.csv", store=store)
     assert f"{odd_log.PER_TOPIC} messages do not fit their definition" in done.err
+    one = run("fetch", "-t", "long", "-n", "1", store=store)
+    assert "1 message does not fit its definition and is not in this answer" in one.err
     exact = run("fetch", "-t", "long", "-F", "raw", store=store)
     assert exact.raw == odd_log.claims_4_gb() * odd_log.PER_TOPIC
 

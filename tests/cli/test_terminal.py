@@ -115,6 +115,14 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
         assert "\x07" not in shown
 
 
+def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:
+    code, shown = on_terminal("info", "robot", "--store", store, width=80)
+    assert code == 0
+    assert re.search(r"(?m)^/base/scan +LaserScan +\d", plain(shown))
+    code, shown = on_terminal("info", "robot", "--store", store, width=160)
+    assert re.search(r"(?m)^/base/scan +sensor_msgs/LaserScan +\d", plain(shown))
+
+
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
     command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time")
     code, shown = on_terminal(*command, "--store", store, width=80)
