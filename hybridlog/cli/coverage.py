@@ -48,7 +48,9 @@ def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     if any(loss["count"] is None for loss in losses):
         known = f"at least {counted(lost, 'message')}" if lost else "an unknown number of messages"
         return f"{known} lost in {counted(len(losses), 'place')}"
-    share = 100 * entry.messages / (entry.messages + lost) if entry.messages + lost else 0.0
+    if not lost:
+        return f"complete, although its source was damaged in {counted(len(losses), 'place')}"
+    share = 100 * entry.messages / (entry.messages + lost)
     return (
         f"{counted(lost, 'message')} lost in {counted(len(losses), 'place')} ({share:.2f} % there)"
     )
@@ -80,7 +82,12 @@ def gaps(
             yield f"{entry.id} is still being recorded; what comes later is not in this answer."
         if between is not None and not _touches(entry, between):
             continue
-        losses = [x for x in losses_of(entry) if x.get("topic") is None or x["topic"] in topics]
+        losses = [
+            loss
+            for loss in losses_of(entry)
+            # None is an unknown number, and any topic.
+            if loss["count"] != 0 and loss.get("topic") in {None, *topics}
+        ]
         if losses:
             yield (
                 f"{entry.id} is not complete, so this answer may not be: "

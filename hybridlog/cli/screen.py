@@ -47,14 +47,13 @@ def print_answer(query: Query) -> Query:
         shown += wanted.num_rows
     if not shown and not asked.counters.messages:
         output.note("No message.")
-    more = limit is None and asked.counters.messages > SCREEN_ROWS
-    if more:
+    if limit is None and asked.counters.messages > SCREEN_ROWS:
         output.note(
             f"The first {SCREEN_ROWS} messages. --limit shows more, --format jsonl or -o FILE "
             "gives them all."
         )
-    missing = min(asked.counters.messages, SCREEN_ROWS if more else asked.counters.messages) - shown
-    tell_unreadable(missing)
+        asked.counters.messages = SCREEN_ROWS
+    tell_unreadable(asked.counters.messages - shown)
     return asked
 
 

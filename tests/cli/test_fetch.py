@@ -347,6 +347,17 @@ def test_the_answer_says_how_complete_it_is(store: Path) -> None:
     assert "torn" not in apart.err
 
 
+def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
+    whole = (logs / "odd.mcap").read_bytes()
+    (tmp_path / "open.mcap").write_bytes(whole[:-8])  # the recorder did not close it
+    run("record", tmp_path / "open.mcap", store=tmp_path / "s", code=4)
+    answer = run("fetch", "-t", "json", store=tmp_path / "s")
+    assert "complete" not in answer.err
+    info = run("info", store=tmp_path / "s").out
+    assert "coverage   complete, although its source was damaged in 1 place" in info
+    assert "0 messages lost, source damaged: open.mcap" in info
+
+
 def test_topics_that_map_to_one_name(store: Path) -> None:
     for topic, text in (("/a/b", "one"), ("/a__b", "two"), ("a/b", "three")):
         rows = [json.loads(r) for r in run("fetch", "-t", topic, store=store).lines]

@@ -132,7 +132,7 @@ def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
     assert re.match(r"\d{4}-\d\d-\d\dT[\d:.]+Z  ", lines[1])
     assert len([line for line in lines if re.match(r"\d{4}-", line)]) == 20
     assert any("--limit shows more" in line for line in lines)
-    assert "messages, " in lines[-1] or "messages, " in lines[-2]
+    assert any(line.startswith("20 messages, ") for line in lines[-2:])
 
 
 def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
