@@ -521,7 +521,7 @@ class Query:
             chunks = self.store.chunks(recording, list(mine), bounds, self._clock)
             targets.append(Target(recording, mine, bounds, chunks))
         if outside and not targets:
-            raise self._holds_nothing(outside)
+            self._refuse(outside)
         return targets
 
     def _is_outside(self, bounds: tuple[int, int], recording: RecordingEntry) -> bool:
@@ -530,23 +530,24 @@ class Query:
         beside = self._clock == "log" and (bounds[0] >= end or bounds[1] <= start)
         return beside or bounds[0] >= bounds[1]
 
-    def _holds_nothing(
-        self, outside: Sequence[tuple[RecordingEntry, tuple[int, int]]]
-    ) -> TimeError:
-        """Why a range holds nothing: it ends before it begins, or lies beside all recordings."""
+    def _refuse(self, outside: Sequence[tuple[RecordingEntry, tuple[int, int]]]) -> None:
+        """Refuse a range that holds nothing of any recording.
+
+        Raises:
+            TimeError: it ends before it begins, or lies beside all of them.
+        """
         assert self._bounds is not None
         begin, stop = self._bounds
-        if all(low >= high for _, (low, high) in outside):
-            start, end = _span(outside[-1][0])
-            try:
-                parse_range(0 if begin is None else begin, stop, start=start, end=end)
-            except TimeError as error:
-                return error
         spans = []
-        for recording, _ in outside[:5]:
+        for recording, (low, high) in outside:
             start, end = _span(recording)
-            spans.append(f"{recording.id} spans {format_time(start)} to {format_time(end)}")
-        return TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")
+            # `2025-01-01` to `end` is no mistake, there is only nothing so late.
+            if low < high or low == start or high == end:
+                spans.append(f"{recording.id} spans {format_time(start)} to {format_time(end)}")
+        if not spans:
+            start, end = _span(outside[0][0])
+            parse_range(begin, stop, start=start, end=end)
+        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans[:5])}.")
 
     def _check_clock(self, lane: Lane) -> None:
         if self._bounds is None:

@@ -536,7 +536,9 @@ def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
             assert asked.count() == len(list(asked.documents())) == len(want)
             assert len(asked.to_pandas()) == len(want)
         for begin, end, words in (
-            ("2030-01-01", "end", "empty"),
+            ("2030-01-01", "end", "first spans .*; later spans"),
+            ("start", "1999-01-01", "first spans .*; later spans"),
+            ("2030-01-01", "2029-01-01", "empty"),
             ("-1s", "+1s", "empty"),
             (1_650_000_000, 1_650_000_001, "later spans"),
         ):

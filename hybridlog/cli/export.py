@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from hybridlog.cli import output
 from hybridlog.cli.asking import question
 from hybridlog.cli.coverage import gaps
-from hybridlog.cli.fetch import form_of, write
+from hybridlog.cli.fetch import write
 from hybridlog.cli.opening import opened
 from hybridlog.cli.placing import check_room, replacing
 from hybridlog.cli.stopping import Stopped
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import DefinitionError, HybridlogError, UsageError
+from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.reader import Query
@@ -59,7 +59,7 @@ def run(target: Path, form: str | None, choices: Choices) -> None:
 
 
 def _form(target: Path) -> str:
-    form = form_of(target)
+    form = target.suffix.lower().lstrip(".")
     if form not in _WHOLE:
         raise UsageError(
             f"{target} does not say what to export: end it in .mcap or .bag, or name a directory "
@@ -79,7 +79,8 @@ def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -
 
 
 def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    """One file a topic; a topic that is no table is said and left out."""
+    """One file a topic; a topic that is no table, or lies beside the range, is left out."""
+    query.plan()  # refuses a range that holds nothing of any topic
     paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
     made = _make(directory)
     for path in paths.values():
@@ -90,8 +91,9 @@ def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: boo
             one = query.only(topic)
             try:
                 missing = write(one, form, path, quiet=quiet)
-            except DefinitionError as error:
-                output.note(str(error))
+            except (DefinitionError, TimeError) as error:
+                what = "" if isinstance(error, DefinitionError) else f"{topic}: "
+                output.note(f"{what}{error}")
                 left_out.append(error)
                 continue
             _tell(path, one, missing, quiet=quiet)

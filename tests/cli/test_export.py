@@ -63,9 +63,22 @@ def test_between(logs: Path, store: Path, tmp_path: Path) -> None:
     assert read_mcap(tmp_path / "x.mcap") == wanted
 
 
+def test_a_topic_beside_the_range_is_said_and_left_out(store: Path, tmp_path: Path) -> None:
+    odd = next(r for r in run("ls", "--json", store=store).json if r["recording"] == "odd")
+    between = ("--between", f"{odd['start_ns']}ns", f"{odd['last_ns'] + 1}ns")
+    topics = ("-t", "/json", "-t", "/base/scan")
+    done = run("export", tmp_path / "x", "-F", "csv", *topics, *between, store=store)
+    assert [path.name for path in (tmp_path / "x").iterdir()] == ["json.csv"]
+    assert "/base/scan: Nothing was recorded between" in done.err
+    nothing = ("--between", "1999-01-01", "1999-01-02")
+    run("export", tmp_path / "y", "-F", "csv", *topics, *nothing, store=store, code=2)
+    assert not (tmp_path / "y").exists()
+
+
 def test_wrong_targets(store: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    run("export", tmp_path / "x", store=store, code=2)
+    nameless = run("export", tmp_path / "x", store=store, code=2)
+    assert "end it in .mcap or .bag, or name a directory" in nameless.err
     run("export", tmp_path / "x.csv", store=store, code=2)
     run("export", tmp_path / "file", "-F", "csv", "--force", store=store, code=2)
     run("export", tmp_path, "-F", "mcap", "--force", store=store, code=2)
