@@ -284,7 +284,12 @@ class Query:
 
         Raises:
             TopicError: there is none.
+            UsageError: the question has a time range, or another clock than the log's.
         """
+        if self._bounds is not None or self._clock != "log":
+            raise UsageError(
+                "A message at a time is the last one by log time; `between` and `clock` do not fit."
+            )
         moments: list[tuple[int, int, RecordingEntry]] = []
         for recording in self._recordings():
             start, end = _span(recording)
@@ -317,6 +322,7 @@ class Query:
 
         Raises:
             TopicError: there is none.
+            UsageError: the question has a time range, or another clock than the log's.
         """
         found = self.just_at(moment).first()
         assert found is not None
@@ -579,6 +585,8 @@ class Query:
 
     def pieces(self, plan: Plan) -> Iterator[Piece]:
         """The plan's messages, thinned out and limited."""
+        if self._limit == 0:
+            return
         taken = given = 0
         for piece in Sweep(plan, self.store.segment).pieces():
             count = len(piece.batch)

@@ -186,6 +186,12 @@ def test_a_predicate_reads_only_chunks_with_an_answer(store: hl.Store, robot: Tr
     assert query.counters.documents_read == 1
 
 
+def test_no_message_reads_no_chunk(store: hl.Store) -> None:
+    query = store.topic("/odom").limit(0)
+    assert list(query) == []
+    assert query.counters.chunks_read == 0
+
+
 def test_one_message_reads_one_chunk(store: hl.Store, robot: Truth) -> None:
     query = store.topic("/camera/front/image_raw").limit(1)
     (message,) = query
@@ -656,6 +662,8 @@ def test_predicates_as_text_and_as_filters(store: hl.Store, robot: Truth) -> Non
         (lambda s: s.topic("/odom").in_recording("x"), TopicError, "robot"),
         (lambda s: s.topic("/odom").clock("wall"), UsageError, "publish"),
         (lambda s: s.topic("/odom").limit(-1), UsageError, "negative"),
+        (lambda s: s.topic("/odom").between("+1s", "+2s").at("+3s"), UsageError, "do not fit"),
+        (lambda s: s.topic("/imu/data").clock("header").at("+3s"), UsageError, "do not fit"),
         (lambda s: s.topic("/odom").every(0), UsageError, "at least 1"),
         (lambda s: s.topic("/odom").where("header.seq >"), WhereError, "header.seq"),
         (lambda s: s.topic("/odom").where("nothing > 1"), HybridlogError, "nothing"),
