@@ -213,7 +213,7 @@ class _Compiler:
     def _check_leaf(self, asked: Field) -> None:
         """Refuse a comparison with a message, which has fields and no value of its own."""
         path = ".".join(part for part in asked.parts if isinstance(part, str))
-        if path not in self._types.inner or path == "_meta":
+        if path not in self._types.inner:
             return
         below = [name for name in self._types.types if name.startswith(f"{path}.")]
         leaves = [name for name in below if name not in self._types.inner]

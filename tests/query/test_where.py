@@ -203,6 +203,7 @@ def test_limits() -> None:
         ("o > 5", "o is a message.*: o.y"),
         ("m == 5", "m is a message.*: m.v, m.q"),
         ("o in [1]", "o is a message"),
+        ("_meta > 1", "_meta is a message.*_meta.t,"),
         ("m[0] ~ 'a'", "m is a message"),
     ],
 )
