@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -23,10 +23,15 @@ def complete_recording(context: typer.Context, incomplete: str) -> list[str]:
 def complete_topic(context: typer.Context, incomplete: str) -> list[str]:
     """Topics that begin with what was typed; without a slash, short names as well.
 
-    A short name is offered when it stands for one topic only.
+    A short name is offered when it stands for one topic only. With `--recording`, the
+    topics of those recordings are offered.
     """
     with _nothing_on_error():
-        topics = _topics(_store(context))
+        directory = _store(context)
+        wanted = tuple(context.params.get("recording") or ())
+        ids = directory.recording_ids()
+        # A recording may be given by its name, too, which is not looked up here.
+        topics = _topics(directory, [i for i in ids if i.startswith(wanted)] or ids)
         found = {topic for topic in topics if topic.startswith(incomplete)}
         if incomplete and not incomplete.startswith("/"):
             found.update(n for n in _short_names(topics) if n.startswith(incomplete))
@@ -42,12 +47,12 @@ def _store(context: typer.Context) -> StoreDirectory:
     return StoreDirectory(store_path(os.path.expanduser(value) if value is not None else None))  # noqa: PTH111
 
 
-def _topics(directory: StoreDirectory) -> set[str]:
+def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
     from hybridlog.entries import read_summaries
 
     return {
         channel.topic
-        for recording in directory.recording_ids()
+        for recording in recordings
         for summary in read_summaries(directory, recording).values()
         for channel in summary.channels.values()
     }

@@ -99,6 +99,7 @@ def test_completion(store: Path) -> None:
     assert complete(f"fetch --store {store} --topic sca") == ["scan"]
     # Two cameras have one, so the short name stands for none.
     assert complete(f"fetch --store {store} --topic image_") == []
+    assert complete(f"fetch --store {store} --recording odd --topic /base") == []
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
     assert "--between" in complete("fetch --be")
     assert complete("info --store /nowhere r") == []
