@@ -140,7 +140,7 @@ def record(
     paths: Annotated[
         list[Path],
         typer.Argument(
-            help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.", metavar="PATH..."
+            help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.", metavar="PATH"
         ),
     ],
     store: StoreOption = None,
@@ -175,7 +175,9 @@ def record(
     compression: Annotated[
         Compression, typer.Option(help="Compression of chunks.")
     ] = Compression.ZSTD,
-    level: Annotated[int, typer.Option(help="zstd level, 1 to 19.", min=1, max=19)] = 1,
+    level: Annotated[
+        int, typer.Option(help="zstd level, 1 to 19.", metavar="N", min=1, max=19)
+    ] = 1,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -226,7 +228,7 @@ def info(
         str | None,
         typer.Argument(
             help="A recording or a segment file; without, every recording.",
-            metavar="[RECORDING|SEGMENT]",
+            metavar="RECORDING|SEGMENT",
             autocompletion=complete_recording,
         ),
     ] = None,
@@ -242,7 +244,9 @@ def info(
 
 @app.command()
 def schema(
-    topic: Annotated[str, typer.Argument(help="A topic.", autocompletion=complete_topic)],
+    topic: Annotated[
+        str, typer.Argument(help="A topic.", metavar="TOPIC", autocompletion=complete_topic)
+    ],
     store: StoreOption = None,
     recording: RecordingOption = None,
     mongo: MongoOption = None,
@@ -285,9 +289,10 @@ def fetch(
     ] = None,
     recording: RecordingOption = None,
     limit: Annotated[
-        int | None, typer.Option("--limit", "-n", help="At most so many messages.", min=0)
+        int | None,
+        typer.Option("--limit", "-n", help="At most so many messages.", metavar="N", min=0),
     ] = None,
-    every: Annotated[int, typer.Option(help="Only every n-th message.", min=1)] = 1,
+    every: Annotated[int, typer.Option(help="Only every n-th message.", metavar="N", min=1)] = 1,
     reverse: Annotated[bool, typer.Option("--reverse", help="Latest first.")] = False,
     fields: Annotated[
         str | None,
@@ -360,7 +365,11 @@ def export(
     topic: Annotated[
         list[str] | None,
         typer.Option(
-            "--topic", "-t", help="Only these. Repeatable.", autocompletion=complete_topic
+            "--topic",
+            "-t",
+            help="Only these. Repeatable.",
+            metavar="TOPIC",
+            autocompletion=complete_topic,
         ),
     ] = None,
     between: BetweenOption = None,
@@ -395,7 +404,9 @@ def reindex(
 def verify(
     recording: Annotated[
         list[str] | None,
-        typer.Argument(help="Only these recordings.", autocompletion=complete_recording),
+        typer.Argument(
+            help="Only these recordings.", metavar="RECORDING", autocompletion=complete_recording
+        ),
     ] = None,
     store: StoreOption = None,
     mongo: MongoOption = None,
@@ -414,7 +425,8 @@ def verify(
 @app.command()
 def rm(
     recording: Annotated[
-        list[str], typer.Argument(help="Recordings.", autocompletion=complete_recording)
+        list[str],
+        typer.Argument(help="Recordings.", metavar="RECORDING", autocompletion=complete_recording),
     ],
     store: StoreOption = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
@@ -429,10 +441,13 @@ def rm(
 @app.command()
 def demo(
     directory: Annotated[
-        Path, typer.Argument(help="Where the bag and the store of the demo go.")
+        Path,
+        typer.Argument(help="Where the bag and the store of the demo go.", metavar="DIRECTORY"),
     ] = Path("hybridlog-demo"),
-    duration: Annotated[float, typer.Option(help="Seconds of robot time.", min=5)] = 60.0,
-    seed: Annotated[int, typer.Option(help="Another number, another drive.")] = 1,
+    duration: Annotated[
+        float, typer.Option(help="Seconds of robot time.", metavar="SECONDS", min=5)
+    ] = 60.0,
+    seed: Annotated[int, typer.Option(help="Another number, another drive.", metavar="N")] = 1,
 ) -> None:
     """Take a tour: simulate a robot, record it, ask it."""
     from hybridlog.demo import tour

@@ -75,6 +75,17 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
     assert "Error" in done.err
 
 
+def test_usage_names_what_is_wanted() -> None:
+    for command, words in (
+        ("record", "{PATH}..."),
+        ("schema", "{TOPIC}"),
+        ("verify", "[RECORDING]..."),
+        ("rm", "{RECORDING}..."),
+        ("export", "-t, --topic TOPIC"),
+    ):
+        assert words in run(command, "--help").out
+
+
 def complete(words: str) -> list[str]:
     """What bash would offer for the last word."""
     ended = subprocess.run(
