@@ -775,12 +775,14 @@ class _Scanner:
             if fields is None or fields.end > end:
                 return None
             return (3 if fields.end == end else 1), end
+        if end > self._window.size:
+            return None
         if opcode == Opcode.MESSAGE_INDEX and weight:
             (entries,) = struct.unpack_from("<I", raw, _HEAD + 2)
             weight = 0 if entries + 6 > length or entries % 16 else 2
         elif opcode == Opcode.DATA_END and length == 4:
             weight = 3
-        return (weight, end) if weight and end <= self._window.size else None
+        return (weight, end) if weight else None
 
     def _is_plausible(self, opcode: int, end: int) -> bool:
         if opcode == 0 or end > self._window.size:

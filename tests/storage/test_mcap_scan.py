@@ -429,6 +429,17 @@ def test_junk_between_records_is_stepped_over() -> None:
         assert [(d.offset, d.length) for d in damages(items)] == [(place, len(junk))]
 
 
+def test_a_message_index_that_starts_at_the_very_end_is_damage() -> None:
+    data = written()
+    end = next(o for o, i in items_of(data) if isinstance(i, DataEnd))
+    before = bytes(9) + struct.pack("<BQ", Opcode.METADATA, 8) + bytes(8)
+    index = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 22) + bytes(22)
+    for there in range(9, 15):
+        items = items_of(data[:end] + before + index[:there])
+        assert payloads(items) == ALL
+        assert damages(items)
+
+
 def test_a_torn_chunk_gives_its_beginning() -> None:
     for compression in CompressionType:
         out = io.BytesIO()
