@@ -64,7 +64,7 @@ class SqliteSource(Source):
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])
         self._channel_of: dict[int, int] = {}
-        self._undefined: Counter[int] = Counter()
+        self._undefined: Counter[int | None] = Counter()
         self._select = ""
         self._got = 0
         header = _read_header(path)
@@ -164,7 +164,11 @@ class SqliteSource(Source):
             name if name in columns else "''"
             for name in ("serialization_format", "offered_qos_profiles", "type_description_hash")
         ]
-        query = f"SELECT id, name, type, {', '.join(optional)} FROM topics ORDER BY id"  # noqa: S608
+        # Without an id, no message can be of the topic.
+        query = (
+            f"SELECT CAST(id AS INTEGER), name, type, {', '.join(optional)} FROM topics "  # noqa: S608
+            "WHERE id IS NOT NULL ORDER BY id"
+        )
         for number, name, kind, encoding, qos, type_hash in self._db.execute(query):
             type_name = str(kind or "")
             found = definitions.get(type_name)
@@ -175,7 +179,7 @@ class SqliteSource(Source):
                 metadata["offered_qos_profiles"] = str(qos or "")
             if type_hash:
                 metadata["topic_type_hash"] = str(type_hash)
-            self._channel_of[int(number)] = len(self.channels)
+            self._channel_of[number] = len(self.channels)
             self.channels.append(
                 Channel(
                     topic=str(name),
@@ -331,7 +335,9 @@ class SqliteSource(Source):
 
     def _report_undefined(self) -> None:
         if self._undefined:
-            ids = ", ".join(str(number) for number in sorted(self._undefined)[:10])
+            numbers = sorted(number for number in self._undefined if number is not None)
+            names = [*map(str, numbers), *(["NULL"] if None in self._undefined else [])]
+            ids = ", ".join(names[:10])
             reason = f"messages of topics that the bag does not list (topic id {ids})"
             lost = self._undefined.total()
             self.damage.append(Damage(self.path, None, None, reason, lost))

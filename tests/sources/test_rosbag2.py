@@ -377,6 +377,23 @@ def test_values_of_odd_types_and_unknown_topics(tmp_path: Path) -> None:
     assert [each.messages_lost for each in source.damage] == [1]
 
 
+def test_messages_and_topics_without_an_id(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        "CREATE TABLE topics(id, name TEXT, type TEXT, serialization_format TEXT)",
+        MESSAGES,
+        "INSERT INTO topics VALUES (NULL, '/n', 'a/B', 'cdr'), ('x', '/x', 'a/B', 'cdr')",
+        "INSERT INTO topics VALUES ('1', '/a', 'a/B', 'cdr')",
+        rows=[(1, 1, 5, b"a"), (2, None, 6, b"lost"), (3, 7, 7, b"lost")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    assert [source.channels[c].topic for c in batch.channel] == ["/a"]
+    (damage,) = source.damage
+    assert damage.messages_lost == 2
+    assert "7, NULL" in damage.reason
+
+
 @pytest.mark.parametrize(
     "script",
     [
