@@ -18,6 +18,7 @@ from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.index_documents import key_bound, recording_key
 from hybridlog_storage.recovery import Recovered, recover_segment
+from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
@@ -274,21 +275,31 @@ class _Check:
         self._schemas.update(c.schema for c in summary.channels.values() if c.schema is not None)
         if self.indexer is None:
             self.indexer = ChunkIndexer(self._recording_id, base.key)
+        name = reader.path.name
+        if summary.recording.get("segment") != reader.number:
+            self.found(name, f"it says that it is segment {summary.recording.get('segment')}")
         messages = 0
-        for place in summary.chunks:
-            try:
-                chunk = reader.read_chunk(place)
-            except SegmentError as error:
-                self.entries.pop((reader.number, place.offset), None)
-                self.found(f"{reader.path.name} byte {place.offset}", str(error))
-                continue
-            self._chunk(reader.path.name, chunk, summary.channels, base.key)
-            messages += len(chunk.batch)
-            if progress is not None:
-                progress(self._recording_id, place.offset + place.length, reader.size)
+        with SegmentCheck(reader.path) as check:
+            for place in summary.chunks:
+                where = f"{name} byte {place.offset}"
+                try:
+                    chunk = reader.read_chunk(place)
+                except SegmentError as error:
+                    self.entries.pop((reader.number, place.offset), None)
+                    self.found(where, str(error))
+                    continue
+                problem = check.chunk(chunk)
+                if problem is not None:
+                    self.found(where, problem)
+                self._chunk(name, chunk, summary.channels, base.key)
+                messages += len(chunk.batch)
+                if progress is not None:
+                    progress(self._recording_id, place.offset + place.length, reader.size)
+            for offset, problem in check.between_chunks():
+                self.found(f"{name} byte {offset}", problem)
         self._result.messages += messages
         if messages != sum(summary.counts.values()):
-            self.found(reader.path.name, f"{messages} messages; its statistics say otherwise")
+            self.found(name, f"{messages} messages; its statistics say otherwise")
 
     def rest(self) -> None:
         """What the database has beyond the segments, and the schemas."""

@@ -553,6 +553,36 @@ def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -
             assert messages == sound[offset], f"byte {spot} of {len(whole)}, chunk {offset}"
 
 
+def test_damage_that_hybridlog_can_read_around_is_found(store: hl.Store) -> None:
+    """Records around the chunks, which have no checksum and other readers may need."""
+    number, path = store.directory.segments("short")[1]
+    whole = path.read_bytes()
+    with SegmentReader(path, number) as reader:
+        chunks = reader.summary().chunks
+    first, last = chunks[0], chunks[-1]
+    at = whole.index(b"hybridlog", 8)
+    schema = whole.rindex(b"frame_id", 0, first.offset)
+    topic = whole.rindex(b"/", 0, first.offset)
+    indexes = last.offset + last.length
+    places = [at, schema, topic, last.offset + 10, indexes + 1, indexes + 9, indexes + 20]
+    for place in [*places, data_end(whole), data_end(whole) + 1]:
+        data = bytearray(whole)
+        data[place] ^= 1
+        path.write_bytes(data)
+        assert any(path.name in f.place for f in store.verify().findings), place
+    path.write_bytes(whole)
+    assert store.verify().findings == []
+
+
+def test_segments_that_changed_places_are_found(store: hl.Store) -> None:
+    (_, one), (_, other), *_ = store.directory.segments("short")
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    findings = store.verify().findings
+    assert any("says that it is segment 1" in f.problem for f in findings)
+
+
 # An index that is altered behind our back.
 
 
