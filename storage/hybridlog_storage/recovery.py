@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Attachment, Header, MessageIndex, Metadata
+from mcap.records import Attachment, DataEnd, Header, MessageIndex, Metadata
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
@@ -91,6 +91,7 @@ class _Rebuilder:
         self.messages = 0
         self.next_seq = 0
         self.has_recording = False
+        self.has_end = False  # the recorder had written all, and only the summary is missing
         self.pending: _Pending | None = None
         self._schemas: dict[int, SchemaRecord] = {}
         self._damage = damage
@@ -112,6 +113,7 @@ class _Rebuilder:
                 started = recording.get("next_seq")
                 self.next_seq = started if isinstance(started, int) else 0
                 self.has_recording = True
+            self.has_end |= item.name == END_METADATA
             self.segment.note_metadata(item.name, offset, end - offset)
         elif isinstance(item, Attachment):
             self.segment.note_attachment(item, offset, end - offset)
@@ -200,6 +202,8 @@ def recover_segment(path: Path) -> Recovered:
     try:
         with path.open("rb") as file:
             for offset, item in scan(file, size=size):
+                if isinstance(item, DataEnd):
+                    break  # behind it is a summary, whole or not, which is made anew
                 if isinstance(item, ScannedChunk):
                     end = offset + item.length
                 else:
@@ -216,8 +220,9 @@ def recover_segment(path: Path) -> Recovered:
     except OSError as error:
         segment.abandon()
         raise durability.explain(error, path, "recovering") from error
-    end_note = {"status": "recovered", "cut_bytes": cut_bytes, "damage": damage}
-    segment.add_metadata(json_metadata(END_METADATA, end_note))
+    if damage or not rebuilder.has_end:
+        end_note = {"status": "recovered", "cut_bytes": cut_bytes, "damage": damage}
+        segment.add_metadata(json_metadata(END_METADATA, end_note))
     sealed = segment.seal()
     return Recovered(sealed, rebuilder.messages, cut_bytes, damage)
 

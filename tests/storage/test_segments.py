@@ -17,6 +17,7 @@ from mcap.stream_reader import StreamReader
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
+from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings, StoredChunk
@@ -187,6 +188,22 @@ def test_every_cut_of_a_small_segment_recovers(tmp_path: Path) -> None:
         whole = sum(len(c.batch) for c in chunks if c.offset + c.length <= cut)
         assert recovered.messages == whole, cut
         (tmp_path / "000000.mcap").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("missing", [0, 1, 8, 37, 60, 200])
+def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: int) -> None:
+    """Killed while it was sealed: all is there, and what follows the data is made anew."""
+    (path,), _ = write(tmp_path / "a", [many(30)], SegmentSettings(chunk_size=1024))
+    whole = path.read_bytes()
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(whole[: len(whole) - missing])
+    recovered = recover_segment(opened)
+    assert recovered.path is not None
+    assert recovered.path.read_bytes() == whole
+    with SegmentReader(recovered.path, 0) as reader:
+        assert reader.summary().end == {"status": "complete"}
+    with SegmentCheck(recovered.path) as check:
+        assert list(check.between_chunks()) == []
 
 
 def test_a_flipped_bit_is_found_and_named(tmp_path: Path) -> None:
