@@ -41,11 +41,13 @@ class Tended:
         recovered: Segments that a crash had left open, by recording id.
         indexed: Recordings whose index was behind, and by how many chunks.
         removed: Recordings in the database without a file.
+        unreadable: Recordings that could not be mended, and why; the others are.
     """
 
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
     indexed: dict[str, int] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)
+    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 def recover(directory: StoreDirectory, recording_id: str) -> list[Recovered]:
@@ -70,23 +72,44 @@ def tend(directory: StoreDirectory, database: Database, progress: Progress | Non
     catalog = Catalog(database)
     known = {r.id: r for r in catalog.recordings()}
     for recording_id in directory.recording_ids():
-        recovered = recover(directory, recording_id)
-        if recovered:
-            tended.recovered[recording_id] = recovered
-        if not directory.segments(recording_id):
-            continue
-        entry = known.get(recording_id)
-        if entry is None or entry.status == "open" or recovered:
-            with directory.writing(recording_id) as mine:
-                if mine:
-                    chunks = catch_up(directory, database, recording_id, progress)
-                    tended.indexed[recording_id] = chunks
+        try:
+            _tend_one(
+                directory,
+                database,
+                recording_id,
+                entry=known.get(recording_id),
+                tended=tended,
+                progress=progress,
+            )
+        except SegmentError as error:
+            tended.unreadable[recording_id] = str(error)
     present = set(directory.recording_ids())
     for recording_id in known:
         if recording_id not in present:
             catalog.remove_recording(recording_id, _topic_collections(database))
             tended.removed.append(recording_id)
     return tended
+
+
+def _tend_one(
+    directory: StoreDirectory,
+    database: Database,
+    recording_id: str,
+    *,
+    entry: RecordingEntry | None,
+    tended: Tended,
+    progress: Progress | None,
+) -> None:
+    recovered = recover(directory, recording_id)
+    if recovered:
+        tended.recovered[recording_id] = recovered
+    if not directory.segments(recording_id):
+        return
+    if entry is None or entry.status == "open" or recovered:
+        with directory.writing(recording_id) as mine:
+            if mine:
+                chunks = catch_up(directory, database, recording_id, progress)
+                tended.indexed[recording_id] = chunks
 
 
 def catch_up(
@@ -115,9 +138,13 @@ def catch_up(
     done = {(c.segment, c.offset) for c in entries}
     index = IndexWriter(indexer, database)
     added = 0
-    for chunk, channels in _chunks(directory, recording_id, summaries, done, progress):
-        index.submit(chunk, channels)
-        added += 1
+    try:
+        for chunk, channels in _chunks(directory, recording_id, summaries, done, progress):
+            index.submit(chunk, channels)
+            added += 1
+    except BaseException:
+        index.abandon()
+        raise
     index.close()
     if index.failure is not None:
         raise index.failure
@@ -152,9 +179,13 @@ def reindex(
 
     Raises:
         StoreError: a recording is being written; nothing is dropped.
+        SegmentError: a segment cannot be read. When its summary cannot, nothing is
+            dropped; when a chunk cannot, all other recordings are in the index.
     """
     for recording_id in directory.recording_ids():
         recover(directory, recording_id)
+        read_summaries(directory, recording_id)
+    damaged: SegmentError | None = None
     with ExitStack() as held:
         for recording_id in directory.recording_ids():
             if not held.enter_context(directory.writing(recording_id)):
@@ -166,7 +197,12 @@ def reindex(
         catalog.prepare()
         for recording_id in directory.recording_ids():
             if directory.segments(recording_id):
-                catch_up(directory, database, recording_id, progress)
+                try:
+                    catch_up(directory, database, recording_id, progress)
+                except SegmentError as error:
+                    damaged = damaged or error
+    if damaged is not None:
+        raise damaged
     return catalog.recordings()
 
 

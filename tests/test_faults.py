@@ -574,6 +574,51 @@ def test_damage_that_hybridlog_can_read_around_is_found(store: hl.Store) -> None
     assert store.verify().findings == []
 
 
+def damage_summary(path: Path) -> None:
+    whole = path.read_bytes()
+    data = bytearray(whole)
+    data[data_end(whole) + 40] ^= 1
+    path.write_bytes(data)
+
+
+def test_reindex_drops_nothing_that_it_cannot_make_again(
+    store: hl.Store, said: Counter[Message]
+) -> None:
+    place = place_in_the_middle(store)
+    damage_summary(place.path)
+    done = run("reindex", store=store.directory.path, code=5)
+    assert place.path.name in done.stderr
+    with reopened(store) as opened:
+        assert content(fetched(opened, "short")) == said
+
+
+@pytest.mark.parametrize("part", ["summary", "chunk"])
+def test_one_damaged_recording_keeps_no_other_out_of_the_index(
+    store: hl.Store, short: Path, said: Counter[Message], part: str
+) -> None:
+    """The database was lost, and a segment is damaged."""
+    other = store.record(short, again=True, name="zz").entry.id
+    place = place_in_the_middle(store)
+    if part == "summary":
+        damage_summary(place.path)
+    else:
+        data = bytearray(place.path.read_bytes())
+        data[place.offset + place.length - 5] ^= 0x10
+        place.path.write_bytes(data)
+        with pytest.raises(SegmentError, match=str(place.offset)):
+            store.reindex()
+    assert store.database is not None
+    for name in store.database.list_collections():
+        if name != maintenance.STORE_MARK:
+            store.database.drop(name)
+    with reopened(store) as opened:
+        assert list(opened.tended.unreadable) == ["short"]
+        assert content(fetched(opened, other)) == said
+        assert opened.verify([other]).findings == []
+    done = run("ls", store=store.directory.path, code=0)
+    assert "short cannot be brought into the index" in done.stderr
+
+
 def test_segments_that_changed_places_are_found(store: hl.Store) -> None:
     (_, one), (_, other), *_ = store.directory.segments("short")
     first, second = one.read_bytes(), other.read_bytes()

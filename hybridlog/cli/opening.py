@@ -56,6 +56,8 @@ def _tell(store: Store) -> None:
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
     for recording in tended.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
+    for recording, problem in tended.unreadable.items():
+        note(f"Recording {recording} cannot be brought into the index: {problem}")
     if store.without_database is not None:
         note(
             f"MongoDB is away, so only topics and times can be asked for: {store.without_database}"
