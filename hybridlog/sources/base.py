@@ -33,6 +33,7 @@ BATCH_MESSAGES = 16384
 """Most messages of one batch."""
 
 MAX_CHUNK = 1 << 30
+_TOO_MUCH = 1 << 63  # for BSON, and for the size of any file
 """Largest chunk or payload, in uncompressed bytes, that a source will unpack."""
 
 
@@ -46,6 +47,9 @@ class Damage:
         length: Bytes from `offset` on that could not be read, None when not known.
         reason: What is wrong there, for people to read.
         messages_lost: Number of messages that lie there, None when it cannot be known.
+
+    Numbers that do not fit into 64 bits, which a file can claim and no file can hold,
+    are not kept: the loss ledger goes into the database.
     """
 
     file: Path
@@ -53,6 +57,13 @@ class Damage:
     length: int | None
     reason: str
     messages_lost: int | None
+
+    def __post_init__(self) -> None:
+        """Forget impossible numbers."""
+        for name in ("offset", "length", "messages_lost"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < _TOO_MUCH:
+                object.__setattr__(self, name, None)
 
 
 class Source(ABC):

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
@@ -104,6 +105,23 @@ def official(path: Path) -> list[Seen]:
                     )
                 )
     return found
+
+
+def test_a_count_that_no_file_can_hold_is_not_kept(tmp_path: Path) -> None:
+    """The loss ledger goes into a database whose integers have 64 bits."""
+    out = io.BytesIO()
+    writer = Writer(out, enable_crcs=False)
+    writer.start()
+    channel = writer.register_channel("/a", "json", 0)
+    writer.add_message(channel, 1, b"{}", 1)
+    writer.finish()
+    count = struct.pack("<BQQ", Opcode.STATISTICS, 56, 1)
+    assert out.getvalue().count(count) == 1
+    path = tmp_path / "a.mcap"
+    path.write_bytes(out.getvalue().replace(count, count[:9] + b"\xff" * 8))
+    found = read(path)
+    assert len(found.messages) == 1
+    assert found.lost == [None]
 
 
 GOOD = [
