@@ -38,6 +38,7 @@ _OP_FIELD = b"\x04\x00\x00\x00op="
 _LOOK_BACK = 320
 _TEMPLATE_HEADER = 512
 _TEMPLATES = 16
+_LEAST_HEADER = 8  # of the field `op` alone
 
 # What a header of each kind must hold to be believed: name and length of the value
 # (None: any length).
@@ -300,6 +301,8 @@ def _walk(data: bytes) -> tuple[list[int], list[int], int, int]:
             need = 4
             break
         body = pos + 4 + u32(data, pos)[0]
+        if body - pos - 4 < _LEAST_HEADER:
+            break  # else zeros would be a record every eight bytes
         if body + 4 > size:
             need = body + 4 - pos
             break

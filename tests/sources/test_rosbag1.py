@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import struct
 import tempfile
+import tracemalloc
 from collections import defaultdict
 from pathlib import Path
 
@@ -514,6 +515,22 @@ def test_a_cut_chunk_gives_what_unpacks(compression: str) -> None:
     assert times == list(range(len(times)))
     assert 5 < len(times) < 40
     assert [each.messages_lost for each in damage] == [None]
+
+
+def test_zeros_are_no_records() -> None:
+    """A small chunk may unpack to very many of them."""
+    sound = connection(0) + message(0, 1, b"a")
+    data = sound + bytes(16 << 20)
+    tracemalloc.start()
+    try:
+        run = RunReader().read(data)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert (run.end, run.why) == (len(sound), Stop.BAD)
+    messages, damage = read_bytes(bag(chunk(sound + bytes(1 << 20), "bz2")))
+    assert values(messages) == [b"a"]
+    assert damage
 
 
 def test_run_reader_stops() -> None:
