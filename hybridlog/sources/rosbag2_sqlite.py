@@ -65,6 +65,7 @@ class SqliteSource(Source):
         super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])
         self._channel_of: dict[int, int] = {}
         self._undefined: Counter[int | None] = Counter()
+        self._early = 0
         self._select = ""
         self._got = 0
         header = _read_header(path)
@@ -261,6 +262,9 @@ class SqliteSource(Source):
             reason = "the file is cut short, but only behind its messages"
             self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
         self._report_undefined()
+        if self._early:
+            reason = "messages with a time before 1970, which no log can keep"
+            self.damage.append(Damage(self.path, None, None, reason, self._early))
 
     def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
         if not rows:
@@ -282,7 +286,11 @@ class SqliteSource(Source):
         )
         if len(channel) and int(channel.min()) < 0:
             self._undefined.update(topic for topic in topics if topic not in self._channel_of)
-            batch = batch.take(channel >= 0)
+        early = (batch.log_time < 0) | (batch.publish_time < 0)
+        self._early += int((early & (channel >= 0)).sum())
+        kept = (channel >= 0) & ~early
+        if not kept.all():
+            batch = batch.take(kept)
         if len(batch):
             yield batch
 

@@ -377,6 +377,22 @@ def test_values_of_odd_types_and_unknown_topics(tmp_path: Path) -> None:
     assert [each.messages_lost for each in source.damage] == [1]
 
 
+def test_times_before_1970_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        TOPICS,
+        MESSAGES,
+        TOPIC,
+        rows=[(1, 1, -1, b"lost"), (2, 1, 0, b"a"), (3, 1, 2**63 - 1, b"b"), (4, 1, -(2**63), b"")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    assert batch.log_time.tolist() == [0, 2**63 - 1]
+    (damage,) = source.damage
+    assert damage.messages_lost == 2
+    assert "1970" in damage.reason
+
+
 def test_messages_and_topics_without_an_id(tmp_path: Path) -> None:
     path = database(
         tmp_path / "a.db3",
