@@ -42,11 +42,13 @@ def _run() -> int:
         return error.exit_code
     except BrokenPipeError:
         _let_go(sys.stdout)
-        return 0
     except OSError as error:
         # What the library maps carries a cure; this is the rest, such as a failing disk.
         _complain(str(error))
         return _code_of(error)
+    except MemoryError:
+        _complain("there is not enough memory for this. Ask for less at a time.")
+        return HybridlogError.exit_code
     except Exception:
         traceback.print_exc()
         _complain("this is a mistake in hybridlog; please report it with the lines above.")

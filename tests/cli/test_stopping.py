@@ -6,6 +6,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from urllib.parse import quote
 
@@ -214,3 +215,14 @@ def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
     assert codes == [0, 0], (tmp_path / "out").read_text()
     assert recordings(store) == ["odd", "small"]
     assert "all is well" in run("verify", store=store).out
+
+
+def test_too_little_memory_is_no_mistake_of_ours(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def starve(**_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("hybridlog.cli.app.app", starve)
+    assert import_module("hybridlog.cli.main")._run() == 1
+    assert "not enough memory" in capsys.readouterr().err
