@@ -7,9 +7,10 @@ or it leaves nothing behind.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,38 +113,23 @@ def record(
     """
     started = time.monotonic()
     catalog = Catalog(database)
-    if not options.again:
-        _refuse_known(catalog, source, fingerprint)
-    name = options.name or _name_of(source.path)
-    recording_id = directory.new_recording(name)
-    entry = RecordingEntry(
-        id=recording_id,
-        key=new_key(r.key for r in catalog.recordings()),
-        name=name,
-        tags=dict(options.tags),
-        source={
-            "path": str(source.path),
-            "kind": source.kind,
-            "profile": source.profile,
-            "bytes": source.size_bytes,
-            "fingerprint": fingerprint,
-        },
-        created=time.time_ns(),
-        status="open",
-    )
-    indexer = ChunkIndexer(entry.id, entry.key)
-    index = IndexWriter(indexer, database)
-    with directory.writing(recording_id) as mine:
-        if not mine:
-            raise StoreError(f"Another process is writing {directory.recording(recording_id)}.")
+    with ExitStack() as held:
+        with directory.alone():
+            # Who records the same at this moment is refused, or refuses us.
+            if not options.again:
+                _refuse_known(catalog, source, fingerprint)
+            entry = _begin(
+                source, directory, catalog, fingerprint=fingerprint, options=options, held=held
+            )
+        indexer = ChunkIndexer(entry.id, entry.key)
+        index = IndexWriter(indexer, database)
         writer = RecordingWriter(
-            directory.recording(recording_id),
+            directory.recording(entry.id),
             recording_metadata(entry),
             index.submit,
             options.settings,
         )
         try:
-            catalog.put_recording(entry)
             skipped = _copy(source, writer, options, progress)
             _check_result(source, writer, options)
             end = _end_of(source)
@@ -154,7 +140,7 @@ def record(
             writer.abort()
             _forget(index, catalog, directory, entry, writer.channels)
             raise
-        entry = build_entry(directory, indexer, recording_id, index.entries)
+        entry = build_entry(directory, indexer, entry.id, index.entries)
         failure = index.failure
         if failure is None:
             try:
@@ -174,6 +160,48 @@ def record(
         skipped,
         time.monotonic() - started,
     )
+
+
+def _begin(
+    source: Source,
+    directory: StoreDirectory,
+    catalog: Catalog,
+    *,
+    fingerprint: str,
+    options: RecordOptions,
+    held: ExitStack,
+) -> RecordingEntry:
+    """Start a recording: its directory, locked for as long as `held` holds, and its entry."""
+    name = _text(options.name or _name_of(source.path))
+    recording_id = directory.new_recording(name)
+    try:
+        if not held.enter_context(directory.writing(recording_id)):
+            raise StoreError(f"Another process is writing {directory.recording(recording_id)}.")
+        entry = RecordingEntry(
+            id=recording_id,
+            key=new_key(r.key for r in catalog.recordings()),
+            name=name,
+            tags={_text(key): _text(value) for key, value in options.tags.items()},
+            source={
+                "path": _text(str(source.path)),
+                "kind": source.kind,
+                "profile": source.profile,
+                "bytes": source.size_bytes,
+                "fingerprint": fingerprint,
+            },
+            created=time.time_ns(),
+            status="open",
+        )
+        catalog.put_recording(entry)
+    except BaseException:
+        directory.remove_recording(recording_id)
+        raise
+    return entry
+
+
+def _text(name: str) -> str:
+    """A name as text that MongoDB and JSON take: what is no UTF-8 in it as escapes."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def _copy(
@@ -238,7 +266,7 @@ def _end_of(source: Source) -> dict[str, Any]:
     losses = [
         {
             "cause": "source damaged",
-            "file": damage.file.name,
+            "file": _text(damage.file.name),
             "offset": damage.offset,
             "length": damage.length,
             "reason": damage.reason,
@@ -269,11 +297,10 @@ def _forget(
 def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:
     for known in catalog.recordings():
         if known.source.get("fingerprint") == fingerprint:
-            incomplete = ""
-            if known.status == "recovered":
-                incomplete = " (cut short by a crash)"
+            state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
             raise AlreadyRecordedError(
-                f"{source.path} is in the store already, as {known.id!r}{incomplete}. "
+                f"{source.path} is in the store already, as {known.id!r}"
+                f"{state.get(known.status, '')}. "
                 "Use --again to record it once more."
             )
 

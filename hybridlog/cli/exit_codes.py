@@ -17,6 +17,7 @@ EXIT_CODES: Final = {
     7: "no space left on the disk",
     8: "this content is in the store already",
     9: "an optional package is missing",
+    10: "fields are asked for that a message definition does not give",
     INTERNAL: "a mistake in hybridlog itself",
     130: "interrupted (Ctrl-C); nothing half-made is kept",
     143: "ended (SIGTERM); nothing half-made is kept",

@@ -151,7 +151,6 @@ class TableBuilder:
     def _finish(self, order: NDArray[np.intp] | None) -> Iterator[tuple[str, Finished]]:
         from hybridlog.frames.arrow import take
 
-        while self._columns:
-            path = next(iter(self._columns))
+        for path in list(self._columns):
             column = self._columns.pop(path).finish()
             yield path, column if order is None else take(column, order)

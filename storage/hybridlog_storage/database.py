@@ -100,7 +100,7 @@ class Database:
         self._address = address
 
     @classmethod
-    def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 10.0) -> Self:
+    def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
         """Connect and make sure that the server answers and is new enough.
 
         Args:

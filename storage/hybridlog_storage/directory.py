@@ -172,6 +172,15 @@ class StoreDirectory:
         return _numbered(self.recording(recording_id), OPEN_SUFFIX)
 
     @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from starting a recording meanwhile; for moments only."""
+        try:
+            with _alone(self.path / "recordings"):
+                yield
+        except OSError as error:
+            raise durability.explain(error, self.path, "locking") from error
+
+    @contextmanager
     def writing(self, recording_id: str) -> Iterator[bool]:
         """Hold a recording for writing; False when another process does."""
         path = self.recording(recording_id) / _LOCK

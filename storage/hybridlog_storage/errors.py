@@ -88,6 +88,10 @@ class DefinitionError(HybridlogError):
     fields stay out of the index.
     """
 
+    exit_code = 10
+
 
 class PayloadError(HybridlogError):
     """A payload that does not fit its definition."""
+
+    exit_code = 10

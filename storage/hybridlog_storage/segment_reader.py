@@ -7,6 +7,7 @@ names its place.
 from __future__ import annotations
 
 import os
+import stat
 import struct
 import zlib
 from collections.abc import Mapping
@@ -97,14 +98,18 @@ class SegmentReader:
     def __init__(self, path: Path, number: int) -> None:
         self.path = path
         self.number = number
+        cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            # Whatever lies there, opening it must not wait.
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         except OSError as error:
-            raise SegmentError(
-                f"Segment {path} cannot be opened: {error.strerror}. "
-                "Restore the file, or run `hybridlog verify` for a list of what is affected."
-            ) from error
-        self.size = os.fstat(self._fd).st_size
+            problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
+            raise SegmentError(problem) from error
+        about = os.fstat(self._fd)
+        if not stat.S_ISREG(about.st_mode):
+            self.close()
+            raise SegmentError(f"Segment {path} is no ordinary file. {cure}")
+        self.size = about.st_size
         self.bytes_read = 0
 
     def close(self) -> None:

@@ -47,7 +47,7 @@ def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> N
     assert "(left out: 3 messages do not fit their definition)" in done.err
     # Three topics whose names fall together without the rule have files of their own.
     assert len(list((tmp_path / "x").glob("a__b*.csv"))) == 3
-    run("export", tmp_path / "y", "-F", "csv", "-t", "/code", store=store, code=1)
+    run("export", tmp_path / "y", "-F", "csv", "-t", "/code", store=store, code=10)
     assert not (tmp_path / "y").exists()
 
 

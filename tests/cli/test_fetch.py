@@ -374,7 +374,7 @@ def test_a_type_that_changes_midway(store: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("topic", ["code", "recursive", "cbor", "no_definition"])
 def test_what_is_no_table_is_still_exact(topic: str, store: Path) -> None:
-    refused = run("fetch", "-t", topic, store=store, code=1)
+    refused = run("fetch", "-t", topic, store=store, code=10)
     assert "--format raw" in refused.err
     assert run("fetch", "-t", topic, "-F", "raw", store=store).raw
 

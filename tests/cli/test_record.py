@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
 
-from .running import recordings, run
+from .running import recordings, run, start
 
 
 def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
@@ -177,3 +179,25 @@ def test_real_logs(name: str, tmp_path: Path) -> None:
     done = run("record", DATA / name, "--json", "--store", tmp_path / "s")
     assert done.json["messages"] == done.json["messages_indexed"] > 0
     assert json.loads(run("verify", "--json", store=tmp_path / "s").out)["findings"] == []
+
+
+def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap"))
+    shutil.copy(logs / "odd.mcap", odd)
+    tag = os.fsdecode(b"who=Ren\xe9")
+    run("record", odd, "--tag", tag, "-q", store=tmp_path / "s")
+    (found,) = run("ls", "--json", store=tmp_path / "s").json
+    assert found["name"] == "caf\\xe9"
+    assert found["tags"] == {"who": "Ren\\xe9"}
+    assert "all is well" in run("verify", store=tmp_path / "s").out
+
+
+def test_one_log_recorded_three_times_at_once(logs: Path, tmp_path: Path) -> None:
+    with (tmp_path / "out").open("wb") as output:
+        three = [
+            start("record", logs / "small.bag", "--store", tmp_path / "s", output=output)
+            for _ in range(3)
+        ]
+        codes = sorted(process.wait(120) for process in three)
+    assert codes == [0, 8, 8], (tmp_path / "out").read_text()
+    assert recordings(tmp_path / "s") == ["small"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -232,3 +233,11 @@ def test_zero_messages_make_a_valid_segment(tmp_path: Path) -> None:
         list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages()) == []
     )
     shutil.rmtree(tmp_path)
+
+
+def test_what_lies_in_the_place_of_a_segment(tmp_path: Path) -> None:
+    for number, make in enumerate((os.mkfifo, os.mkdir)):
+        path = tmp_path / f"{number:06d}.mcap"
+        make(path)
+        with pytest.raises(SegmentError, match="no ordinary file"):
+            SegmentReader(path, number)
