@@ -87,17 +87,26 @@ class Message:
     )
 
     def __init__(
-        self, lane: Lane, batch: Batch, seq: NDArray[np.int64], row: int, documents: _Documents
+        self,
+        lane: Lane,
+        *,
+        log_time: int,
+        publish_time: int,
+        sequence: int,
+        seq: int,
+        view: memoryview,
+        documents: _Documents,
+        row: int,
     ) -> None:
         channel = lane.channel
         self.topic = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
-        self.log_time_ns = int(batch.log_time[row])
-        self.publish_time_ns = int(batch.publish_time[row]) if channel.has_publish_time else None
-        self.sequence = int(batch.sequence[row])
-        self.seq = int(seq[row])
+        self.log_time_ns = log_time
+        self.publish_time_ns = publish_time if channel.has_publish_time else None
+        self.sequence = sequence
+        self.seq = seq
         self.recording = lane.recording.id
-        self._view = batch.payload(row)
+        self._view = view
         self._codec = lane.codec
         self._documents = documents
         self._row = row
@@ -170,6 +179,34 @@ class _Documents:
         for group in self._lanes[lane].codec.bodies(part.buffer, part.offset, part.length):
             for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
                 self._bodies[row] = body.tobytes()
+
+
+def _messages(lanes: Sequence[Lane], piece: Piece) -> Iterator[Message]:
+    batch = piece.batch
+    documents = _Documents(lanes, batch)
+    view = memoryview(batch.buffer)
+    # Columns become lists at once: one number at a time is the slow way out of an array.
+    columns = (
+        batch.channel,
+        batch.log_time,
+        batch.publish_time,
+        batch.sequence,
+        piece.seq,
+        batch.offset,
+        batch.length,
+    )
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    for row, (lane, log_time, publish_time, sequence, seq, start, size) in enumerate(rows):
+        yield Message(
+            lanes[lane],
+            log_time=log_time,
+            publish_time=publish_time,
+            sequence=sequence,
+            seq=seq,
+            view=view[start : start + size],
+            documents=documents,
+            row=row,
+        )
 
 
 @dataclass(frozen=True)
@@ -334,9 +371,7 @@ class Query:
         """The messages, ordered by log time, recording and arrival."""
         plan = self.plan()
         for piece in self.pieces(plan):
-            documents = _Documents(plan.lanes, piece.batch)
-            for row, lane in enumerate(piece.batch.channel.tolist()):
-                yield Message(plan.lanes[lane], piece.batch, piece.seq, row, documents)
+            yield from _messages(plan.lanes, piece)
 
     def first(self) -> Message | None:
         """The first message, None when there is none."""

@@ -284,6 +284,9 @@ class Sweep:
         bounds = task.target.bounds
         if bounds is not None:
             mask &= self._inside(batch, lane_of, mask, bounds)
+        if mask.all():
+            batch.channel = lane_of
+            return Piece(batch, seq)
         rows = np.flatnonzero(mask)
         own = batch.take(rows)
         own.channel = lane_of[rows]

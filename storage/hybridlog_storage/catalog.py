@@ -19,6 +19,7 @@ RECORDINGS: Final = "hybridlog.recordings"
 SCHEMAS: Final = "hybridlog.schemas"
 CHUNKS: Final = "hybridlog.chunks"
 LOSSES: Final = "hybridlog.losses"
+_CHUNK_ENTRIES = 500  # decoded at once; as dictionaries they take some kilobytes each
 
 
 @dataclass(slots=True)
@@ -231,7 +232,8 @@ class Catalog:
             of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
         if of_channel:
             query["ch"] = {"$elemMatch": of_channel}
-        return [_chunk_entry(d) for d in self._db.find(CHUNKS, query)]
+        found = self._db.find(CHUNKS, query, batch_size=_CHUNK_ENTRIES)
+        return [_chunk_entry(document) for document in found]
 
     def forget_chunk_entries(self, recording: str) -> None:
         """Remove the chunk entries of a recording."""

@@ -315,6 +315,7 @@ class Database:
         *,
         sort: Sort | None = None,
         limit: int = 0,
+        batch_size: int = 0,
         max_time_ms: int | None = None,
     ) -> Iterator[Document]:
         """Documents one by one; for small answers. Arguments as in `find_raw`."""
@@ -324,6 +325,7 @@ class Database:
                 None if projection is None else dict(projection),
                 sort=sort or None,
                 limit=limit,
+                batch_size=batch_size,
                 max_time_ms=max_time_ms,
             )
             with cursor:
