@@ -622,8 +622,14 @@ class Query:
         """The plan's messages, thinned out and limited."""
         if self._limit == 0:
             return
+        pieces = Sweep(plan, self.store.segment).pieces()
+        if self.is_unthinned:
+            for piece in pieces:
+                count_given(plan.counters, piece.batch)
+                yield piece
+            return
         taken = given = 0
-        for piece in Sweep(plan, self.store.segment).pieces():
+        for piece in pieces:
             count = len(piece.batch)
             rows = np.arange((-taken) % self._every, count, self._every)
             taken += count

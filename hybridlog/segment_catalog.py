@@ -57,6 +57,8 @@ class SegmentCatalog:
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
         longest: int | None = None,
+        *,
+        brief: bool = False,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range.
 

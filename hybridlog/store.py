@@ -304,12 +304,12 @@ class Store:
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range."""
         if recording.status == "open":
-            return self.catalog.chunks(recording.id, channels, bounds, clock)
+            return self.catalog.chunks(recording.id, channels, bounds, clock, brief=True)
         wanted = set(channels)
         longest = max((c.stats.longest for c in recording.channels if c.id in wanted), default=0)
 
         def fetch(within: tuple[int, int] | None) -> list[ChunkEntry]:
-            return self.catalog.chunks(recording.id, channels, within, clock, longest)
+            return self.catalog.chunks(recording.id, channels, within, clock, longest, brief=True)
 
         if bounds is None or clock != "log":
             return fetch(bounds)

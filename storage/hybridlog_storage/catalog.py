@@ -19,6 +19,10 @@ RECORDINGS: Final = "hybridlog.recordings"
 SCHEMAS: Final = "hybridlog.schemas"
 CHUNKS: Final = "hybridlog.chunks"
 LOSSES: Final = "hybridlog.losses"
+_BRIEF: Final = {
+    **dict.fromkeys(("rec", "seg", "len", "trailer", "first", "last"), 1),
+    **{f"ch.{name}": 1 for name in ("c", "messages", "first", "last")},
+}
 _CHUNK_ENTRIES = 500  # decoded at once; as dictionaries they take some kilobytes each
 
 
@@ -209,6 +213,8 @@ class Catalog:
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
         longest: int | None = None,
+        *,
+        brief: bool = False,
     ) -> list[ChunkEntry]:
         """Chunks of a recording that may hold messages of some channels in a time range.
 
@@ -219,6 +225,8 @@ class Catalog:
             clock: `log`, `publish` or `header`: which time `bounds` is about.
             longest: Most log time that a chunk spans, ns, if known: no chunk that begins
                 earlier than that before `bounds` needs to be looked at.
+            brief: Of each channel only how many messages there are, and their first and
+                last log time.
         """
         query: dict[str, Any] = {"rec": recording}
         of_channel: dict[str, Any] = {}
@@ -232,7 +240,7 @@ class Catalog:
             of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
         if of_channel:
             query["ch"] = {"$elemMatch": of_channel}
-        found = self._db.find(CHUNKS, query, batch_size=_CHUNK_ENTRIES)
+        found = self._db.find(CHUNKS, query, _BRIEF if brief else None, batch_size=_CHUNK_ENTRIES)
         return [_chunk_entry(document) for document in found]
 
     def forget_chunk_entries(self, recording: str) -> None:

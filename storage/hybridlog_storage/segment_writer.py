@@ -85,7 +85,7 @@ class SegmentSettings:
     """
 
     chunk_size: int = 2 << 20
-    chunk_span_ns: int = 200_000_000
+    chunk_span_ns: int = 250_000_000
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 1
