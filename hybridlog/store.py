@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -353,7 +354,10 @@ class Store:
         from hybridlog.sources.detect import open_source
         from hybridlog.sources.fingerprint import fingerprint
 
-        with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
+        with (
+            open_source(Path(log)) if isinstance(log, str | Path) else log as source,
+            self.directory.using_index(),
+        ):
             report = record(
                 source,
                 self.directory,
@@ -381,7 +385,9 @@ class Store:
 
     def reindex(self, progress: maintenance.Progress | None = None) -> list[RecordingEntry]:
         """Drop the index and make it again from the segments."""
-        found = maintenance.reindex(self.directory, self.database_for("reindex"), progress)
+        database = self.database_for("reindex")
+        with self.directory.using_index(rebuild=True):
+            found = maintenance.reindex(self.directory, database, progress)
         self.refresh()
         return found
 
@@ -391,19 +397,23 @@ class Store:
         progress: maintenance.Progress | None = None,
     ) -> maintenance.Verification:
         """Read everything, check checksums, compare the index with the segments."""
-        chosen = (
-            self.directory.recording_ids()
-            if recordings is None
-            else [r.id for r in self.select(recordings)]
-        )
-        return maintenance.verify(self.directory, self.database_for("verify"), chosen, progress)
+        database = self.database_for("verify")
+        with self.directory.using_index():
+            chosen = (
+                self.directory.recording_ids()
+                if recordings is None
+                else [r.id for r in self.select(recordings)]
+            )
+            return maintenance.verify(self.directory, database, chosen, progress)
 
     def remove(self, recording: str) -> None:
         """Delete a recording: first from the catalog, then its files."""
-        entry = self.select([recording])[0]
         database = self.database_for("Removing a recording")
-        with self.directory.writing(entry.id) as mine:
-            if not mine:
+        with ExitStack() as held:
+            held.enter_context(self.directory.using_index())
+            self.refresh()
+            entry = self.select([recording])[0]
+            if not held.enter_context(self.directory.writing(entry.id)):
                 raise maintenance.being_written(entry.id)
             Catalog(database).remove_recording(
                 entry.id, {collection_of(c.topic) for c in entry.channels}

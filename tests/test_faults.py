@@ -807,15 +807,26 @@ def test_opening_leaves_a_running_recording_alone(path: Path, robot: Path) -> No
 
 def test_reindex_does_not_cost_a_running_recording_its_index(path: Path, robot: Path) -> None:
     with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
-        # Either it refuses, or what it drops is made again.
-        try:
+        with pytest.raises(StoreError, match="is in use"):
             store.reindex()
-        except StoreError:
-            pass
     (report,) = writing.result
     assert not isinstance(report, Exception), report
     with hl.open(path, require_database=True) as store:
         assert store.verify().findings == []
+
+
+def test_while_the_index_is_made_anew_nobody_relies_on_it(store: hl.Store, robot: Path) -> None:
+    with hl.open(store.directory.path) as other, other.directory.using_index(rebuild=True):
+        for use in (
+            store.verify,
+            lambda: store.record(robot),
+            lambda: store.remove("short"),
+            store.reindex,
+        ):
+            with pytest.raises(StoreError, match="is in use"):
+                use()
+    assert [r.id for r in store.recordings()] == ["short"]
+    assert store.verify().findings == []
 
 
 def test_a_running_recording_cannot_be_removed(path: Path, robot: Path) -> None:

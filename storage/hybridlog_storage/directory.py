@@ -181,6 +181,35 @@ class StoreDirectory:
             raise durability.explain(error, self.path, "locking") from error
 
     @contextmanager
+    def using_index(self, *, rebuild: bool = False) -> Iterator[None]:
+        """Keep the index from being made anew meanwhile; or, to do just that, be alone.
+
+        Raises:
+            StoreError: Another process makes it anew, or uses it.
+        """
+        path = self.path / _SETTINGS
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise durability.explain(error, path, "locking") from error
+        try:
+            fcntl.flock(fd, (fcntl.LOCK_EX if rebuild else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(fd)
+            doing = (
+                "a recording is being written, checked or removed"
+                if rebuild
+                else "its index is being made anew"
+            )
+            raise StoreError(
+                f"The store {self.path} is in use: {doing}. Run the command again after that."
+            ) from error
+        try:
+            yield
+        finally:
+            os.close(fd)
+
+    @contextmanager
     def writing(self, recording_id: str) -> Iterator[bool]:
         """Hold a recording for writing; False when another process does."""
         path = self.recording(recording_id) / _LOCK
