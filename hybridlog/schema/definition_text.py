@@ -22,7 +22,7 @@ _FIELD = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
     r"(?:<=(?P<text_bound>[0-9]{1,10}))?"
     r"(?P<array>\[(?P<at_most><=)?(?P<count>[0-9]{0,10})\])?"
-    r"[ \t]+(?P<name>[A-Za-z0-9_]+)"
+    r"[ \t]+(?P<name>[A-Za-z0-9_]+)(?=[ \t=#]|\Z)"
     r"[ \t]*(?P<rest>.*)\Z"
 )
 

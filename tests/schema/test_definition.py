@@ -437,6 +437,8 @@ def test_idl_that_is_refused(body, reason):
     [
         ("uint8\n", "line 1 is no field"),
         ("\nuint8 a\n??\n", "line 3 is no field"),
+        ("uint8 a.b\n", "line 1 is no field"),
+        ("uint8 a; import os\n", "line 1 is no field"),
         ("uint8 a\nuint8 a\n", "two fields named a"),
         ("uint8 9a\n", "cannot be named '9a'"),
         ("uint8 _a\n", "cannot be named '_a'"),
