@@ -136,6 +136,11 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     return f"{number} {what if number == 1 else plural or what + 's'}"
 
 
+def stored(messages: int) -> str:
+    """That so many messages are there: `1 message is stored`."""
+    return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
+
+
 def unfit(messages: int) -> str:
     """That so many messages cannot be read: `1 message does not fit its definition`."""
     verb = "does not fit its" if messages == 1 else "do not fit their"

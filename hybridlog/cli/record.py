@@ -382,13 +382,13 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
         output.note(f"{damage.file}{place}: {damage.reason}{lost}")
     if report.failure is not None:
         output.note(
-            f"hybridlog: {report.failure} {output.counted(report.missed, 'message')} are stored "
+            f"hybridlog: {report.failure} {output.stored(report.missed)} "
             "but not in the index; the next command that opens the store catches up."
         )
         problems.append(DatabaseError(str(report.failure)))
     if report.damage:
         output.note(
-            f"{path} is damaged: {output.counted(report.entry.messages, 'message')} are stored, "
+            f"{path} is damaged: {output.stored(report.entry.messages)}, "
             f"{output.counted(len(report.damage), 'place')} could not be read."
         )
         problems.append(SourceDamagedError(str(path)))
