@@ -82,10 +82,16 @@ class ExportFormat(StrEnum):
     BAG = "bag"
 
 
+# Paths are judged by the library, whose errors have messages and exit codes of their own:
+# hence `readable=False` on each, which leaves typer's own check out.
 StoreOption = Annotated[
     Path | None,
     typer.Option(
-        "--store", envvar="HYBRIDLOG_STORE", help="Directory of the store.", metavar="DIR"
+        "--store",
+        envvar="HYBRIDLOG_STORE",
+        help="Directory of the store.",
+        metavar="DIR",
+        readable=False,
     ),
 ]
 MongoOption = Annotated[
@@ -140,7 +146,9 @@ def record(
     paths: Annotated[
         list[Path],
         typer.Argument(
-            help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.", metavar="PATH"
+            help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.",
+            metavar="PATH",
+            readable=False,
         ),
     ],
     store: StoreOption = None,
@@ -314,6 +322,7 @@ def fetch(
             "-o",
             help="Write to this file (raw: a directory); - is standard output.",
             metavar="FILE",
+            readable=False,
         ),
     ] = None,
     force: ForceOption = False,
@@ -354,7 +363,9 @@ def fetch(
 def export(
     output: Annotated[
         Path,
-        typer.Argument(help="File (mcap, bag) or directory (parquet, csv).", metavar="OUTPUT"),
+        typer.Argument(
+            help="File (mcap, bag) or directory (parquet, csv).", metavar="OUTPUT", readable=False
+        ),
     ],
     form: Annotated[
         ExportFormat | None,
@@ -442,7 +453,9 @@ def rm(
 def demo(
     directory: Annotated[
         Path,
-        typer.Argument(help="Where the bag and the store of the demo go.", metavar="DIRECTORY"),
+        typer.Argument(
+            help="Where the bag and the store of the demo go.", metavar="DIRECTORY", readable=False
+        ),
     ] = Path("hybridlog-demo"),
     duration: Annotated[
         float, typer.Option(help="Seconds of robot time.", metavar="SECONDS", min=5)

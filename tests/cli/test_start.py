@@ -5,10 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+import typing
 from pathlib import Path
 
 import pytest
 
+from hybridlog.cli.app import app
 from hybridlog.cli.main import EXIT_CODES
 
 from .running import COMMAND, environment, run
@@ -114,3 +116,15 @@ def test_completion(store: Path) -> None:
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
     assert "--between" in complete("fetch --be")
     assert complete("info --store /nowhere r") == []
+
+
+def test_paths_are_judged_by_the_library() -> None:
+    """Its errors say what to do and have exit codes of their own; typer's have neither."""
+    seen = 0
+    for command in app.registered_commands:
+        assert command.callback is not None
+        for hint in typing.get_type_hints(command.callback, include_extras=True).values():
+            if typing.get_origin(hint) is typing.Annotated and "Path" in str(hint.__origin__):
+                seen += 1
+                assert not hint.__metadata__[0].readable, (command.callback.__name__, hint)
+    assert seen > 10
