@@ -214,13 +214,11 @@ class IndexWriter:
             if self.failure is None:
                 for collection, tables in parcel.documents.items():
                     self._ensure(collection)
-                    lengths = [np.full(len(table), table.shape[1], np.int64) for table in tables]
-                    self._database.insert_raw(
-                        collection,
-                        b"".join(table.data for table in tables),
-                        sum(map(len, lengths)),
-                        lengths=np.concatenate(lengths),
+                    lengths = np.concatenate(
+                        [np.full(len(table), table.shape[1], np.int64) for table in tables]
                     )
+                    data = b"".join(table.data for table in tables)
+                    self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
                 self._catalog.put_chunks(parcel.entries)
         except DatabaseError as error:
             with self._lock:

@@ -323,6 +323,10 @@ class Query:
             TopicError: there is none.
             UsageError: the question has a time range, or another clock than the log's.
         """
+        return self._current(moment)[0]
+
+    def _current(self, moment: TimeLike) -> tuple[Query, Message]:
+        """The message that was current at a time, and the question that has it as its answer."""
         if self._bounds is not None or self._clock != "log":
             raise UsageError(
                 "A message at a time is the last one by log time; `between` and `clock` do not fit."
@@ -333,7 +337,7 @@ class Query:
             now = parse_time(moment, start=start, end=end)
             if recording.span is not None and now >= start:
                 moments.append((min(now, end - 1), now, recording))
-        best: tuple[tuple[int, int, int], Query] | None = None
+        best: tuple[tuple[int, int, int], Query, Message] | None = None
         # The recording that could hold the latest message is asked first: mostly it does.
         for latest, now, recording in sorted(moments, key=lambda m: m[0], reverse=True):
             if best is not None and latest < best[0][0]:
@@ -349,9 +353,9 @@ class Query:
             if found is not None:
                 place = found.log_time_ns, recording.key, found.seq
                 if best is None or place > best[0]:
-                    best = place, query
+                    best = place, query, found
         if best is not None:
-            return best[1]
+            return best[1], best[2]
         raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
 
     def at(self, moment: TimeLike) -> Message:
@@ -361,9 +365,7 @@ class Query:
             TopicError: there is none.
             UsageError: the question has a time range, or another clock than the log's.
         """
-        found = self.just_at(moment).first()
-        assert found is not None
-        return found
+        return self._current(moment)[1]
 
     # Answers.
 
@@ -411,7 +413,7 @@ class Query:
         """The index documents of one of the topics, in the order of the messages."""
         import bson
 
-        for raw, rows in self.thinned_documents(topic, None):
+        for raw, rows, _ in self.thinned_documents(topic, None):
             documents = bson.decode_all(raw)
             yield from (documents[row] for row in rows.tolist())
 
@@ -716,11 +718,12 @@ class Query:
 
     def thinned_documents(
         self, topic: str, projection: Mapping[str, object] | None
-    ) -> Iterator[tuple[bytes, NDArray[np.intp]]]:
+    ) -> Iterator[tuple[bytes, NDArray[np.intp], int]]:
         """The index documents of one topic, in key order, as raw batches.
 
         Yields:
-            BSON documents one after the other, and which of them the answer has.
+            BSON documents one after the other, which of them the answer has, and how many
+            documents came before them.
         """
         from hybridlog_storage.bson_columns import split
 
@@ -746,11 +749,11 @@ class Query:
             rows = np.arange((-taken) % self._every, count, self._every)
             if self._limit is not None:
                 rows = rows[: self._limit - given]
-            taken += count
             given += len(rows)
             self.counters.documents_read += count
             self.counters.elapsed_s = time.monotonic() - started
-            yield raw, rows
+            yield raw, rows, taken
+            taken += count
             if self._limit is not None and given >= self._limit:
                 return
 

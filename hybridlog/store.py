@@ -427,16 +427,19 @@ class Store:
     def _claim(self, database: Database) -> None:
         """Make sure that the database is this store's, and nobody else's."""
         mine = self.directory.settings.store_id
-        check_unclaimed(database, mine)
-        database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
+        if not check_claim(database, mine):
+            database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
 
 
-def check_unclaimed(database: Database, store_id: str | None = None) -> None:
+def check_claim(database: Database, store_id: str | None = None) -> bool:
     """Check that a database holds no index but that of one store.
 
     Args:
         database: Connected.
         store_id: The store; None for one that is yet to be made.
+
+    Returns:
+        Whether it is that store's already.
 
     Raises:
         StoreError: it holds the index of another one.
@@ -447,6 +450,7 @@ def check_unclaimed(database: Database, store_id: str | None = None) -> None:
             f"The database {database.name!r} at {database.address} holds the index of "
             "another store. Name a database of its own in the URI: mongodb://host/NAME."
         )
+    return mark is not None
 
 
 def _listed(names: Sequence[str]) -> str:

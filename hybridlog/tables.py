@@ -231,12 +231,10 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
 def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:
     """Blocks of the fields asked for, in groups that are in the order of the index."""
     from hybridlog.frames.bson import records_from_bson
-    from hybridlog_storage.bson_columns import split
 
     topic = query.topics[0]
     projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
-    before = 0
-    for raw, rows in query.thinned_documents(topic, projection):
+    for raw, rows, before in query.thinned_documents(topic, projection):
         group = []
         # Documents that lack a field (an array too short for a summary) form parts.
         for part in records_from_bson(raw, types):
@@ -250,4 +248,3 @@ def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]
             place = -places if query.is_reversed else places
             group.append(Block(topic, reference.t, place, records, 0))
         yield group
-        before += len(split(raw))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import sys
 import traceback
@@ -11,7 +10,7 @@ from typing import NoReturn, TextIO
 
 from hybridlog.cli import stopping
 from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
-from hybridlog_storage.errors import DiskFullError, HybridlogError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
 
@@ -92,8 +91,7 @@ def _leave(code: int) -> NoReturn:
 
 
 def _code_of(error: OSError) -> int:
-    full = error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-    return DiskFullError.exit_code if full else HybridlogError.exit_code
+    return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
 
 
 def _let_go(stream: TextIO) -> None:

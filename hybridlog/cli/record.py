@@ -81,7 +81,7 @@ def run(paths: list[Path], choices: Choices) -> None:
 
 def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
     """Before a store is made: what cannot succeed should leave nothing behind."""
-    from hybridlog.store import EMBEDDED, check_unclaimed, store_path
+    from hybridlog.store import EMBEDDED, check_claim, store_path
 
     if (store_path(choices.store) / "hybridlog.toml").exists():
         return
@@ -105,7 +105,7 @@ def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
         from hybridlog_storage.database import Database
 
         with Database.connect(choices.mongo) as database:
-            check_unclaimed(database)
+            check_claim(database)
 
 
 def _record_one(

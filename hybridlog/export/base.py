@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
 
 from hybridlog_storage.durability import sync_directory
-from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
 """Where a writer writes: a path, or a binary stream, which is left open."""
 
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _WRONG_PLACE = {
     errno.ENOENT,
     errno.ENOTDIR,
@@ -291,7 +290,7 @@ def failures(name: str) -> Iterator[None]:
 def explain(error: OSError, name: str) -> HybridlogError:
     """The error of our tree for a failure in writing an output."""
     reason = error.strerror or str(error)
-    if error.errno in _FULL:
+    if error.errno in NO_SPACE:
         return DiskFullError(
             f"no space left for {name}: {reason}; free some, or write to another place with -o"
         )

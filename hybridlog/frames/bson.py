@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, concatenate, take
 from hybridlog_storage.bson_columns import BsonStringArrays, BsonStrings, read_columns
 from hybridlog_storage.errors import StoreError
 
@@ -338,7 +338,7 @@ def _joined(
         rows = np.concatenate([rows for rows, _ in alike])
         order = np.argsort(rows)
         columns = {
-            path: take(_concatenated([each[path] for _, each in alike]), order) for path in paths
+            path: take(concatenate([each[path] for _, each in alike]), order) for path in paths
         }
         joined.append((rows[order], columns))
     return joined
@@ -355,24 +355,6 @@ def _signature(column: Column) -> str:
         return "[]" if empty else f"[{_signature(column.values)}]"
     inner = (f"{name}:{_signature(value)}" for name, value in column.fields.items())
     return f"{{{','.join(inner)}}}"
-
-
-def _concatenated(columns: Sequence[Any]) -> Column:
-    """Columns of one signature as one."""
-    first = columns[0]
-    if isinstance(first, Scalars):
-        return Scalars(np.concatenate([column.values for column in columns]), first.kind)
-    if isinstance(first, Records):
-        fields = {n: _concatenated([c.fields[n] for c in columns]) for n in first.fields}
-        return Records(fields, sum(column.rows for column in columns))
-    length = np.concatenate([np.diff(column.offset) for column in columns])
-    offset = np.zeros(len(length) + 1, np.int64)
-    np.cumsum(length, out=offset[1:])
-    if isinstance(first, Strings):
-        return Strings(
-            np.concatenate([c.data[int(c.offset[0]) : int(c.offset[-1])] for c in columns]), offset
-        )
-    return Arrays(_concatenated([column.values for column in columns]), offset)
 
 
 def _nested(columns: Mapping[str, Column], rows: int) -> Records:

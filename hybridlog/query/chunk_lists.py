@@ -43,13 +43,15 @@ class ChunkLists:
                 or in all times.
         """
         key = recording, frozenset(channels)
-        if key not in self._lists:
-            if key not in self._asked:
-                self._asked.add(key)
-                return fetch(bounds)
+        if key in self._lists:
+            kept = self._lists[key]
+        elif key not in self._asked:
+            self._asked.add(key)
+            kept = None
+        else:
             everything = fetch(None)
-            self._lists[key] = _ChunkList(everything, key[1]) if len(everything) <= _MOST else None
-        kept = self._lists[key]
+            kept = _ChunkList(everything, key[1]) if len(everything) <= _MOST else None
+            self._lists[key] = kept
         return fetch(bounds) if kept is None else kept.between(*bounds)
 
     def clear(self) -> None:
@@ -62,20 +64,12 @@ class _ChunkList:
     """Chunks by the time at which they begin."""
 
     def __init__(self, chunks: Sequence[ChunkEntry], channels: frozenset[int]) -> None:
-        held, firsts, lasts = [], [], []
-        for row, chunk in enumerate(chunks):
-            stats = [s for c, s in chunk.stats.items() if c in channels]
-            begins = [s.first for s in stats if s.first is not None]
-            ends = [s.last for s in stats if s.last is not None]
-            if begins and ends:
-                held.append(row)
-                firsts.append(min(begins))
-                lasts.append(max(ends))
-        first, last = np.array(firsts, np.int64), np.array(lasts, np.int64)
-        order = np.argsort(first, kind="stable")
-        self._chunks = [chunks[held[row]] for row in order.tolist()]
-        self._first, self._last = first[order], last[order]
-        self._longest = int((last - first).max()) if held else 0
+        held = [(chunk, span) for chunk in chunks if (span := chunk.span(channels)) is not None]
+        held.sort(key=lambda item: item[1][0])
+        self._chunks = [chunk for chunk, _ in held]
+        spans = np.array([span for _, span in held], np.int64).reshape(-1, 2)
+        self._first, self._last = np.ascontiguousarray(spans.T)
+        self._longest = int((self._last - self._first).max()) if held else 0
 
     def between(self, begin: int, end: int) -> list[ChunkEntry]:
         low = int(np.searchsorted(self._first, begin - self._longest))

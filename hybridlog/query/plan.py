@@ -159,12 +159,10 @@ class Plan:
         found = []
         for target in self.targets:
             for chunk in target.chunks:
-                stats = [s for c, s in chunk.stats.items() if c in target.lanes]
-                firsts = [s.first for s in stats if s.first is not None]
-                lasts = [s.last for s in stats if s.last is not None]
-                if firsts:
-                    count = sum(s.messages for s in stats)
-                    found.append(Task(target, chunk, min(firsts), max(lasts), count))
+                span = chunk.span(target.lanes)
+                if span is not None:
+                    count = sum(s.messages for c, s in chunk.stats.items() if c in target.lanes)
+                    found.append(Task(target, chunk, *span, count))
         if self.reverse:
             return sorted(found, key=lambda t: (-t.last, t.key))
         return sorted(found, key=lambda t: (t.first, t.key))

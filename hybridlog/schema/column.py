@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 
@@ -122,6 +124,25 @@ def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64])
     # An index of eight bytes an element would be larger than what it picks.
     ends = (start + count).tolist()
     return np.concatenate([data[a:b] for a, b in zip(start.tolist(), ends, strict=True)])
+
+
+def concatenate(columns: Sequence[AnyColumn]) -> AnyColumn:
+    """The rows of several columns of one type, one column after the other."""
+    return cast("AnyColumn", _concatenate(columns))
+
+
+def _concatenate(columns: Sequence[Any]) -> Column:
+    first = columns[0]
+    if isinstance(first, Scalars):
+        return Scalars(np.concatenate([column.values for column in columns]), first.kind)
+    if isinstance(first, Records):
+        fields = {name: _concatenate([c.fields[name] for c in columns]) for name in first.fields}
+        return Records(fields, sum(column.rows for column in columns))
+    offset = offsets(np.concatenate([np.diff(column.offset) for column in columns]))
+    if isinstance(first, Strings):
+        data = [c.data[int(c.offset[0]) : int(c.offset[-1])] for c in columns]
+        return Strings(np.concatenate(data), offset)
+    return Arrays(_concatenate([column.values for column in columns]), offset, first.width)
 
 
 def ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.intp]:

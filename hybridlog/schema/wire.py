@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hybridlog.schema.column import Records, take
-from hybridlog.schema.wire_gather import Source, concatenate
+from hybridlog.schema.column import Records, concatenate, take
+from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
 from hybridlog.schema.wire_scan import MisfitError, Scanner
 from hybridlog.schema.wire_walk import Walker
@@ -155,9 +155,7 @@ class WireReader:
             return second_rows, second
         both = np.concatenate([first_rows, second_rows])
         order = np.argsort(both)
-        merged = take(concatenate(first, second), order)
-        assert isinstance(merged, Records)
-        return both[order], merged
+        return both[order], take(concatenate([first, second]), order)
 
     def _read(
         self,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
-from hybridlog.schema.column import AnyColumn, Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.column import Arrays, Column, Scalars
 from hybridlog.schema.definition import Instant, Primitive
 
 if TYPE_CHECKING:
@@ -173,42 +173,6 @@ def empty_fixed(item: Fixed) -> Column:
 def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
     """Offsets of rows of `width` elements each: int64[rows + 1]."""
     return np.arange(rows + 1, dtype=np.int64) * width
-
-
-def within(counts: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of each element within its row: 0, 1, ..., counts[0] - 1, 0, 1, ..."""
-    index = np.arange(int(offset[-1]), dtype=np.int64)
-    index -= np.repeat(offset[:-1], counts)
-    return index
-
-
-def concatenate(first: AnyColumn, second: AnyColumn) -> AnyColumn:
-    """The rows of one column, then those of another of the same type."""
-    result: Column
-    if isinstance(first, Scalars) and isinstance(second, Scalars):
-        result = Scalars(np.concatenate([first.values, second.values]), first.kind)
-    elif isinstance(first, Strings) and isinstance(second, Strings):
-        result = Strings(
-            np.concatenate([first.data, second.data]), _join_offsets(first.offset, second.offset)
-        )
-    elif isinstance(first, Arrays) and isinstance(second, Arrays):
-        result = Arrays(
-            concatenate(first.values, second.values),
-            _join_offsets(first.offset, second.offset),
-            first.width,
-        )
-    else:
-        assert isinstance(first, Records)
-        assert isinstance(second, Records)
-        result = Records(
-            {name: concatenate(first.fields[name], second.fields[name]) for name in first.fields},
-            first.rows + second.rows,
-        )
-    return cast("AnyColumn", result)
-
-
-def _join_offsets(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate([first, second[1:] + first[-1]])
 
 
 def _even_stride(base: NDArray[np.int64]) -> int:

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Column, Scalars, Strings, offsets
+from hybridlog.schema.column import Arrays, Column, Scalars, Strings, offsets, ranges
 from hybridlog.schema.wire_gather import (
     Source,
     empty_fixed,
     even_offsets,
-    within,
 )
 from hybridlog.schema.wire_program import (
     ArrayStep,
@@ -346,7 +345,7 @@ class Walker:
         extra = firsts - stride
         ends = start + np.where(counts > 0, counts * stride + extra, 0)
         cursor.move_or_step(ends, self._least_known())
-        index = within(counts, offsets(counts))
+        index = ranges(np.zeros_like(counts), counts)
         starts = np.repeat(start, counts)
         starts += index * stride
         starts += np.where(index > 0, np.repeat(extra, counts), 0)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import zstandard
 
 from hybridlog.sources.base import cannot_open
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import NO_SPACE, SourceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,13 +109,10 @@ def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | 
             spooled.problem = fill(target, room)
         except BaseException as error:
             spooled.remove()
-            if isinstance(error, OSError) and error.errno in _FULL:
+            if isinstance(error, OSError) and error.errno in NO_SPACE:
                 raise _no_room(path, folder) from error
             raise
     return spooled
-
-
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:

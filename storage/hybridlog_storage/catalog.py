@@ -8,7 +8,7 @@ crash left out is found by comparing entries with the segment's own list of chun
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final, cast
 
@@ -150,6 +150,13 @@ class ChunkEntry:
     last: int
     stats: dict[int, ChannelStats]
 
+    def span(self, channels: Container[int]) -> tuple[int, int] | None:
+        """First and last log time of some channels in it, None when it has none of them."""
+        stats = [s for c, s in self.stats.items() if c in channels]
+        firsts = [s.first for s in stats if s.first is not None]
+        lasts = [s.last for s in stats if s.last is not None]
+        return (min(firsts), max(lasts)) if firsts and lasts else None
+
 
 class Catalog:
     """The catalog collections of a database."""
@@ -242,10 +249,6 @@ class Catalog:
             query["ch"] = {"$elemMatch": of_channel}
         found = self._db.find(CHUNKS, query, _BRIEF if brief else None, batch_size=_CHUNK_ENTRIES)
         return [_chunk_entry(document) for document in found]
-
-    def forget_chunk_entries(self, recording: str) -> None:
-        """Remove the chunk entries of a recording."""
-        self._db.delete(CHUNKS, {"rec": recording})
 
     def remove_recording(self, recording: str, collections: Iterable[str]) -> None:
         """Remove every trace of a recording from the database."""

@@ -76,7 +76,7 @@ class ChunkBuilder:
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]
-        content = memoryview(buffer.data)[:used]
+        content = buffer.data[:used]
         whole = Batch(
             content,
             np.concatenate([b.offset for b in batches]),

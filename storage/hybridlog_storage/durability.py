@@ -16,15 +16,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hybridlog_storage.errors import DiskFullError, HybridlogError, StoreError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError
 from hybridlog_storage.messages import Buffer
-
-_NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
     """The error of our tree for an operating system error on a file of the store."""
-    if error.errno in _NO_SPACE:
+    if error.errno in NO_SPACE:
         return DiskFullError(
             f"No space left while {doing} {path}. Free some space and run the command again."
         )

@@ -8,7 +8,11 @@ zstandard, pyarrow, rosbags) are mapped to one of these where they are caught.
 
 from __future__ import annotations
 
-from typing import ClassVar
+import errno
+from typing import ClassVar, Final
+
+NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Numbers of system errors that mean that nothing more can be written."""
 
 
 class HybridlogError(Exception):
