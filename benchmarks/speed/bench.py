@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.memory import wait_for_mongods
-from benchmarks.results import Finding, Outcome, Sample, figure
+from benchmarks.speed.results import Finding, Outcome, Sample, figure
 from benchmarks.side import LINGER_S, Values, run_side
 
 if TYPE_CHECKING:

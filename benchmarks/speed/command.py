@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from benchmarks.machine import describe
 from benchmarks.progress import Steps, steps
-from benchmarks.report import markdown, show, write_docs
-from benchmarks.results import Outcome
+from benchmarks.speed.report import markdown, show, write_docs
+from benchmarks.speed.results import Outcome
 from benchmarks.side import SideError
 from benchmarks.speed import reading, record, start
 from benchmarks.speed.bench import Bench, Settings

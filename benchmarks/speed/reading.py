@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.results import figure, ratio, values_of
+from benchmarks.speed.results import figure, ratio, values_of
 from benchmarks.side import Values
 from benchmarks.speed import logs
 from benchmarks.speed.bench import discard

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.results import figure, ratio, values_of
+from benchmarks.speed.results import figure, ratio, values_of
 from benchmarks.speed import logs
 from benchmarks.speed.bench import discard
 

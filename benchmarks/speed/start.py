@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.results import figure, values_of
+from benchmarks.speed.results import figure, values_of
 from benchmarks.side import SideError
 
 if TYPE_CHECKING:

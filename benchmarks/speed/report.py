@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from benchmarks.results import Finding, Outcome
+    from benchmarks.speed.results import Finding, Outcome
 
 _HEADINGS = ("study", "figure", "value", "spread", "target", "")
 _SECTION = re.compile(r"(<!-- results -->\n).*?(<!-- /results -->)", re.DOTALL)

@@ -1,0 +1,90 @@
+"""What a system must be able to do to take part: this is all that the harness knows.
+
+To add one, write a class in a module of its own, and name it in `registry.py`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel
+
+Kind = Literal["file", "database", "hybrid", "none"]
+
+
+class BackendMissing(Exception):
+    """A system is not there or does not start; the message names the cure."""
+
+
+class BackendFailed(Exception):
+    """A system has stopped working in the middle: a dead server, a full disk."""
+
+
+class Backend(ABC):
+    """One system under test. Made once a run, in a process of its own.
+
+    Args:
+        directory: Where all its data goes. It exists, and may hold what an earlier
+            process has left there, which `open` then goes on with.
+
+    Attributes:
+        name: As on the command line and in tables.
+        about: One line: what it is and how it is set up.
+        kind: `file`, `database`, `hybrid` (both), or `none` (keeps nothing).
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str]
+    kind: ClassVar[Kind]
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+
+    @classmethod
+    def check(cls) -> None:
+        """See that it can be used here, without starting it.
+
+        Raises:
+            BackendMissing: It cannot; the message says what to install.
+        """
+
+    @abstractmethod
+    def open(self, channels: Sequence[Channel]) -> None:
+        """Start what has to be started, make tables or files for these channels.
+
+        Raises:
+            BackendMissing: It does not start.
+        """
+
+    @abstractmethod
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        """Take a message. Called by the channel's own thread, several at a time.
+
+        Args:
+            channel: Index into the channels given to `open`.
+            log_time: When the message was received, ns since the epoch.
+            payload: The serialized message.
+
+        Raises:
+            BackendFailed: It cannot go on.
+        """
+
+    @abstractmethod
+    def finish(self) -> None:
+        """See everything inserted safe on the disk; no `insert` follows."""
+
+    @abstractmethod
+    def counts(self) -> Mapping[str, int]:
+        """Messages of each topic, read back from the system itself."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop what was started; the data stays. Also called after a failure."""
+
+    def processes(self) -> Sequence[int]:
+        """Process ids of the servers that belong to it, children included."""
+        return ()

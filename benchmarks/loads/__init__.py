@@ -1,0 +1,1 @@
+"""What is published to a backend: synthetic streams, logs like the paper's, real logs."""

@@ -1,0 +1,121 @@
+"""A load: the channels, when each message is due, and the payloads in one file."""
+
+from __future__ import annotations
+
+import json
+import mmap
+from base64 import b64decode, b64encode
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog_storage.messages import Channel, Schema
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PAYLOADS = "payloads.bin"
+_COLUMNS = "columns.npz"
+_ABOUT = "load.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Load:
+    """Messages to be published, in the order in which they are due.
+
+    Rows may share a payload: a stream of many messages needs a file of only a few.
+
+    Attributes:
+        name: Short, for tables: `throughput 5 kB 64 Hz`, `mit_like`.
+        seed: From which it was made; None for a real log.
+        channels: One a topic.
+        channel: int32[n], index into `channels`.
+        due: int64[n], ns after the start, ascending.
+        log_time: int64[n], ns since the epoch: what the log says, or would have said.
+        offset: int64[n], byte in the payload file.
+        length: int64[n], bytes of the payload.
+        payloads: The payload file.
+    """
+
+    name: str
+    seed: int | None
+    channels: tuple[Channel, ...]
+    channel: NDArray[np.int32]
+    due: NDArray[np.int64]
+    log_time: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    length: NDArray[np.int64]
+    payloads: Path
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.due)
+
+    @property
+    def payload_bytes(self) -> int:
+        """Sum of all payload lengths."""
+        return int(self.length.sum())
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the start until the last message is due."""
+        return float(self.due[-1]) / 1e9 if len(self) else 0.0
+
+    def map(self) -> memoryview:
+        """The payload file, mapped."""
+        with self.payloads.open("rb") as stream:
+            return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+
+    def save(self, directory: Path) -> None:
+        """Write everything but the payload file, which must lie in `directory` already."""
+        assert self.payloads == directory / PAYLOADS
+        np.savez(
+            directory / _COLUMNS,
+            channel=self.channel,
+            due=self.due,
+            log_time=self.log_time,
+            offset=self.offset,
+            length=self.length,
+        )
+        about = {
+            "name": self.name,
+            "seed": self.seed,
+            "channels": [_channel_to_json(channel) for channel in self.channels],
+        }
+        # Last: a directory without it is a load that was not finished.
+        (directory / _ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+    @classmethod
+    def is_complete(cls, directory: Path) -> bool:
+        """Whether a whole load lies in a directory."""
+        return (directory / _ABOUT).is_file()
+
+    @classmethod
+    def open(cls, directory: Path) -> Load:
+        """A load that was saved."""
+        about = json.loads((directory / _ABOUT).read_text(encoding="utf-8"))
+        with np.load(directory / _COLUMNS) as columns:
+            return cls(
+                name=about["name"],
+                seed=about["seed"],
+                channels=tuple(_channel_from_json(value) for value in about["channels"]),
+                payloads=directory / PAYLOADS,
+                **{name: columns[name] for name in columns.files},
+            )
+
+
+def _channel_to_json(channel: Channel) -> dict[str, Any]:
+    value = asdict(channel)
+    value["metadata"] = dict(channel.metadata)
+    if channel.schema is not None:
+        value["schema"]["data"] = b64encode(channel.schema.data).decode("ascii")
+    return value
+
+
+def _channel_from_json(value: dict[str, Any]) -> Channel:
+    schema = value.pop("schema")
+    if schema is not None:
+        schema = Schema(**{**schema, "data": b64decode(schema["data"])})
+    return Channel(schema=schema, **value)
