@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 Kind = Literal["file", "database", "hybrid", "none"]
 
 
-class BackendMissing(Exception):
+class BackendMissingError(Exception):
     """A system is not there or does not start; the message names the cure."""
 
 
-class BackendFailed(Exception):
+class BackendFailedError(Exception):
     """A system has stopped working in the middle: a dead server, a full disk."""
 
 
@@ -45,11 +45,11 @@ class Backend(ABC):
         self.directory = directory
 
     @classmethod
-    def check(cls) -> None:
+    def check(cls) -> None:  # most need nothing
         """See that it can be used here, without starting it.
 
         Raises:
-            BackendMissing: It cannot; the message says what to install.
+            BackendMissingError: It cannot; the message says what to install.
         """
 
     @abstractmethod
@@ -57,7 +57,7 @@ class Backend(ABC):
         """Start what has to be started, make tables or files for these channels.
 
         Raises:
-            BackendMissing: It does not start.
+            BackendMissingError: It does not start.
         """
 
     @abstractmethod
@@ -70,7 +70,7 @@ class Backend(ABC):
             payload: The serialized message.
 
         Raises:
-            BackendFailed: It cannot go on.
+            BackendFailedError: It cannot go on.
         """
 
     @abstractmethod

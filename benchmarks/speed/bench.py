@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.memory import wait_for_mongods
-from benchmarks.speed.results import Finding, Outcome, Sample, figure
 from benchmarks.side import LINGER_S, Values, run_side
+from benchmarks.speed.results import Finding, Outcome, Sample, figure
 
 if TYPE_CHECKING:
     from benchmarks.progress import Steps

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 from benchmarks.machine import describe
 from benchmarks.progress import Steps, steps
-from benchmarks.speed.report import markdown, show, write_docs
-from benchmarks.speed.results import Outcome
 from benchmarks.side import SideError
 from benchmarks.speed import reading, record, start
 from benchmarks.speed.bench import Bench, Settings
+from benchmarks.speed.report import markdown, show, write_docs
+from benchmarks.speed.results import Outcome
 
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 

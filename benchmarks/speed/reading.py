@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.speed.results import figure, ratio, values_of
 from benchmarks.side import Values
 from benchmarks.speed import logs
 from benchmarks.speed.bench import discard
+from benchmarks.speed.results import figure, ratio, values_of
 
 if TYPE_CHECKING:
     from benchmarks.speed.bench import Bench

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.speed.results import figure, ratio, values_of
 from benchmarks.speed import logs
 from benchmarks.speed.bench import discard
+from benchmarks.speed.results import figure, ratio, values_of
 
 if TYPE_CHECKING:
     from benchmarks.speed.bench import Bench

@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.speed.results import figure, values_of
 from benchmarks.side import SideError
+from benchmarks.speed.results import figure, values_of
 
 if TYPE_CHECKING:
     from benchmarks.speed.bench import Bench
