@@ -44,8 +44,8 @@ class Backend(ABC):
     def __init__(self, directory: Path) -> None:
         self.directory = directory
 
-    @classmethod
-    def check(cls) -> None:  # most need nothing
+    @classmethod  # noqa: B027 - most backends need nothing
+    def check(cls) -> None:
         """See that it can be used here, without starting it.
 
         Raises:
