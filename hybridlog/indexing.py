@@ -7,9 +7,12 @@ channels, and `record`, recovery, `reindex` and `verify` all call it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,10 +21,11 @@ from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import DatabaseError
+from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.index_documents import DocumentAssembler, Origin
 from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.segment_writer import StoredChunk
+from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segment_writer import OPEN_SUFFIX, SEALED_SUFFIX, StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
 ARRAY_LIMIT = 32
 STAMP = "header.stamp"
 _SENDERS = 2
+_LAG_PAUSE_S = 0.002
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
 
@@ -136,6 +141,55 @@ class _Parcel:
         self.messages += messages
 
 
+class Lag:
+    """Lets the index fall behind the recording that it belongs to.
+
+    Args:
+        recording: The recording's directory.
+        behind: Says whether the recorder has more than it can write.
+    """
+
+    def __init__(self, recording: Path, behind: Callable[[], bool]) -> None:
+        self._recording = recording
+        self._behind = behind
+        self._reader: SegmentReader | None = None
+
+    def wait(self) -> None:
+        """Return once the recorder can spare the processor."""
+        while self._behind():
+            time.sleep(_LAG_PAUSE_S)
+
+    def read(self, chunk: _Forgotten) -> StoredChunk:
+        """Read a chunk back from its segment, which may still be growing."""
+        if self._reader is None or self._reader.number != chunk.segment:
+            self.close()
+            self._reader = self._open(chunk.segment)
+        self._reader.grow()
+        return self._reader.read_chunk(chunk.place)
+
+    def close(self) -> None:
+        """Give the segment back."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _open(self, segment: int) -> SegmentReader:
+        path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
+        if path.exists():
+            # It may be sealed, and renamed, at this moment.
+            with suppress(SegmentError):
+                return SegmentReader(path, segment)
+        return SegmentReader(path.with_name(f"{segment:06d}{SEALED_SUFFIX}"), segment)
+
+
+class _Forgotten(NamedTuple):
+    """A chunk that is in its segment, and no longer in memory."""
+
+    segment: int
+    place: ChunkPlace
+    messages: int
+
+
 class IndexWriter:
     """Sends chunks to the index in the background, so that recording need not wait.
 
@@ -147,10 +201,18 @@ class IndexWriter:
     Args:
         indexer: Makes the documents.
         database: Where they go.
-        backlog: Most chunks waiting or under way before `submit` waits.
+        backlog: Most chunks in memory, waiting or under way, before `submit` waits.
+        lag: With it `submit` never waits: chunks beyond the backlog are read back.
     """
 
-    def __init__(self, indexer: ChunkIndexer, database: Database, *, backlog: int = 8) -> None:
+    def __init__(
+        self,
+        indexer: ChunkIndexer,
+        database: Database,
+        *,
+        backlog: int = 8,
+        lag: Lag | None = None,
+    ) -> None:
         self.failure: DatabaseError | None = None
         self.indexed = 0
         """Messages whose index documents are in the database."""
@@ -158,6 +220,7 @@ class IndexWriter:
         """Messages that were skipped because the database had failed."""
         self.entries: list[ChunkEntry] = []
         self._indexer = indexer
+        self._lag = lag
         self._database = database
         self._catalog = Catalog(database)
         self._collections: set[str] = set()
@@ -173,9 +236,24 @@ class IndexWriter:
         """Index a chunk that is in its segment; waits while the backlog is full."""
         if self._crash is not None:
             raise self._crash
-        self._room.acquire()
+        if not self._room.acquire(blocking=self._lag is None):
+            place = ChunkPlace(
+                chunk.offset,
+                chunk.length,
+                chunk.trailer,
+                int(chunk.batch.log_time.min()),
+                int(chunk.batch.log_time.max()),
+                (),
+            )
+            forgotten = _Forgotten(chunk.segment, place, len(chunk.batch))
+            self._maker.submit(self._remember, forgotten, channels).add_done_callback(self._done)
+            return
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(self._made)
+
+    def nudge(self) -> None:
+        """Send what has been made so far, however little, once a sender is free."""
+        self._maker.submit(self._dispatch, wait=False).add_done_callback(self._done)
 
     def close(self) -> None:
         """Wait for all chunks; an error of our own (no database's) is raised here."""
@@ -183,6 +261,8 @@ class IndexWriter:
             self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
         self._maker.shutdown(wait=True)
         self._senders.shutdown(wait=True)
+        if self._lag is not None:
+            self._lag.close()
         if self._crash is not None:
             raise self._crash
 
@@ -190,12 +270,24 @@ class IndexWriter:
         """Stop without indexing what still waits."""
         self._maker.shutdown(wait=True, cancel_futures=True)
         self._senders.shutdown(wait=True, cancel_futures=True)
+        if self._lag is not None:
+            self._lag.close()
+
+    def _remember(self, chunk: _Forgotten, channels: Mapping[int, Channel]) -> None:
+        assert self._lag is not None
+        if self.failure is not None:
+            with self._lock:
+                self.missed += chunk.messages
+            return
+        self._make(self._lag.read(chunk), channels)
 
     def _make(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         if self.failure is not None:
             with self._lock:
                 self.missed += len(chunk.batch)
             return
+        if self._lag is not None:
+            self._lag.wait()
         documents, entry = self._indexer.documents_of(chunk, channels)
         self._parcel.add(documents, entry, len(chunk.batch))
         parcel = self._parcel

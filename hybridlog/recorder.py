@@ -7,29 +7,23 @@ or it leaves nothing behind.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.entries import build_entry, new_key, recording_metadata
-from hybridlog.indexing import ChunkIndexer, IndexWriter
+from hybridlog.capture import Capture, text
 from hybridlog_storage.catalog import Catalog, RecordingEntry
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
     SourceError,
-    StoreError,
     TopicError,
 )
 from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -112,96 +106,43 @@ def record(
         DiskFullError: no space; nothing is kept.
     """
     started = time.monotonic()
-    catalog = Catalog(database)
-    with ExitStack() as held:
-        with directory.alone():
-            # Who records the same at this moment is refused, or refuses us.
-            if not options.again:
-                _refuse_known(catalog, source, fingerprint)
-            entry = _begin(
-                source, directory, catalog, fingerprint=fingerprint, options=options, held=held
-            )
-        indexer = ChunkIndexer(entry.id, entry.key)
-        index = IndexWriter(indexer, database)
-        writer = RecordingWriter(
-            directory.recording(entry.id),
-            recording_metadata(entry),
-            index.submit,
-            options.settings,
-        )
-        try:
-            skipped = _copy(source, writer, options, progress)
-            _check_result(source, writer, options)
-            end = _end_of(source)
-            writer.close(json_metadata(END_METADATA, end))
-            index.close()
-        except BaseException:
-            # Nothing half-made: the source is still there, the command can be run again.
-            writer.abort()
-            _forget(index, catalog, directory, entry, writer.channels)
-            raise
-        entry = build_entry(directory, indexer, entry.id, index.entries)
-        failure = index.failure
-        if failure is None:
-            try:
-                catalog.put_losses(entry.id, end["losses"])
-                for channel in writer.channels.values():
-                    if channel.schema is not None:
-                        catalog.put_schema(channel.schema)
-                catalog.put_recording(entry)
-            except DatabaseError as error:
-                failure = error
+
+    def refuse_known(catalog: Catalog) -> None:
+        if not options.again:
+            _refuse_known(catalog, source, fingerprint)
+
+    capture = Capture(
+        directory,
+        database,
+        name=options.name or _name_of(source.path),
+        tags=options.tags,
+        source={
+            "path": text(str(source.path)),
+            "kind": source.kind,
+            "profile": source.profile,
+            "bytes": source.size_bytes,
+            "fingerprint": fingerprint,
+        },
+        settings=options.settings,
+        check=refuse_known,
+    )
+    try:
+        skipped = _copy(source, capture.writer, options, progress)
+        _check_result(source, capture.writer, options)
+        failure = capture.close(_end_of(source))
+    except BaseException:
+        # Nothing half-made: the source is still there, the command can be run again.
+        capture.forget()
+        raise
     return RecordReport(
-        entry,
+        capture.entry,
         list(source.damage),
-        index.indexed,
-        index.missed,
+        capture.index.indexed,
+        capture.index.missed,
         failure,
         skipped,
         time.monotonic() - started,
     )
-
-
-def _begin(
-    source: Source,
-    directory: StoreDirectory,
-    catalog: Catalog,
-    *,
-    fingerprint: str,
-    options: RecordOptions,
-    held: ExitStack,
-) -> RecordingEntry:
-    """Start a recording: its directory, locked for as long as `held` holds, and its entry."""
-    name = _text(options.name or _name_of(source.path))
-    recording_id = directory.new_recording(name)
-    try:
-        if not held.enter_context(directory.writing(recording_id)):
-            raise StoreError(f"Another process is writing {directory.recording(recording_id)}.")
-        entry = RecordingEntry(
-            id=recording_id,
-            key=new_key(r.key for r in catalog.recordings()),
-            name=name,
-            tags={_text(key): _text(value) for key, value in options.tags.items()},
-            source={
-                "path": _text(str(source.path)),
-                "kind": source.kind,
-                "profile": source.profile,
-                "bytes": source.size_bytes,
-                "fingerprint": fingerprint,
-            },
-            created=time.time_ns(),
-            status="open",
-        )
-        catalog.put_recording(entry)
-    except BaseException:
-        directory.remove_recording(recording_id)
-        raise
-    return entry
-
-
-def _text(name: str) -> str:
-    """A name as text that MongoDB and JSON take: what is no UTF-8 in it as escapes."""
-    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def _copy(
@@ -266,7 +207,7 @@ def _end_of(source: Source) -> dict[str, Any]:
     losses = [
         {
             "cause": "source damaged",
-            "file": _text(damage.file.name),
+            "file": text(damage.file.name),
             "offset": damage.offset,
             "length": damage.length,
             "reason": damage.reason,
@@ -278,20 +219,6 @@ def _end_of(source: Source) -> dict[str, Any]:
         for damage in source.damage
     ]
     return {"status": "damaged" if losses else "complete", "losses": losses}
-
-
-def _forget(
-    index: IndexWriter,
-    catalog: Catalog,
-    directory: StoreDirectory,
-    entry: RecordingEntry,
-    channels: Mapping[int, Channel],
-) -> None:
-    index.abandon()
-    # If the database is away too, the next opening finds an entry without files.
-    with suppress(DatabaseError):
-        catalog.remove_recording(entry.id, {collection_of(c.topic) for c in channels.values()})
-    directory.remove_recording(entry.id)
 
 
 def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:

@@ -25,6 +25,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
+    from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.query.plan import Lane
     from hybridlog.reader import Query
     from hybridlog.recorder import RecordOptions, RecordReport
@@ -366,10 +367,32 @@ class Store:
                 options=options or RecordOptions(**choices),
                 progress=progress,
             )
+        self._after(report)
+        return report
+
+    def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
+        """Start a recording that messages are written to as they come.
+
+        Args:
+            name: Name of the recording.
+            options: How.
+            choices: Fields of `LiveOptions`, instead of `options`.
+        """
+        from hybridlog.live import LiveOptions, LiveRecording
+
+        return LiveRecording(
+            self.directory,
+            self.database_for("Starting a recording"),
+            name,
+            options or LiveOptions(**choices),
+            on_close=self._after,
+        )
+
+    def _after(self, report: RecordReport) -> None:
+        """A recording has ended."""
         if report.failure is not None:
             self._catch_up(report)
         self.refresh()
-        return report
 
     def _catch_up(self, report: RecordReport) -> None:
         """MongoDB failed while a log was recorded: index the rest, if it can be had again."""

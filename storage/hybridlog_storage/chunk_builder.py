@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +32,8 @@ class ChunkBuilder:
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
+        self.opened = 0.0
+        """When that was, seconds of `time.monotonic`."""
 
     def __len__(self) -> int:
         """Bytes laid down so far."""
@@ -45,6 +48,7 @@ class ChunkBuilder:
         """
         if not self._used:
             self.first_log_time = int(batch.log_time[0])
+            self.opened = time.monotonic()
         ends = np.cumsum(batch.length + _HEAD) + self._used
         starts = ends - batch.length - _HEAD
         self._grow(int(ends[-1]))

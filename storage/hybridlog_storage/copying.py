@@ -25,8 +25,9 @@ def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
 def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[np.int64]) -> None:
     """Copy each payload of a batch to its place in a buffer that is large enough."""
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
-        source = memoryview(batch.buffer)
-        view = memoryview(target)
+        # Between arrays numpy copies without the interpreter lock.
+        source = np.frombuffer(batch.buffer, np.uint8)
+        view = np.frombuffer(target, np.uint8)
         for to, at, size in zip(
             starts.tolist(), batch.offset.tolist(), batch.length.tolist(), strict=True
         ):

@@ -7,7 +7,6 @@ are gathered by numpy. Records of every other kind are rare and become objects.
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -18,6 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import decompress_prefix
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch
@@ -345,5 +345,5 @@ def _check_attachment(content: Buffer, used: int) -> None:
 
     view = memoryview(content)
     (crc,) = struct.unpack_from("<I", view, used - 4)
-    if crc not in {0, zlib.crc32(view[: used - 4])}:
+    if crc not in {0, crc32(view[: used - 4])}:
         raise SegmentError("the checksum of an attachment differs")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import bisect
 import struct
-import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 
@@ -19,6 +18,7 @@ from mcap import records
 from mcap.opcode import Opcode
 from mcap.summary import Summary
 
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import MAX_UNCOMPRESSED, decompress
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import (
@@ -140,7 +140,7 @@ class ScannedChunk:
             SegmentError: It does not decompress, or its checksum differs.
         """
         content = decompress(self.compression, self.data, self.uncompressed_size, limit=self.limit)
-        if check_crc and self.uncompressed_crc not in {0, zlib.crc32(content)}:
+        if check_crc and self.uncompressed_crc not in {0, crc32(content)}:
             raise SegmentError("its checksum differs")
         return content
 
@@ -244,7 +244,7 @@ def read_summary(file: BinaryIO, size: int) -> Summary | None:
         return None
     file.seek(footer.summary_start)
     data = file.read(end - footer.summary_start + _FOOTER_SIZE - 4)
-    if footer.summary_crc not in {0, zlib.crc32(data)}:
+    if footer.summary_crc not in {0, crc32(data)}:
         return None
     view = memoryview(data)[: end - footer.summary_start]
     summary = Summary()
@@ -447,7 +447,7 @@ class _Scanner:
         self._in_data = True
         self._crc: int | None = None
         if start == len(MAGIC) and self._data_crc() not in {None, 0}:
-            self._crc = zlib.crc32(MAGIC)
+            self._crc = crc32(MAGIC)
 
     def _data_crc(self) -> int | None:
         """The checksum that the file's end has for the data section, if it has one."""
@@ -812,5 +812,5 @@ class _Scanner:
             piece = self._window.at(at, min(self._at - at, _WINDOW))
             if not len(piece):
                 break
-            self._crc = zlib.crc32(piece, self._crc)
+            self._crc = crc32(piece, self._crc)
             at += len(piece)

@@ -18,6 +18,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage import durability
+from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
 from hybridlog_storage.mcap_scan import (
@@ -191,17 +192,20 @@ def recover_segment(path: Path) -> Recovered:
         DiskFullError: no room for the summary; the file stays as it was.
     """
     number = int(path.name.removesuffix(OPEN_SUFFIX))
-    size = path.stat().st_size
     damage: list[str] = []
     try:
-        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        segment = SegmentFile(path, number, AppendFile.reopen(path))
     except OSError as error:
         raise durability.explain(error, path, "recovering") from error
-    segment = SegmentFile(path, number, fd, size)
+    size = segment.position
     rebuilder = _Rebuilder(segment, damage)
     try:
         with path.open("rb") as file:
+            fd = file.fileno()
             for offset, item in scan(file, size=size):
+                if isinstance(item, ScanDamage) and _is_padding(fd, item.offset, size):
+                    size = item.offset
+                    continue
                 if isinstance(item, DataEnd):
                     break  # behind it is a summary, whole or not, which is made anew
                 if isinstance(item, ScannedChunk):
@@ -225,6 +229,11 @@ def recover_segment(path: Path) -> Recovered:
         segment.add_metadata(json_metadata(END_METADATA, end_note))
     sealed = segment.seal()
     return Recovered(sealed, rebuilder.messages, cut_bytes, damage)
+
+
+def _is_padding(fd: int, offset: int, size: int) -> bool:
+    """Whether nothing follows but what fills the last block of an `AppendFile`."""
+    return size - offset < BLOCK and not any(os.pread(fd, size - offset, offset))
 
 
 def _record_end(fd: int, offset: int) -> int:

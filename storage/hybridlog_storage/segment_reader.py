@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import stat
 import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
@@ -21,6 +20,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_scan import (
@@ -129,6 +129,10 @@ class SegmentReader:
     def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
+
+    def grow(self) -> None:
+        """Take note of what was appended since the file was opened."""
+        self.size = os.fstat(self._fd).st_size
 
     def summary(self) -> SegmentSummary:
         """Channels, chunks and metadata, from the summary at the end of the file.
@@ -252,7 +256,7 @@ def open_chunk(record: memoryview) -> tuple[Buffer, int]:
     compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
     at += name_length + 8
     content = decompress(compression, record[at:], size)
-    if zlib.crc32(content) != crc:
+    if crc32(content) != crc:
         raise SegmentError("its checksum differs")
     return content, len(record) - at
 

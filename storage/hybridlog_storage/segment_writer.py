@@ -2,15 +2,14 @@
 
 Chunks hold like with like. A channel whose payloads are large has chunks of its own,
 bounded in bytes and in log time, so that a slice of a scan reads next to nothing else;
-the channels with small payloads share one. Compression runs on worker threads; chunks
+the channels with small payloads share one. Worker threads compress, another writes: chunks
 reach the file in the order in which they were closed, each with its indexes in one
-system call, and only then their owner hears of them: **log first, index second**.
+go, and only then their owner hears of them: **log first, index second**.
 """
 
 from __future__ import annotations
 
-import os
-import zlib
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -37,6 +36,8 @@ from mcap.records import (
 )
 
 from hybridlog_storage import durability
+from hybridlog_storage.append_file import AppendFile
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
@@ -125,13 +126,12 @@ class StoredChunk:
 class SegmentFile:
     """One open segment: appends whole records, keeps what the summary will say."""
 
-    def __init__(self, path: Path, number: int, fd: int, position: int) -> None:
+    def __init__(self, path: Path, number: int, file: AppendFile) -> None:
         self.path = path
         self.number = number
-        self.position = position
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, tuple[int, Channel]] = {}
-        self._fd = fd
+        self._file = file
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
@@ -153,10 +153,10 @@ class SegmentFile:
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
         try:
-            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            file = AppendFile.create(path)
         except OSError as error:
             raise durability.explain(error, path, "creating") from error
-        segment = cls(path, number, fd, 0)
+        segment = cls(path, number, file)
         segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
         segment.add_metadata(
             json_metadata(
@@ -170,6 +170,16 @@ class SegmentFile:
             )
         )
         return segment
+
+    @property
+    def position(self) -> int:
+        """Bytes in the file."""
+        return self._file.position
+
+    @property
+    def direct(self) -> bool:
+        """Whether what was written is on the disk already, but for the file's length."""
+        return self._file.direct
 
     def define(
         self, channel_id: int, schema_id: int, channel: Channel, *, write: bool = True
@@ -298,16 +308,14 @@ class SegmentFile:
     def cut(self, position: int) -> None:
         """Drop everything from a position on; the next record is written there."""
         try:
-            os.ftruncate(self._fd, position)
-            os.lseek(self._fd, position, os.SEEK_SET)
+            self._file.cut(position)
         except OSError as error:
             raise durability.explain(error, self.path, "cutting") from error
-        self.position = position
 
     def sync(self) -> None:
         """Force what was written to the disk."""
         try:
-            durability.sync_file(self._fd)
+            self._file.sync()
         except OSError as error:
             raise durability.explain(error, self.path, "syncing") from error
 
@@ -315,11 +323,9 @@ class SegmentFile:
         """Write the summary, close, and give the file its final name."""
         self._write([record_bytes(DataEnd(data_section_crc=0))])
         self._write([self._summary(self.position), MAGIC])
-        if sync:
-            self.sync()
-        os.close(self._fd)
         final = self.path.with_name(self.path.name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX)
         try:
+            self._file.finish(sync=sync)
             durability.publish(self.path, final)
         except OSError as error:
             raise durability.explain(error, final, "sealing") from error
@@ -329,11 +335,11 @@ class SegmentFile:
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
         with suppress(OSError):
-            os.close(self._fd)
+            self._file.finish(sync=False)
 
     def _write(self, parts: Sequence[Buffer]) -> None:
         try:
-            self.position += durability.write_all(self._fd, parts)
+            self._file.append(parts)
         except OSError as error:
             raise durability.explain(error, self.path, "writing") from error
 
@@ -370,7 +376,7 @@ class SegmentFile:
         footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0)
         # The footer's checksum covers the summary and the footer up to the checksum itself.
         covered = record_bytes(footer)[:-4]
-        footer.summary_crc = zlib.crc32(covered, zlib.crc32(summary))
+        footer.summary_crc = crc32(covered, crc32(summary))
         return summary + record_bytes(footer)
 
     def _statistics(self) -> Statistics:
@@ -412,12 +418,15 @@ def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
         int(batch.log_time.min()),
         int(batch.log_time.max()),
         size,
-        zlib.crc32(batch.buffer),
+        crc32(batch.buffer),
         compression,
         data,
         message_indexes(batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize),
         pack_arrivals(seq),
     )
+
+
+_AS_IT_IS = Compressor("none")
 
 
 @dataclass(slots=True)
@@ -444,9 +453,10 @@ class RecordingWriter:
     Args:
         directory: The recording's directory; it exists and is empty.
         recording: Catalog entry kept in every segment.
-        on_chunk: Called, on the caller's thread and in file order, with every chunk
+        on_chunk: Called, on a thread of the writer's and in file order, with every chunk
             that is in the file.
         settings: How to cut and pack.
+        hurry: Says whether there is no time to compress; None when there always is.
     """
 
     def __init__(
@@ -455,6 +465,7 @@ class RecordingWriter:
         recording: Mapping[str, object],
         on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
         settings: SegmentSettings | None = None,
+        hurry: Callable[[], bool] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -467,7 +478,10 @@ class RecordingWriter:
         self._clusters: dict[int, ChunkBuilder] = {}
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
-        self._packing: deque[Future[PackedChunk]] = deque()
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
+        self._hurry = hurry
+        self._storing: deque[Future[None]] = deque()
+        self._broken: BaseException | None = None
         self._next_seq = 0
         self._stored_seq = 0
         self._segment: SegmentFile | None = None
@@ -514,17 +528,21 @@ class RecordingWriter:
 
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Keep an attachment or a metadata record of the source."""
-        segment = self._open_segment()
-        if isinstance(record, Metadata):
-            segment.add_metadata(record)
-        else:
-            segment.add_attachment(record)
+        self._disk.submit(self._add, record).result()
 
     def flush(self) -> None:
         """Close every open chunk and see it written."""
         for key in list(self._clusters):
             self._close_chunk(key)
         self._drain(limit=0)
+
+    def flush_older(self, seconds: float) -> None:
+        """Close the chunks that were opened so long ago, and write what is packed."""
+        limit = time.monotonic() - seconds
+        for key, builder in self._clusters.items():
+            if len(builder) and builder.opened <= limit:
+                self._close_chunk(key)
+        self._drain(limit=4)
 
     def close(self, end: Metadata | None = None) -> list[Path]:
         """Flush, seal the last segment; returns the paths of all segments.
@@ -534,20 +552,24 @@ class RecordingWriter:
         """
         try:
             self.flush()
-            segment = self._open_segment()
             if end is not None:
-                segment.add_metadata(end)
-            self._seal()
+                self.add_extra(end)
+            self._disk.submit(self._seal).result()
         finally:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._shut_down()
         return self._closed
 
     def abort(self) -> None:
         """Stop at once; sealed segments and flushed chunks stay where they are."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._broken = self._broken or StoreError("The recording was stopped.")
+        self._shut_down()
         if self._segment is not None:
             self._segment.abandon()
             self._segment = None
+
+    def _shut_down(self) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._disk.shutdown(wait=True, cancel_futures=True)
 
     def _channel(self, channel: Channel, batch: Batch, index: int) -> _Known:
         known = self._known.get(channel)
@@ -596,15 +618,37 @@ class RecordingWriter:
         builder = self._clusters[key]
         if len(builder):
             batch, seq, size = builder.take()
-            self._packing.append(self._pool.submit(pack, self._compressor, batch, seq, size))
+            hurried = self._hurry is not None and self._hurry()
+            compressor = _AS_IT_IS if hurried else self._compressor
+            packed = self._pool.submit(pack, compressor, batch, seq, size)
+            self._storing.append(self._disk.submit(self._store, packed))
             self._drain(limit=8)
 
     def _drain(self, limit: int) -> None:
-        """Write closed chunks, in order, until at most `limit` are still being packed."""
-        while self._packing and (len(self._packing) > limit or self._packing[0].done()):
-            self._store(self._packing.popleft().result())
+        """Wait until at most `limit` chunks are still being packed and written."""
+        while self._storing and (len(self._storing) > limit or self._storing[0].done()):
+            self._storing.popleft().result()
 
-    def _store(self, chunk: PackedChunk) -> None:
+    # What follows runs on the thread that writes, and on no other.
+
+    def _store(self, packed: Future[PackedChunk]) -> None:
+        """Write a closed chunk; none after one that could not be written."""
+        if self._broken is not None:
+            raise self._broken
+        try:
+            self._write(packed.result())
+        except BaseException as error:
+            self._broken = error
+            raise
+
+    def _add(self, record: Metadata | Attachment) -> None:
+        segment = self._open_segment()
+        if isinstance(record, Metadata):
+            segment.add_metadata(record)
+        else:
+            segment.add_attachment(record)
+
+    def _write(self, chunk: PackedChunk) -> None:
         segment = self._open_segment()
         for channel_id in chunk.indexes:
             if channel_id not in segment.channels:
@@ -613,7 +657,7 @@ class RecordingWriter:
         stored = segment.append_chunk(chunk)
         if self.settings.sync == "chunk":
             segment.sync()
-        elif self.settings.sync == "seal":
+        elif self.settings.sync == "seal" and not segment.direct:
             self._sync_behind(segment)
         self.totals.chunks += 1
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)

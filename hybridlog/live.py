@@ -1,0 +1,285 @@
+"""Recording messages as they come, from any number of threads.
+
+`LiveRecording.write` only puts a message down; one thread of the recording's own takes
+what has come since it looked last, lays it into chunks and sees old chunks written. The
+index has the lowest rank: while messages come faster than they can be written, it waits,
+and makes up for it from the segments. So what bounds a recording is the disk, and what
+bounds its memory is the budget: when that is spent, `write` waits.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import numpy as np
+
+from hybridlog.capture import Capture
+from hybridlog.recorder import RecordReport
+from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_writer import SegmentSettings
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+
+_LARGE = 1 << 15  # bytes from which a payload is a batch of its own, and is not copied first
+_ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
+_TICK_S = 0.02  # the writing thread looks so often when little comes
+_BEHIND = 8 << 20  # bytes not yet written from which the index waits
+_MOST_NS = 1 << 63
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How to record what comes.
+
+    Attributes:
+        tags: Kept with the recording.
+        budget_bytes: Payload bytes that may be in memory, not written yet.
+        flush_interval_s: Seconds after which a message is in the segment at the latest:
+            what a `kill -9` can cost.
+        settings: How segments are cut and packed.
+    """
+
+    tags: Mapping[str, str] = field(default_factory=dict)
+    budget_bytes: int = 512 << 20
+    flush_interval_s: float = 1.0
+    settings: SegmentSettings = field(default_factory=SegmentSettings)
+
+    def __post_init__(self) -> None:
+        if self.budget_bytes < _ENOUGH:
+            raise UsageError("the memory budget must be at least 1 MiB")
+        if not 0 < self.flush_interval_s <= 3600:
+            raise UsageError("the flush interval must lie between 0 and 3600 seconds")
+
+
+class _Message(NamedTuple):
+    channel: int
+    log_time: int
+    publish_time: int
+    sequence: int
+    payload: bytes
+
+
+class LiveRecording:
+    """A recording that messages are written to as they come.
+
+    Get one from `Store.start`. As a context manager it is closed at the end of the
+    block, after an error too: what was received is worth keeping.
+
+    Args:
+        directory: The store.
+        database: The index.
+        name: Name of the recording.
+        options: How.
+        on_close: Called with the report when the recording has come to its end.
+    """
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        database: Database,
+        name: str,
+        options: LiveOptions,
+        on_close: Callable[[RecordReport], None],
+    ) -> None:
+        self._options = options
+        self._on_close = on_close
+        self._started = time.monotonic()
+        self._ids: dict[Channel, int] = {}
+        self._channels: list[Channel] = []
+        self._inbox: list[_Message] = []
+        self._inbox_bytes = 0
+        self._unwritten = 0
+        self._lock = threading.Lock()
+        self._room = threading.Condition(self._lock)
+        self._wake = threading.Event()
+        self._ended = False
+        self._failure: BaseException | None = None
+        self._report: RecordReport | None = None
+        self._held = ExitStack()
+        with self._held:
+            self._held.enter_context(directory.using_index())
+            self._capture = Capture(
+                directory,
+                database,
+                name=name,
+                tags=options.tags,
+                source={"path": "", "kind": "live", "profile": "", "bytes": 0},
+                settings=options.settings,
+                behind=self._behind,
+            )
+            self._held = self._held.pop_all()
+        self.id = self._capture.entry.id
+        """Recording id."""
+        self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """The recording itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    def write(
+        self,
+        channel: Channel,
+        payload: bytes,
+        *,
+        log_time: int | None = None,
+        publish_time: int | None = None,
+        sequence: int = 0,
+    ) -> None:
+        """Take a message; waits while the memory budget is spent. Thread safe.
+
+        Args:
+            channel: The same object for all messages of a channel.
+            payload: The serialized message, of any size. It must not change afterwards.
+            log_time: When it was received, ns since the epoch; None for now.
+            publish_time: When it was sent, ns since the epoch; None when not known.
+            sequence: The sender's number, 0 to 2³²-1.
+
+        Raises:
+            UsageError: A number is out of its range, or the recording was closed.
+            DiskFullError: No space; what was flushed before stays.
+        """
+        now = time.time_ns() if log_time is None else log_time
+        sent = now if publish_time is None else publish_time
+        if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
+            raise UsageError("a time or the sequence number of a message is out of its range")
+        with self._lock:
+            while self._unwritten and self._unwritten + len(payload) > self._options.budget_bytes:
+                self._check()
+                self._wake.set()
+                self._room.wait()
+            self._room.notify()  # there may be room for another
+            self._check()
+            index = self._ids.get(channel)
+            if index is None:
+                index = self._ids[channel] = len(self._channels)
+                self._channels.append(channel)
+            self._inbox.append(_Message(index, now, sent, sequence, payload))
+            self._unwritten += len(payload)
+            self._inbox_bytes += len(payload)
+            enough = self._inbox_bytes >= _ENOUGH
+        if enough:
+            self._wake.set()
+
+    def close(self) -> RecordReport:
+        """Write, index and seal everything; tells how the recording went.
+
+        Raises:
+            DiskFullError: No space; what was flushed before stays, and the next opening of
+                the store seals it.
+        """
+        if self._report is not None:
+            return self._report
+        self._stop()
+        with self._held:
+            try:
+                if self._failure is not None:
+                    raise self._failure
+                failure = self._capture.close({"status": "complete", "losses": []})
+            except BaseException:
+                self._capture.leave()
+                raise
+        index = self._capture.index
+        self._report = RecordReport(
+            self._capture.entry,
+            [],
+            index.indexed,
+            index.missed,
+            failure,
+            0,
+            time.monotonic() - self._started,
+        )
+        self._on_close(self._report)
+        return self._report
+
+    def abort(self) -> None:
+        """Take the whole recording back."""
+        self._stop()
+        with self._held:
+            self._capture.forget()
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        if self._ended:
+            raise UsageError(f"The recording {self.id!r} was closed.")
+
+    def _behind(self) -> bool:
+        return self._unwritten > _BEHIND and not self._ended
+
+    def _stop(self) -> None:
+        with self._lock:
+            self._ended = True
+            self._room.notify_all()
+        self._wake.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        """What the writing thread does."""
+        flushed = time.monotonic()
+        interval = self._options.flush_interval_s
+        try:
+            while True:
+                self._wake.wait(_TICK_S)
+                self._wake.clear()
+                ended = self._ended
+                self._take()
+                if ended:
+                    return
+                if time.monotonic() - flushed >= interval / 4:
+                    self._capture.writer.flush_older(interval * 3 / 4)
+                    self._capture.index.nudge()
+                    flushed = time.monotonic()
+        except (HybridlogError, OSError, MemoryError) as error:
+            with self._lock:
+                self._failure = error
+                self._room.notify_all()
+
+    def _take(self) -> None:
+        """Lay what has come into chunks."""
+        with self._lock:
+            inbox, self._inbox, self._inbox_bytes = self._inbox, [], 0
+        if not inbox:
+            return
+        for large, run in groupby(inbox, lambda message: len(message.payload) >= _LARGE):
+            messages = list(run)
+            for group in [[message] for message in messages] if large else [messages]:
+                batch = _batch(group)
+                self._capture.append(batch, self._channels)
+                with self._lock:
+                    self._unwritten -= batch.payload_bytes
+                    self._room.notify()
+
+
+def _batch(messages: Sequence[_Message]) -> Batch:
+    channel, log_time, publish_time, sequence, payloads = zip(*messages, strict=True)
+    length = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    return Batch(
+        payloads[0] if len(payloads) == 1 else b"".join(payloads),
+        np.cumsum(length) - length,
+        length,
+        np.array(channel, np.int32),
+        np.array(log_time, np.int64),
+        np.array(publish_time, np.int64),
+        np.array(sequence, np.uint32),
+    )

@@ -1,0 +1,175 @@
+"""A file that only grows, written past the page cache where the file system allows it.
+
+What a recorder writes it does not read again, so copying it into the page cache first
+costs a processor's time twice, then stalls whoever writes next when the kernel decides
+to clean up. Direct writes take neither, but must start and end at whole blocks: so the
+bytes behind the last whole block stay here too, and are written again, with zeros up to
+the next block, together with what follows. A file that nobody closed may therefore end
+in up to a block of zeros.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import mmap
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from hybridlog_storage.durability import sync_file, write_all
+from hybridlog_storage.messages import Buffer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BLOCK = 4096
+"""Bytes of a block; every device's own blocks divide it."""
+_STAGE = 4 << 20
+_DIRECT = getattr(os, "O_DIRECT", 0)
+_REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
+
+
+class AppendFile:
+    """One file, open for appending.
+
+    Args:
+        fd: The file; it is closed with this object.
+        position: Its length, bytes; 0 for direct writes.
+        direct: Whether it was opened for direct writes.
+    """
+
+    def __init__(self, fd: int, position: int = 0, *, direct: bool = False) -> None:
+        self.position = position
+        """Bytes in the file."""
+        self._fd = fd
+        self._stage = mmap.mmap(-1, _STAGE) if direct else None
+        self._filled = 0  # bytes in the stage; the first of them belongs at `position - filled`
+
+    @classmethod
+    def create(cls, path: Path) -> Self:
+        """A new file.
+
+        Raises:
+            OSError: It exists, or cannot be made.
+        """
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        if _DIRECT:
+            try:
+                return cls(os.open(path, flags | _DIRECT, 0o644), direct=True)
+            except OSError as error:
+                if error.errno not in _REFUSED:
+                    raise
+                with suppress(FileNotFoundError):
+                    path.unlink()  # some systems refuse only after they have made it
+        return cls(os.open(path, flags, 0o644))
+
+    @classmethod
+    def reopen(cls, path: Path) -> Self:
+        """A file that is there already.
+
+        Raises:
+            OSError: It cannot be opened for writing.
+        """
+        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        return cls(fd, os.lseek(fd, 0, os.SEEK_END))
+
+    @property
+    def direct(self) -> bool:
+        """Whether what was appended is on the disk already, but for the file's length."""
+        return self._stage is not None
+
+    def append(self, parts: Sequence[Buffer]) -> None:
+        """Write all parts at the end; they are in the file when this returns.
+
+        Raises:
+            OSError: when the system refuses; a part may have been written by then.
+        """
+        if self._stage is None:
+            self.position += write_all(self._fd, parts)
+            return
+        stage = np.frombuffer(self._stage, np.uint8)
+        for part in parts:
+            content = np.frombuffer(part, np.uint8)
+            while len(content):
+                piece = content[: _STAGE - self._filled]
+                stage[self._filled : self._filled + len(piece)] = piece
+                self._filled += len(piece)
+                self.position += len(piece)
+                content = content[len(piece) :]
+                if self._filled == _STAGE:
+                    self._put(stage)
+        self._put(stage)
+
+    def cut(self, position: int) -> None:
+        """Drop everything from a position on; not for direct writes.
+
+        Raises:
+            OSError: when the system refuses.
+        """
+        assert self._stage is None
+        os.ftruncate(self._fd, position)
+        os.lseek(self._fd, position, os.SEEK_SET)
+        self.position = position
+
+    def finish(self, *, sync: bool) -> None:
+        """Give the file its exact length and close it.
+
+        Args:
+            sync: Return once everything is on the disk.
+
+        Raises:
+            OSError: when the system refuses.
+        """
+        try:
+            if self._stage is not None:
+                os.ftruncate(self._fd, self.position)
+            if sync:
+                self.sync()
+        finally:
+            self.close()
+
+    def sync(self) -> None:
+        """Return once everything appended is on the disk."""
+        sync_file(self._fd)
+
+    def close(self) -> None:
+        """Give the file back as it is."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _put(self, stage: NDArray[np.uint8]) -> None:
+        """Write what is staged, and keep the bytes behind the last whole block."""
+        if not self._filled:
+            return
+        whole = self._filled - self._filled % BLOCK
+        end = whole + BLOCK if whole < self._filled else whole
+        stage[self._filled : end] = 0
+        self._write(stage[:end].data, self.position - self._filled)
+        stage[: self._filled - whole] = stage[whole : self._filled].copy()
+        self._filled -= whole
+
+    def _write(self, data: memoryview, position: int) -> None:
+        while data:
+            try:
+                done = os.pwrite(self._fd, data, position)
+            except OSError as error:
+                if error.errno not in _REFUSED:
+                    raise
+                # Some file systems take the flag and refuse the write. Blocks stay whole,
+                # so nothing else changes.
+                self._give_up_direct(error)
+                continue
+            data = data[done:]
+            position += done
+
+    def _give_up_direct(self, error: OSError) -> None:
+        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
+        if not flags & _DIRECT:
+            raise error
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~_DIRECT)

@@ -1,0 +1,7 @@
+"""The checksum of MCAP: CRC-32 as in zlib, by a library that computes it at memory speed."""
+
+from __future__ import annotations
+
+from isal.isal_zlib import crc32
+
+__all__ = ["crc32"]
