@@ -92,12 +92,13 @@ class Source:
         return self._join(start.tolist(), size.tolist())
 
     def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
-        buffer = self.buffer
-        # A bytearray, since arrays over bytes would be read-only.
-        joined = bytearray().join(
-            [buffer[at : at + count] for at, count in zip(start, size, strict=True)]
-        )
-        return np.frombuffer(joined, np.uint8) if joined else np.empty(0, np.uint8)
+        joined = np.empty(sum(size), np.uint8)
+        content = np.frombuffer(self.buffer, np.uint8)
+        to = 0
+        for at, count in zip(start, size, strict=True):
+            joined[to : to + count] = content[at : at + count]
+            to += count
+        return joined
 
     def _by_size(
         self,
