@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
@@ -31,7 +30,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
 
-_LARGE = 1 << 15  # bytes from which a payload is a batch of its own, and is not copied first
+_LARGE = 1 << 17  # bytes from which a payload is a batch of its own, and is not copied first
+_MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.02  # the writing thread looks so often when little comes
 _BEHIND = 8 << 20  # bytes not yet written from which the index waits
@@ -261,14 +261,24 @@ class LiveRecording:
             inbox, self._inbox, self._inbox_bytes = self._inbox, [], 0
         if not inbox:
             return
-        for large, run in groupby(inbox, lambda message: len(message.payload) >= _LARGE):
-            messages = list(run)
-            for group in [[message] for message in messages] if large else [messages]:
-                batch = _batch(group)
-                self._capture.append(batch, self._channels)
-                with self._lock:
-                    self._unwritten -= batch.payload_bytes
-                    self._room.notify()
+        for group in _groups(inbox):
+            batch = _batch(group)
+            self._capture.append(batch, self._channels)
+            with self._lock:
+                self._unwritten -= batch.payload_bytes
+                self._room.notify()
+
+
+def _groups(messages: Sequence[_Message]) -> Iterator[Sequence[_Message]]:
+    """Runs of messages for a batch each, in order."""
+    start = size = 0
+    for at, message in enumerate(messages):
+        length = len(message.payload)
+        if at > start and (length >= _LARGE or size >= _MOST_JOINED):
+            yield messages[start:at]
+            start, size = at, 0
+        size += _MOST_JOINED if length >= _LARGE else length
+    yield messages[start:]
 
 
 def _batch(messages: Sequence[_Message]) -> Batch:
