@@ -34,6 +34,7 @@ ALLOWED = {
         "hybridlog_storage.database",
     ),
     "google": ("hybridlog.schema.protobuf_codec",),
+    "isal": ("hybridlog_storage.checksum",),
     "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
     "mcap": (
         "hybridlog.export.mcap",
