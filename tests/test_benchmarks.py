@@ -12,11 +12,11 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from benchmarks.speed.report import markdown, write_docs
-from benchmarks.speed.results import Finding, Outcome, Sample, figure, ratio, values_of
 from benchmarks.side import SideError, run_side
 from benchmarks.speed import logs
 from benchmarks.speed.command import DOCS, STUDIES
+from benchmarks.speed.report import markdown, write_docs
+from benchmarks.speed.results import Finding, Outcome, Sample, figure, ratio, values_of
 from tests.imports import ROOT
 
 HEADER = {

@@ -6,7 +6,6 @@ import json
 import mmap
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, is_dataclass
 from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import hybridlog as hl
+from benchmarks.backends.conversion import Plan, message_plan
 from benchmarks.memory import mongod_peak
 from benchmarks.side import Values
 from hybridlog_storage.bson_columns import split
@@ -27,7 +27,6 @@ _DOCUMENTS = 1000
 """Documents in one `insert_many`."""
 _BLOCK = 5000
 _THREADS = 2
-_NAMES: dict[type, tuple[str, ...]] = {}
 
 
 def dictionaries(bag: str, directory: str) -> Values:
@@ -42,9 +41,14 @@ def dictionaries(bag: str, directory: str) -> Values:
             client.admin.command("ping")
             started = time.perf_counter()
             waiting: dict[str, list[dict[str, Any]]] = {}
+            plans: dict[str, Plan] = {}
             messages = 0
             for connection, log_time, payload in reader.messages():
-                document = as_dict(reader.deserialize(payload, connection.msgtype))
+                kind = connection.msgtype
+                plan = plans.get(kind)
+                if plan is None:
+                    plan = plans[kind] = message_plan(reader.typestore, kind)
+                document = plan(reader.deserialize(payload, kind))
                 document["log_time"] = log_time
                 rows = waiting.setdefault(connection.topic, [])
                 rows.append(document)
@@ -126,30 +130,6 @@ def _blocks(
         for first in range(0, len(sizes), _BLOCK)
         for last in (min(first + _BLOCK, len(sizes)),)
     ]
-
-
-def as_dict(message: object) -> dict[str, Any]:
-    """A decoded message as a dictionary that MongoDB takes."""
-    names = _field_names(type(message))
-    return {name: _plain(getattr(message, name)) for name in names}
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if is_dataclass(value):
-        return as_dict(value)
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value
-
-
-def _field_names(kind: type) -> tuple[str, ...]:
-    names = _NAMES.get(kind)
-    if names is None:
-        assert is_dataclass(kind)
-        names = _NAMES[kind] = tuple(field.name for field in fields(kind))
-    return names
 
 
 def _name(topic: str) -> str:

@@ -81,8 +81,18 @@ def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -
 def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     """One file a topic; a topic that is no table, or lies beside the range, is left out."""
     query.plan()  # refuses a range that holds nothing of any topic
+    new = not directory.exists()
+    try:
+        _make(directory)
+        _write_tables(query, form, directory, force=force, quiet=quiet)
+    finally:
+        if new:
+            with contextlib.suppress(OSError):  # it holds what was written
+                directory.rmdir()
+
+
+def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
-    made = _make(directory)
     for path in paths.values():
         check_room(path, form=form, force=force)
     left_out: list[HybridlogError] = []
@@ -100,25 +110,20 @@ def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: boo
     except Stopped as stopped:
         stopped.consequence = f"The files named above are whole, {path} is not written."
         raise
-    finally:
-        if made:
-            with contextlib.suppress(OSError):  # it holds what was written
-                directory.rmdir()
     if len(left_out) == len(paths):
         raise left_out[0]
 
 
-def _make(directory: Path) -> bool:
-    """Make a directory for tables; whether it was not there before."""
+def _make(directory: Path) -> None:
+    """Make a directory for tables, if it is not there."""
     if directory.is_dir():
-        return False
+        return
     if directory.exists():
         raise UsageError(f"{directory} is a file; tables go into a directory, one a topic.")
     try:
         directory.mkdir(parents=True)
     except OSError as error:
         raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
-    return True
 
 
 def _tell(path: Path, query: Query, missing: int, *, quiet: bool) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,9 +14,9 @@ from rosbags.rosbag1.writer import Header, WriteChunk
 from rosbags.rosbag1.writer import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hybridlog.export.base import FileWriter, Target, beside, destination, failures
+from hybridlog.export.base import FileWriter, Target, destination, failures
 from hybridlog.export.mcap import source_metadata
-from hybridlog_storage.durability import sync_directory
+from hybridlog.export.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ class BagWriter(FileWriter):
         super().__init__()
         self._stream: BinaryIO | None = None
         self._final: Path | None = None
-        self._scratch: Path | None = None
         self._connections: dict[_ConnectionKey, Connection] = {}
         self._known: dict[Channel, Connection] = {}
         if isinstance(target, str | os.PathLike):
@@ -59,10 +57,11 @@ class BagWriter(FileWriter):
             self._stream, self._atomic = target, False
         with failures(self._name):
             if self._atomic and self._final is not None:
-                self._temporary = beside(self._final)
+                self._unfinished = beside(self._final)
+                self._temporary = self._unfinished.path
             else:
-                self._scratch = Path(tempfile.mkdtemp(prefix="hybridlog-"))
-                self._temporary = self._scratch / "output.bag"
+                self._unfinished = scratch_directory()
+                self._temporary = self._unfinished.path / "output.bag"
             self._writer = _ExactWriter(self._temporary)
             if compression != "none":
                 self._writer.set_compression(RosbagsWriter.CompressionFormat[compression.upper()])
@@ -131,8 +130,7 @@ class BagWriter(FileWriter):
             if self._atomic and self._final is not None:
                 with self._temporary.open("rb") as file:
                     os.fsync(file.fileno())
-                self._temporary.replace(self._final)
-                sync_directory(self._final.parent)
+                self._unfinished.publish(self._final)
                 return
             with self._temporary.open("rb") as file:
                 if self._stream is not None:
@@ -146,10 +144,7 @@ class BagWriter(FileWriter):
     def _discard(self) -> None:
         with suppress(OSError):
             self._writer.abort()
-        with suppress(OSError):
-            self._temporary.unlink(missing_ok=True)
-        if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+        self._unfinished.remove()
 
 
 class _ExactWriter(RosbagsWriter):

@@ -1,8 +1,8 @@
 """What all writers share: where bytes go, and that nothing half-made stays behind.
 
 A file appears under its name only when it is complete: it is written beside the target,
-synced, and renamed on `close`. `abort` removes it. Devices, pipes and streams are
-written as they are.
+synced, and renamed on `close`. `abort` removes it, and so does an interruption at any
+instant: see `unfinished`. Devices, pipes and streams are written as they are.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
 
-from hybridlog_storage.durability import sync_directory
+from hybridlog.export.unfinished import Unfinished, beside
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
 
 if TYPE_CHECKING:
@@ -162,7 +161,7 @@ class Sink:
 
     def __init__(self, target: Target) -> None:
         self._position = 0
-        self._temporary: Path | None = None
+        self._unfinished: Unfinished | None = None
         self._final: Path | None = None
         self._own = True
         self._over = False
@@ -174,9 +173,9 @@ class Sink:
         with failures(self.name):
             self._final, atomic = destination(target)
             if atomic:
-                self._temporary = beside(self._final)
+                self._unfinished = beside(self._final)
             # A text that is a path is never opened for reading here, nor followed again.
-            path = self._temporary or self._final
+            path = self._unfinished.path if self._unfinished is not None else self._final
             self._file = path.open("xb" if atomic else "wb", buffering=_BUFFER)
 
     @property
@@ -230,13 +229,12 @@ class Sink:
         """Sync, and give the file its name."""
         with failures(self.name):
             self._file.flush()
-            if self._temporary is not None and self._final is not None:
+            if self._unfinished is not None:
                 os.fsync(self._file.fileno())
             if self._own:
                 self._file.close()
-            if self._temporary is not None and self._final is not None:
-                self._temporary.replace(self._final)
-                sync_directory(self._final.parent)
+            if self._unfinished is not None and self._final is not None:
+                self._unfinished.publish(self._final)
         self._over = True
 
     def abort(self) -> None:
@@ -248,9 +246,8 @@ class Sink:
             # Closing flushes, and on a full disk that fails again.
             with contextlib.suppress(OSError):
                 self._file.close()
-        if self._temporary is not None:
-            with contextlib.suppress(OSError):
-                self._temporary.unlink(missing_ok=True)
+        if self._unfinished is not None:
+            self._unfinished.remove()
 
 
 def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
@@ -269,11 +266,6 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
     if not path.parent.is_dir():
         raise UsageError(f"cannot write {target}: there is no directory {path.parent}")
     return path, path.is_file() or not path.exists()
-
-
-def beside(final: Path) -> Path:
-    """A name in the same directory that is not in use."""
-    return final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial")
 
 
 @contextlib.contextmanager

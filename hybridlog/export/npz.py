@@ -29,6 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.export.base import FileWriter, Sink, Target, failures
+from hybridlog.export.unfinished import scratch_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -126,8 +127,7 @@ class _Spools:
 
     def __init__(self) -> None:
         self._stack = contextlib.ExitStack()
-        self._directory = tempfile.TemporaryDirectory(prefix="hybridlog-")
-        self._stack.enter_context(self._directory)
+        self._directory = scratch_directory()
         self._count = 0
 
     def new(self) -> IO[bytes]:
@@ -136,13 +136,14 @@ class _Spools:
         if self._count > _OPEN_FILES:
             raise UsageError("more columns than files can be open; choose some with --fields")
         return self._stack.enter_context(
-            tempfile.SpooledTemporaryFile(max_size=1 << 16, dir=self._directory.name)
+            tempfile.SpooledTemporaryFile(max_size=1 << 16, dir=str(self._directory.path))
         )
 
     def close(self) -> None:
         """Remove all files."""
         with contextlib.suppress(OSError):
             self._stack.close()
+        self._directory.remove()
 
 
 _Array = tuple[str, "np.dtype[Any]", tuple[int, ...], Iterator[bytes]]

@@ -12,15 +12,14 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog.export.base import BatchWriter, FileWriter, Sink, Target, beside, failures
+from hybridlog.export.base import BatchWriter, FileWriter, Sink, Target, failures
+from hybridlog.export.unfinished import beside
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.durability import sync_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -89,7 +88,8 @@ class RawWriter(FileWriter):
                 raise UsageError(f"{target} is a file; payloads go into a directory")
             if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
                 raise UsageError(f"{target} is not empty; name a directory that does not exist")
-            self._temporary = beside(self._final)
+            self._unfinished = beside(self._final)
+            self._temporary = self._unfinished.path
             self._temporary.mkdir()
             self._index = (self._temporary / INDEX).open("x", encoding="ascii")
         self._last: dict[str, tuple[int, int]] = {}
@@ -140,13 +140,12 @@ class RawWriter(FileWriter):
             self._index.close()
             # One sync for all: thousands of small ones take minutes on a slow disk.
             os.sync()
-            self._temporary.replace(self._final)
-            sync_directory(self._final.parent)
+            self._unfinished.publish(self._final)
 
     def _discard(self) -> None:
         with suppress(OSError):
             self._index.close()
-        shutil.rmtree(self._temporary, ignore_errors=True)
+        self._unfinished.remove()
 
 
 class RawStreamWriter(FileWriter):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from importlib import import_module
@@ -83,6 +84,57 @@ def test_a_file_that_was_being_written_goes_away(store: Path, tmp_path: Path) ->
         assert process.wait(60) == 130
     assert f"{target} is not written" in (tmp_path / "out").read_text()
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+STOPS_ITSELF = """
+import os, signal, sys
+
+def stop(frame, event, argument):
+    seen = f"{event} {frame.f_code.co_qualname}"
+    if frame.f_code.co_filename.endswith(FILES) and seen == MOMENT:
+        sys.setprofile(None)
+        os.kill(os.getpid(), signal.SIGINT)
+
+FILES = ("base.py", "raw.py", "bag.py", "unfinished.py")
+MOMENT = sys.argv.pop(1)
+sys.setprofile(stop)
+from hybridlog.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("form", "moment"),
+    [
+        ("mcap", "return beside"),
+        ("mcap", "return Sink.__init__"),
+        ("mcap", "return FileWriter.__enter__"),
+        ("mcap", "call FileWriter.__exit__"),
+        ("mcap", "call FileWriter.close"),
+        ("mcap", "call Unfinished.publish"),
+        ("bag", "return BagWriter.__init__"),
+        ("bag", "call FileWriter.__exit__"),
+        ("raw", "return RawWriter.__init__"),
+        ("raw", "call FileWriter.__exit__"),
+    ],
+)
+def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path: Path) -> None:
+    target = tmp_path / f"new.{form}"
+    if form == "raw":
+        command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target)]
+    else:
+        command = ["export", str(target)]
+    ended = subprocess.run(
+        [sys.executable, "-c", STOPS_ITSELF, moment, *command, "-r", "robot"],
+        capture_output=True,
+        text=True,
+        env=environment(HYBRIDLOG_STORE=str(store)),
+        check=False,
+    )
+    assert ended.returncode == 130, ended.stderr
+    assert f"{target} is not written" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def limited(kilobytes: int) -> tuple[str, ...]:

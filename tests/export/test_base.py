@@ -7,11 +7,15 @@ import os
 import stat
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 
 import pyarrow as pa
 import pytest
 
+import hybridlog.export
 from hybridlog.export import (
     FORMATS,
     open_batch_writer,
@@ -19,19 +23,20 @@ from hybridlog.export import (
     open_table_writer,
 )
 from hybridlog.export.base import Sink
+from hybridlog.export.unfinished import beside, remove_unfinished, scratch_directory
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from tests.export.batches import many, ros1_channels
 
 TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})
 
 
-def fill(name: str, target: object, times: int = 1) -> object:
+def fill(name: str, target: object, times: int = 1, messages: int = 300) -> object:
     """A writer of any format with something in it."""
     kind = FORMATS[name].kind
     if kind == "exact":
         exact = open_batch_writer(name, target)  # type: ignore[arg-type]
         for _ in range(times):
-            exact.write(many(300), ros1_channels())
+            exact.write(many(messages), ros1_channels())
         return exact
     if kind == "table":
         table = open_table_writer(name, target)  # type: ignore[arg-type]
@@ -205,3 +210,166 @@ def test_an_aborted_stream_has_no_end(name: str) -> None:
     del writer
     gc.collect()
     assert stream.getvalue() == before
+
+
+def write_whole(name: str, target: Path) -> None:
+    """What a command does: whoever began it holds nothing when it is interrupted."""
+    try:
+        with fill(name, target, messages=5):  # type: ignore[attr-defined]
+            pass
+    except BaseException:
+        remove_unfinished()
+        raise
+
+
+def write_alone(name: str, target: Path) -> None:
+    """What a script does."""
+    with fill(name, target, messages=5):  # type: ignore[attr-defined]
+        pass
+
+
+class Interruption:
+    """Ctrl-C at one instant: before the n-th step of the export modules and of the caller.
+
+    A step is a bytecode there, and the call of any function from there.
+
+    Args:
+        at: Number of the step, from 1; 0 for none.
+    """
+
+    OURS = str(Path(hybridlog.export.__file__).parent)
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+        self.steps = 0
+
+    def __call__(self, frame: FrameType, event: str, arg: object) -> object:
+        code = frame.f_code
+        ours = code.co_filename.startswith(self.OURS)
+        if not ours and code not in {write_whole.__code__, write_alone.__code__}:
+            caller = frame.f_back
+            if caller is not None and caller.f_code.co_filename.startswith(self.OURS):
+                self._step()
+            return None
+        frame.f_trace_opcodes = True
+        self._step()
+        return self._within
+
+    def _within(self, frame: FrameType, event: str, arg: object) -> object:
+        if event == "opcode":
+            self._step()
+        return self._within
+
+    def _step(self) -> None:
+        self.steps += 1
+        if self.steps == self.at:
+            raise KeyboardInterrupt
+
+
+def interrupted(at: int, write: Callable[[str, Path], None], name: str, target: Path) -> int:
+    """Write with an interruption; returns how many steps were done."""
+    interruption = Interruption(at)
+    before = sys.gettrace()
+    try:
+        sys.settrace(interruption)  # type: ignore[arg-type]
+        write(name, target)
+    except BaseException:
+        # Libraries may make another error of it; what counts is what they leave.
+        assert at > 0
+    finally:
+        sys.settrace(before)
+    return interruption.steps
+
+
+# Files that nobody could close are closed by the collector, which warns.
+UNCLOSED = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@UNCLOSED
+@pytest.mark.parametrize("write", [write_whole, write_alone])
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
+    name: str,
+    write: Callable[[str, Path], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    (tmp_path / "whole").mkdir()
+    for time in range(2):  # what is done once only, such as imports, is not counted
+        target = tmp_path / "whole" / f"out{time}"
+        steps = interrupted(0, write, name, target)
+    whole = contents(target)
+    outcomes = set()
+    for at in range(1, steps + 1, max(1, steps // 500)):
+        place = tmp_path / str(at)
+        place.mkdir()
+        interrupted(at, write, name, place / "out")
+        left = [path.name for path in place.iterdir()]
+        assert left in ([], ["out"]), at
+        assert list(scratch.iterdir()) == [], at
+        if left:
+            assert contents(place / "out") == whole, at
+        outcomes.add(len(left))
+    assert outcomes == {0, 1}
+    gc.collect()
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """The bytes of a file, or of all files in a directory."""
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+@UNCLOSED
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_writer_that_is_let_go_leaves_nothing(name: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    writer = fill(name, tmp_path / "in" / "out")
+    del writer
+    gc.collect()
+    assert list((tmp_path / "in").iterdir()) == []
+
+
+def test_what_is_unfinished_goes_at_the_end_of_the_process(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from hybridlog.export.base import Sink; "
+        "sink = Sink(sys.argv[1]); sink.flush(); print(len(list(Path(sys.argv[2]).iterdir())))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "out"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_child_process_removes_nothing_of_its_parent(tmp_path: Path) -> None:
+    file, directory = beside(tmp_path / "out"), beside(tmp_path / "dir")
+    file.path.touch()
+    directory.path.mkdir()
+    (directory.path / "inner").touch()
+    child = os.fork()
+    if not child:
+        try:
+            remove_unfinished()
+            file.remove()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_unfinished()
+    assert list(tmp_path.iterdir()) == []
+    file.path.touch()  # another's by now
+    file.remove()
+    assert list(tmp_path.iterdir()) == [file.path]
+
+
+def test_a_scratch_directory_is_private(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    place = scratch_directory()
+    assert stat.S_IMODE(place.path.stat().st_mode) == 0o700
+    place.remove()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,160 @@
+"""hybridlog itself: payloads in segments, fields in its embedded MongoDB."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
+from benchmarks.backends.processes import working_below
+from benchmarks.memory import wait_for_mongods
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import HybridlogError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from hybridlog.live import LiveRecording
+    from hybridlog.store import Store
+    from hybridlog_storage.messages import Channel
+
+_LINGER = "HYBRIDLOG_MONGOD_LINGER_S"
+
+
+class Hybridlog(Backend):
+    """A store with its default settings; each run is a recording of its own."""
+
+    name = "hybridlog"
+    about = "hybridlog: payloads in MCAP segments, fields in its embedded MongoDB"
+    kind = "hybrid"
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self._opened: Store | None = None
+        self._recording: LiveRecording | None = None
+        self._channels: Sequence[Channel] = ()
+        self._lock = threading.Lock()
+
+    @property
+    def path(self) -> Path:
+        """Directory of the store."""
+        return self.directory / "store"
+
+    @property
+    def store(self) -> Store:
+        """The store; between `open` and `close`."""
+        assert self._opened is not None
+        return self._opened
+
+    @classmethod
+    def check(cls) -> None:
+        from hybridlog_storage.mongod import find_mongod
+
+        try:
+            find_mongod()
+        except MissingDependencyError as error:
+            raise BackendMissingError(str(error)) from error
+
+    def open(self, channels: Sequence[Channel]) -> None:
+        self.check()
+        import hybridlog as hl
+
+        self._channels = channels
+        fresh = not self.path.exists()
+        try:
+            with _no_linger():
+                self._opened = hl.open(
+                    self.path, mongo="embedded", create=True, require_database=True
+                )
+        except HybridlogError as error:
+            raise BackendMissingError(f"hybridlog: {error}") from error
+        if fresh:
+            self._start()
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        try:
+            recording = self._recording or self._start()
+            recording.write(self._channels[channel], payload, log_time=log_time)
+        except (HybridlogError, OSError) as error:
+            raise BackendFailedError(f"hybridlog: {error}") from error
+
+    def _start(self) -> LiveRecording:
+        """The recording of this run. A store that is there already may be opened to count."""
+        with self._lock:
+            if self._recording is None:
+                self._recording = self.store.start("benchmark")
+            return self._recording
+
+    def finish(self) -> None:
+        recording, self._recording = self._recording, None
+        if recording is None:
+            return
+        try:
+            report = recording.close()
+        except (HybridlogError, OSError) as error:
+            raise BackendFailedError(f"hybridlog: {error}") from error
+        if report.missed:
+            raise BackendFailedError(
+                f"hybridlog: {report.missed} messages are stored, but not in the index: "
+                f"{report.failure}"
+            )
+
+    def counts(self) -> Mapping[str, int]:
+        """Payloads that were read back, by topic.
+
+        Raises:
+            BackendFailedError: The index has another number of documents.
+        """
+        found = dict.fromkeys((channel.topic for channel in self._channels), 0)
+        try:
+            store = self.store
+            store.refresh()
+            database = store.database_for("Counting")
+            for topic in set(found) & set(store.topics()):
+                found[topic] = sum(len(batch) for batch, _ in store.query([topic]).batches())
+                indexed = database.count(collection_of(topic))
+                if indexed != found[topic]:
+                    raise BackendFailedError(
+                        f"hybridlog: {topic} has {found[topic]} payloads and {indexed} index "
+                        "documents"
+                    )
+        except (HybridlogError, OSError) as error:
+            raise BackendFailedError(f"hybridlog: {error}") from error
+        return found
+
+    def close(self) -> None:
+        recording, self._recording = self._recording, None
+        store, self._opened = self._opened, None
+        if recording is not None:
+            with suppress(HybridlogError, OSError):
+                recording.close()
+        if store is not None:
+            store.close()
+            wait_for_mongods(self.path)
+
+    def processes(self) -> Sequence[int]:
+        return working_below(self.path, "mongod") if self._opened is not None else ()
+
+
+class HybridlogRecorder(Hybridlog):
+    """The same without a thread and a queue of ten a topic: its own memory budget is the queue."""
+
+    name = "hybridlog_recorder"
+    about = "hybridlog with one thread that takes in everything, as its recorder does"
+    intake = "single"
+
+
+@contextmanager
+def _no_linger() -> Iterator[None]:
+    """Let a mongod that is started here end with its last user, not seconds later."""
+    before = os.environ.get(_LINGER)
+    os.environ[_LINGER] = "0.1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_LINGER]
+        else:
+            os.environ[_LINGER] = before

@@ -1,0 +1,194 @@
+"""MongoDB, as the paper and its predecessor use it: a document a message."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from benchmarks.backends.base import BackendFailedError, BackendMissingError
+from benchmarks.backends.conversion import INSERTED_AT
+from benchmarks.backends.database import DatabaseBackend
+from benchmarks.backends.requirements import need
+from benchmarks.backends.server import Server
+from hybridlog_storage.collection_names import collection_of
+
+if TYPE_CHECKING:
+    from pymongo import MongoClient
+    from pymongo.collection import Collection
+    from pymongo.database import Database
+
+    from benchmarks.backends.conversion import Document
+    from hybridlog_storage.messages import Channel
+
+DATABASE = "roslog"
+_FIND_MS = 2000
+"""ms until a server that is gone counts as gone."""
+_ANSWER_MS = 120_000
+"""ms until an operation counts as hanging."""
+_PING_MS = 250
+
+
+class MongoJson(DatabaseBackend):
+    """A mongod of its own with its default settings.
+
+    The WiredTiger cache has its default size (half of the memory less 1 GiB), the journal
+    is on, the write concern is the default one. One client is shared by all threads.
+    """
+
+    name = "mongo_json"
+    about = (
+        "MongoDB: one document a message, one collection a topic, one insert a message; "
+        "default settings"
+    )
+
+    _is_indexed = False
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self._server = Server("mongod", directory)
+        self._client: MongoClient[Document] | None = None
+        self._collections: list[Collection[Document]] = []
+
+    @classmethod
+    def check(cls) -> None:
+        need("pymongo", "pymongo")
+        _program()
+
+    @property
+    def database(self) -> Database[Document]:
+        """The database with the collections, through pymongo; between `open` and `close`."""
+        assert self._client is not None
+        return self._client[DATABASE]
+
+    def open(self, channels: Sequence[Channel]) -> None:
+        self.check()
+        from pymongo import MongoClient
+        from pymongo.errors import PyMongoError
+
+        self._take_channels(channels)
+        data = self.directory / "mongod"
+        self._server.prepare(data)
+        socket = self._server.sockets / "mongod.sock"
+        uri = f"mongodb://{quote(str(socket), safe='')}/?directConnection=true"
+        command = [
+            _program(),
+            *("--dbpath", str(data.absolute())),
+            # A path as address, and no socket of its own making: no TCP port is opened.
+            *("--bind_ip", str(socket)),
+            "--nounixsocket",
+            *("--filePermissions", "0700"),
+        ]
+        self._server.start(command, signal.SIGTERM, lambda: _answers(uri))
+        self._client = MongoClient(
+            uri,
+            serverSelectionTimeoutMS=_FIND_MS,
+            connectTimeoutMS=_FIND_MS,
+            socketTimeoutMS=_ANSWER_MS,
+        )
+        try:
+            self._make_collections()
+        except PyMongoError as error:
+            raise BackendFailedError(f"MongoDB: {error}") from error
+
+    def _make_collections(self) -> None:
+        there = set(self.database.list_collection_names())
+        for topic, groups in self._topics().items():
+            name = collection_of(topic)
+            if name not in there:
+                self.database.create_collection(name)
+            if self._is_indexed:
+                for keys in (_keys(group) for group in [*groups, (INSERTED_AT,)]):
+                    self.database[name].create_index(keys)
+        self._collections = [self.database[collection_of(c.topic)] for c in self._channels]
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        from bson.errors import InvalidDocument
+        from pymongo.errors import DocumentTooLarge, PyMongoError
+
+        document = self._converters[channel].document(log_time, payload)
+        try:
+            self._collections[channel].insert_one(document)
+        except (DocumentTooLarge, InvalidDocument):
+            self._refuse(channel)
+        except PyMongoError as error:
+            raise BackendFailedError(f"MongoDB: {error}") from error
+
+    def finish(self) -> None:
+        from pymongo import WriteConcern
+        from pymongo.errors import PyMongoError
+
+        assert self._client is not None
+        # All that was written before this one is in the journal when this one is.
+        journaled = self._client["harness"].get_collection(
+            "finish", write_concern=WriteConcern(w=1, j=True)
+        )
+        try:
+            journaled.replace_one({"_id": 0}, {}, upsert=True)
+        except PyMongoError as error:
+            raise BackendFailedError(f"MongoDB: {error}") from error
+
+    def counts(self) -> Mapping[str, int]:
+        from pymongo.errors import PyMongoError
+
+        try:
+            return {
+                topic: self.database[collection_of(topic)].count_documents({})
+                for topic in self._topics()
+            }
+        except PyMongoError as error:
+            raise BackendFailedError(f"MongoDB: {error}") from error
+
+    def close(self) -> None:
+        client, self._client = self._client, None
+        try:
+            if client is not None:
+                client.close()
+        finally:
+            self._server.stop()
+
+    def processes(self) -> Sequence[int]:
+        return self._server.processes()
+
+
+class MongoJsonIndexed(MongoJson):
+    """The same with the indexes of the paper's appendix A, made before the first message.
+
+    They are made where a topic's type has the fields; every collection has one on
+    `_meta.inserted_at`.
+    """
+
+    name = "mongo_json_indexed"
+    about = "MongoDB as mongo_json, with the indexes of the paper's appendix A"
+
+    _is_indexed = True
+
+
+def _keys(group: tuple[str, ...]) -> list[tuple[str, int]]:
+    keys = [(path, 1) for path in group]
+    return [*keys, (INSERTED_AT, 1)] if group == ("position.x",) else keys
+
+
+def _program() -> str:
+    from hybridlog_storage.errors import MissingDependencyError
+    from hybridlog_storage.mongod import find_mongod
+
+    try:
+        return str(find_mongod())
+    except MissingDependencyError as error:
+        raise BackendMissingError(str(error)) from error
+
+
+def _answers(uri: str) -> bool:
+    from pymongo import MongoClient
+    from pymongo.errors import PyMongoError
+
+    client: MongoClient[dict[str, Any]] = MongoClient(uri, serverSelectionTimeoutMS=_PING_MS)
+    with client:
+        try:
+            client.admin.command("ping")
+        except PyMongoError:
+            return False
+    return True

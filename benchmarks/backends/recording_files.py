@@ -1,0 +1,131 @@
+"""What the backends that write recording files have in common.
+
+A file of a recording cannot be added to once it has come to its end. A backend that is
+opened on a directory with files from before therefore begins a new one, with the next
+number, when the first message comes.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+from benchmarks.backends.base import Backend, BackendFailedError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel
+
+
+class Recorder(Protocol):
+    """What writes one file."""
+
+    def write(self, channel: int, log_time: int, payload: bytes) -> None:
+        """Append a message."""
+
+    def close(self) -> None:
+        """Write what belongs at the end, and close the file."""
+
+
+class FileBackend(Backend):
+    """Recorders under one lock: files are written by one thread at a time."""
+
+    kind = "file"
+
+    suffix: ClassVar[str]
+    """Of the files' names."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self._channels: Sequence[Channel] = ()
+        self._recorder: Recorder | None = None
+        self._started: Path | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files, oldest first."""
+        return sorted(self.directory.glob(f"recording-*{self.suffix}"))
+
+    @property
+    def path(self) -> Path:
+        """The newest file."""
+        return self.paths[-1]
+
+    def open(self, channels: Sequence[Channel]) -> None:
+        self.check()
+        self._check_channels(channels)
+        self._channels = channels
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        with self._lock:
+            try:
+                if self._recorder is None:
+                    number = len(self.paths) + 1
+                    self._started = self.directory / f"recording-{number:04d}{self.suffix}"
+                    self._recorder = self._record(self._started)
+                self._recorder.write(channel, log_time, payload)
+            except Exception as error:
+                raise self._failed(error) from error
+
+    def finish(self) -> None:
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+            if recorder is None or self._started is None:
+                return
+            try:
+                recorder.close()
+                _sync(self._started)
+                _sync(self.directory)
+            except Exception as error:
+                raise self._failed(error) from error
+
+    def counts(self) -> Mapping[str, int]:
+        found = dict.fromkeys((channel.topic for channel in self._channels), 0)
+        for path in self.paths:
+            try:
+                for topic, count in self._count(path).items():
+                    found[topic] = found.get(topic, 0) + count
+            except Exception as error:
+                raise self._failed(error) from error
+        return found
+
+    def close(self) -> None:
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+            if recorder is not None:
+                with suppress(Exception):  # on a full disk there is no good end
+                    recorder.close()
+
+    def _check_channels(self, channels: Sequence[Channel]) -> None:
+        """See that the files can hold such channels.
+
+        Raises:
+            BackendMissingError: They cannot.
+        """
+
+    @abstractmethod
+    def _record(self, path: Path) -> Recorder:
+        """Begin a file."""
+
+    @abstractmethod
+    def _count(self, path: Path) -> Mapping[str, int]:
+        """Read all messages of a file and count them by topic."""
+
+    def _failed(self, error: Exception) -> BackendFailedError:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        return BackendFailedError(f"{self.name}: {type(error).__name__}: {reason}")
+
+
+def _sync(path: Path) -> None:
+    """See a file, or everything in a directory, on the disk."""
+    for place in (path, *path.iterdir()) if path.is_dir() else (path,):
+        descriptor = os.open(place, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,217 @@
+"""SQLite with messages as JSON text: as in the paper, and as one would do it today."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from benchmarks.backends.base import BackendFailedError, BackendMissingError
+from benchmarks.backends.conversion import T
+from benchmarks.backends.database import DatabaseBackend
+from hybridlog_storage.collection_names import collection_of
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel
+
+BATCH_S = 2.0
+"""Seconds of messages in one transaction."""
+BATCH_BYTES = 16 << 20
+"""Characters of JSON after which a transaction is not put off any longer."""
+_BUSY_S = 5.0
+
+
+def table_of(topic: str) -> str:
+    """Name of the table of a topic, unquoted: its collection's.
+
+    SQLite's names do not know upper case from lower case, and those that begin with
+    `sqlite_` are its own. Such names end in a part of the topic's hash.
+    """
+    name = collection_of(topic)
+    if name == name.lower() and not name.startswith("sqlite_"):
+        return name
+    digest = hashlib.sha256(topic.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return f"t_{name}~{digest}" if name.lower().startswith("sqlite_") else f"{name}~{digest}"
+
+
+def quoted(name: str) -> str:
+    """A name as an SQL identifier."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def expression(path: str, column: str = "msg") -> str:
+    """The value at a path, as an index has it: `json_extract(msg, '$.pose.x')`.
+
+    A query uses the index when it asks for exactly this.
+
+    Args:
+        path: Names joined by dots.
+        column: Of the table.
+    """
+    return f"json_extract({column}, '$.{path}')"
+
+
+class SqliteUdf(DatabaseBackend):
+    """One file, one connection under a lock, one transaction a message.
+
+    As SQLite's documentation advises for many small transactions: the journal mode is
+    WAL, `synchronous` is NORMAL. Questions about fields are asked through functions
+    written in Python.
+    """
+
+    name = "sqlite_udf"
+    about = (
+        "SQLite: JSON text, one table a topic, one transaction a message, WAL, synchronous NORMAL"
+    )
+
+    _is_indexed: ClassVar[bool] = False
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.path = directory / "messages.sqlite3"
+        """The database file."""
+        self._lock = threading.Lock()
+        self._opened: sqlite3.Connection | None = None
+        self._inserts: list[str] = []
+
+    @property
+    def connection(self) -> sqlite3.Connection:
+        """The connection; between `open` and `close`."""
+        assert self._opened is not None
+        return self._opened
+
+    def open(self, channels: Sequence[Channel]) -> None:
+        self.check()
+        self._take_channels(channels)
+        try:
+            self._opened = sqlite3.connect(
+                self.path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
+            )
+            self._opened.execute("PRAGMA journal_mode = WAL")
+            self._opened.execute("PRAGMA synchronous = NORMAL")
+            self._make_tables()
+        except sqlite3.Error as error:
+            raise _failed(error) from error
+        self._inserts = [
+            f"INSERT INTO {quoted(table_of(channel.topic))} (msg) VALUES (?)"
+            for channel in channels
+        ]
+
+    def _make_tables(self) -> None:
+        for topic, groups in self._topics().items():
+            table = table_of(topic)
+            self.connection.execute(
+                f"CREATE TABLE IF NOT EXISTS {quoted(table)} (id INTEGER PRIMARY KEY, msg TEXT)"
+            )
+            for group in [*groups, (T,)] if self._is_indexed else ():
+                keys = ", ".join(expression(path) for path in group)
+                index = quoted(f"{table} by {group[0]}")
+                self.connection.execute(
+                    f"CREATE INDEX IF NOT EXISTS {index} ON {quoted(table)} ({keys})"
+                )
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        text = self._converters[channel].text(log_time, payload)
+        with self._lock:
+            try:
+                self.connection.execute(self._inserts[channel], (text,))
+            except sqlite3.DataError:  # longer than SQLite's limit of 1 GB
+                self._refuse(channel)
+            except sqlite3.Error as error:
+                raise _failed(error) from error
+
+    def finish(self) -> None:
+        with self._lock:
+            try:
+                # With `synchronous` NORMAL this is when commits reach the disk for good.
+                self.connection.execute("PRAGMA wal_checkpoint(FULL)")
+            except sqlite3.Error as error:
+                raise _failed(error) from error
+
+    def counts(self) -> Mapping[str, int]:
+        with self._lock:
+            try:
+                return {
+                    topic: self.connection.execute(
+                        f"SELECT count(*) FROM {quoted(table_of(topic))}"
+                    ).fetchone()[0]
+                    for topic in self._topics()
+                }
+            except sqlite3.Error as error:
+                raise _failed(error) from error
+
+    def close(self) -> None:
+        with self._lock:
+            connection, self._opened = self._opened, None
+            if connection is not None:
+                connection.close()
+
+
+class SqliteJson1(SqliteUdf):
+    """The same text, with SQLite's own JSON functions, indexes on them, and 2 s batches.
+
+    One transaction holds the messages of all topics for 2 s or 16 MiB. There are indexes
+    on `json_extract` of the fields of the paper's appendix A, where a topic's type has
+    them, and of `_meta.t`.
+    """
+
+    name = "sqlite_json1"
+    about = (
+        "SQLite: JSON text, one table a topic, transactions of 2 s, WAL, synchronous NORMAL, "
+        "indexes on json_extract of the fields of the paper's appendix A"
+    )
+
+    _is_indexed = True
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self._since = 0.0
+        self._size = 0
+
+    @classmethod
+    def check(cls) -> None:
+        if sqlite3.sqlite_version_info < (3, 38):
+            connection = sqlite3.connect(":memory:")
+            try:
+                connection.execute("SELECT json_extract('{}', '$.a')")
+            except sqlite3.Error:
+                raise BackendMissingError(
+                    f"This Python's SQLite {sqlite3.sqlite_version} has no JSON functions. "
+                    "Use a Python with SQLite 3.38 or newer."
+                ) from None
+            finally:
+                connection.close()
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        text = self._converters[channel].text(log_time, payload)
+        with self._lock:
+            connection = self.connection
+            try:
+                if not connection.in_transaction:
+                    connection.execute("BEGIN IMMEDIATE")
+                    self._since, self._size = time.monotonic(), 0
+                connection.execute(self._inserts[channel], (text,))
+                self._size += len(text)
+                if self._size >= BATCH_BYTES or time.monotonic() - self._since >= BATCH_S:
+                    connection.execute("COMMIT")
+            except sqlite3.DataError:
+                self._refuse(channel)
+            except sqlite3.Error as error:
+                raise _failed(error) from error
+
+    def finish(self) -> None:
+        with self._lock:
+            try:
+                if self.connection.in_transaction:
+                    self.connection.execute("COMMIT")
+            except sqlite3.Error as error:
+                raise _failed(error) from error
+        super().finish()
+
+
+def _failed(error: sqlite3.Error) -> BackendFailedError:
+    return BackendFailedError(f"SQLite: {error}")

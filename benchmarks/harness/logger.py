@@ -1,0 +1,252 @@
+"""The logger: the process of one run, with the backend in it; and the one that counts.
+
+Both are sides: `python -m benchmarks.side benchmarks.harness.logger:log`. A run whose
+backend fails ends like any other and says so in its values; only a crash leaves none.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
+from benchmarks.harness import usage
+from benchmarks.harness.counters import Counters
+from benchmarks.harness.publisher import READY
+from benchmarks.harness.subscribers import Subscribers
+from benchmarks.loads.base import Load
+from benchmarks.side import Values
+
+Publishing = dict[str, Any]
+"""What the publisher needs besides: `counters`, a file that is made; `speed`; `intake`,
+which is `threads` or `single`; `limit`, the messages a queue or the bytes of an intake."""
+
+_LOOK_S = 0.1
+_END_S = 5.0
+
+
+class StoppedError(Exception):
+    """Whoever started this process wants its end, or has gone."""
+
+
+def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> Values:
+    """Publish a load into a backend.
+
+    Args:
+        load: The load's directory.
+        backend: `module:class`.
+        directory: For the backend's data.
+        publishing: How.
+
+    Returns:
+        `status`, `reason`, and what was measured.
+    """
+    parent = os.getppid()
+    opened = Load.open(Path(load))
+    values: Values = {"status": "ok", "reason": ""}
+    with ended_by_signals():
+        kind = _backend(backend)
+        system = kind(Path(directory))
+        try:
+            kind.check()
+            system.open(opened.channels)
+            _run(system, opened, publishing, values, parent)
+        except BackendMissingError as error:
+            values |= {"status": "missing", "reason": str(error)}
+        except (BackendFailedError, StoppedError) as error:
+            values |= {"status": "failed", "reason": str(error)}
+        finally:
+            _close(system, values)
+    return values
+
+
+def count(*, load: str, backend: str, directory: str) -> Values:
+    """What a backend holds that another process has filled.
+
+    Returns:
+        `counts`, messages of each topic; or `status` and `reason`.
+    """
+    opened = Load.open(Path(load))
+    values: Values = {"status": "ok", "reason": ""}
+    with ended_by_signals():
+        system = _backend(backend)(Path(directory))
+        try:
+            system.open(opened.channels)
+            values["counts"] = {topic: int(n) for topic, n in system.counts().items()}
+        except (BackendMissingError, BackendFailedError, StoppedError) as error:
+            values |= {"status": "failed", "reason": str(error)}
+        finally:
+            _close(system, values)
+    return values
+
+
+def _backend(name: str) -> type[Backend]:
+    module, _, kind = name.partition(":")
+    found: type[Backend] = getattr(import_module(module), kind)
+    return found
+
+
+def _close(system: Backend, values: Values) -> None:
+    try:
+        system.close()
+    except BackendFailedError as error:
+        if values["status"] == "ok":
+            values |= {"status": "failed", "reason": str(error)}
+
+
+def _run(system: Backend, load: Load, publishing: Publishing, values: Values, parent: int) -> None:
+    """Everything between opening and closing; `values` is filled as things become known."""
+    single = publishing["intake"] == "single"
+    counters = Counters(Path(publishing["counters"]), len(load.channels))
+    subscribers = Subscribers(load, system, counters)
+    pipes = [os.pipe() for _ in range(1 if single else len(load.channels))]
+    arguments = {
+        **publishing,
+        "load": str(load.payloads.parent),
+        "pipes": [write for _, write in pipes],
+    }
+    publisher = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.harness.publisher", json.dumps(arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        pass_fds=[write for _, write in pipes],
+    )
+    try:
+        for _, write in pipes:
+            os.close(write)
+        assert publisher.stdin is not None
+        assert publisher.stdout is not None
+        if publisher.stdout.readline().strip() != READY:
+            raise RuntimeError("the publisher did not start")
+        values["spin_ms"] = usage.spin_ms()
+        subscribers.start([read for read, _ in pipes], single=single)
+        meter = _Meter(system)
+        publisher.stdin.write("go\n")
+        publisher.stdin.flush()
+        _watch(publisher, subscribers, parent)
+        failure = subscribers.failure
+        if not subscribers.failed.is_set():
+            try:
+                system.finish()
+            except BackendFailedError as error:
+                failure = str(error) or "finish failed"
+        meter.stop()
+        said = publisher.stdout.read()
+    finally:
+        _end(publisher)
+        if subscribers.first_error:
+            values["insert_error"] = subscribers.first_error
+    if not said and not failure:
+        raise RuntimeError("the publisher did not come to its end")
+    meter.note(values, json.loads(said) if said else {})
+    values["peak_rss_mapped"] = usage.mapped_rss(load.payloads.resolve())
+    if failure:
+        raise BackendFailedError(failure)
+
+
+def _watch(publisher: subprocess.Popen[str], subscribers: Subscribers, parent: int) -> None:
+    """Wait until all that is published has been taken, or the backend has failed."""
+    while not subscribers.join(_LOOK_S):
+        _see(parent)
+        if subscribers.failed.is_set():
+            _end(publisher)
+            # Those that hang in the backend end with the process.
+            subscribers.join(_END_S)
+            return
+
+
+def _see(parent: int) -> None:
+    if os.getppid() != parent:
+        raise StoppedError("the process that started this run has gone")
+
+
+def _end(publisher: subprocess.Popen[str]) -> None:
+    if publisher.poll() is None:
+        publisher.kill()
+    publisher.wait()
+
+
+class _Meter:
+    """What a run uses, from its making until it is stopped.
+
+    Args:
+        system: Its servers are counted.
+    """
+
+    def __init__(self, system: Backend) -> None:
+        self._system = system
+        self._servers = usage.cpu_s(self._pids())
+        self._own = self._own_cpu()
+        self._machine = usage.machine()
+        self._started = self._stopped = time.monotonic_ns()
+
+    def stop(self) -> None:
+        """Read all clocks."""
+        self._stopped = time.monotonic_ns()
+        self._own = self._own_cpu() - self._own
+        machine = usage.machine()
+        pids = self._pids()
+        self._servers = max(usage.cpu_s(pids) - self._servers, 0.0)
+        self._server_peak = usage.peak_rss(pids)
+        self._busy = self._stolen = 0.0
+        if machine is not None and self._machine is not None:
+            self._busy = machine.busy - self._machine.busy
+            self._stolen = max(machine.stolen - self._machine.stolen, 0.0)
+
+    def note(self, values: Values, published: dict[str, Any]) -> None:
+        """Note what was used.
+
+        Args:
+            values: Where.
+            published: What the publisher has said; empty when it was ended.
+        """
+        values |= published
+        start = values.pop("start_ns", self._started)
+        publisher = values.pop("cpu_s", 0.0)
+        values |= {
+            "publish_s": (values.pop("end_ns", self._stopped) - start) / 1e9,
+            "wall_s": (self._stopped - start) / 1e9,
+            "cpu_s": self._own,
+            "publisher_cpu_s": publisher,
+            "server_cpu_s": self._servers,
+            "server_peak_rss": self._server_peak,
+            "steal_s": self._stolen,
+            "other_cpu_s": max(self._busy - self._own - self._servers - publisher, 0.0),
+        }
+
+    def _pids(self) -> set[int]:
+        pids = self._system.processes()
+        return usage.with_children(pids) if pids else set()
+
+    @staticmethod
+    def _own_cpu() -> float:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        return used.ru_utime + used.ru_stime
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """SIGTERM ends the block from within, so that what it has started is ended, too."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        # Once: the second one must not disturb the end.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise StoppedError("the run was ended from outside")
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,234 @@
+"""The publisher: a process of its own that follows the schedule and nothing else.
+
+A message travels as its row, eight bytes through a pipe; the payload lies in a file
+that the logger has mapped. The publisher never waits for the logger: a message that
+finds its queue full is dropped and counted, and the next one is due when it is due.
+
+Started by the logger as `python -m benchmarks.harness.publisher ARGUMENTS`, with JSON
+for arguments. Writes a line when it is ready, starts on a line, and ends with one line
+of JSON.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import sys
+import time
+from array import array
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness.counters import Counters
+from benchmarks.loads.base import Load
+
+READY = "ready"
+TOKEN = 8
+"""Bytes of a row on its way through a pipe, little-endian."""
+
+_HEAD_START_NS = 5_000_000
+_BLOCK = 4096
+"""Rows made Python numbers at once: a tenth of a millisecond, also in a log of millions."""
+_BATCH = 512
+"""Messages after which the clock is looked at again by a publisher that is late."""
+_NAP_NS = 250_000_000
+"""Longest sleep; after each the publisher sees whether its logger is still there."""
+_PIPE_BYTES = 1 << 20
+_PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
+
+
+class _OrphanedError(Exception):
+    """The logger has gone."""
+
+
+class Track:
+    """What is noted of every message on its way.
+
+    Args:
+        rows: Number of messages.
+
+    Attributes:
+        depth: int32[rows], messages that were ahead in the queue.
+        late_us: int32[rows], µs from when it was due until it was published.
+        rows: Messages noted.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.depth = array("i", bytes(4 * rows))
+        self.late_us = array("i", bytes(4 * rows))
+        self.rows = 0
+
+    def values(self) -> dict[str, float]:
+        """Percentiles, of all messages that were due."""
+        found: dict[str, float] = {}
+        for name, column, unit in (("depth", self.depth, 1), ("late_ms", self.late_us, 1000)):
+            values = np.frombuffer(column, np.int32)[: self.rows]
+            if len(values):
+                at = np.percentile(values, list(_PERCENTILES.values()), method="inverted_cdf")
+                for label, value in zip(_PERCENTILES, (at / unit).tolist(), strict=True):
+                    found[f"{name}_{label}"] = value
+        return found
+
+
+def publish_to_queues(
+    load: Load, counters: Counters, *, start: int, speed: float, pipes: Sequence[int], limit: int
+) -> Track:
+    """Publish into a queue a topic.
+
+    Args:
+        load: What.
+        counters: Of this run.
+        start: When, ns of the monotonic clock.
+        speed: Times as fast as the load says.
+        pipes: Where the tokens go, a descriptor a channel.
+        limit: Messages that a queue holds.
+    """
+    track = Track(len(load))
+    depths, late_us = track.depth, track.late_us
+    all_sent, all_dropped, taken = counters.sent, counters.dropped, counters.taken
+    sent, dropped = [0] * len(pipes), [0] * len(pipes)
+    clock, write = time.monotonic_ns, os.write
+    for first, channels, due in _batches(load, start, speed):
+        for row, channel, when in zip(range(first, len(load)), channels, due, strict=False):
+            late_us[row] = (clock() - when) // 1000
+            depths[row] = depth = sent[channel] - taken[channel]
+            if depth < limit:
+                sent[channel] += 1
+                # First: whoever takes a message has been counted as a waiting one.
+                all_sent[channel] = sent[channel]
+                write(pipes[channel], row.to_bytes(TOKEN, "little"))
+            else:
+                dropped[channel] += 1
+                all_dropped[channel] = dropped[channel]
+        track.rows = first + len(channels)
+    return track
+
+
+def publish_ahead(
+    load: Load, counters: Counters, *, start: int, speed: float, pipe: int, limit: int
+) -> Track:
+    """Publish into one intake, which may lie behind by a number of bytes.
+
+    Args:
+        load: What.
+        counters: Of this run.
+        start: When, ns of the monotonic clock.
+        speed: Times as fast as the load says.
+        pipe: Where all tokens go.
+        limit: Payload bytes that may be waiting; a longer message may wait alone.
+    """
+    track = Track(len(load))
+    depths, late_us = track.depth, track.late_us
+    sent, dropped, taken_bytes = counters.sent, counters.dropped, counters.taken_bytes
+    clock = time.monotonic_ns
+    os.set_blocking(pipe, False)
+    _widen(pipe)
+    waiting = bytearray()
+    total = total_bytes = 0
+    for first, channels, due in _batches(load, start, speed):
+        stop = first + len(channels)
+        lengths = load.length[first:stop].tolist()
+        taken = sum(counters.taken)
+        for row, channel, when, length in zip(
+            range(first, stop), channels, due, lengths, strict=True
+        ):
+            late_us[row] = (clock() - when) // 1000
+            ahead = total_bytes - taken_bytes[0]
+            depths[row] = max(total - taken, 0)
+            if not ahead or ahead + length <= limit:
+                sent[channel] += 1
+                total += 1
+                total_bytes += length
+                waiting += row.to_bytes(TOKEN, "little")
+            else:
+                dropped[channel] += 1
+        track.rows = stop
+        # What the pipe does not hold waits here: the limit is one of payloads, not of tokens.
+        _pass_on(pipe, waiting)
+    os.set_blocking(pipe, True)
+    while waiting:
+        _pass_on(pipe, waiting)
+    return track
+
+
+def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[int], list[int]]]:
+    """Sleep until messages are due; give the first row, the channels and the due times."""
+    clock, parent = time.monotonic_ns, os.getppid()
+    for block in range(0, len(load), _BLOCK):
+        rows = slice(block, block + _BLOCK)
+        due = (start + np.rint(load.due[rows] / speed).astype(np.int64)).tolist()
+        channels = load.channel[rows].tolist()
+        at = 0
+        while at < len(due):
+            now = clock()
+            if due[at] > now:
+                time.sleep(min(due[at] - now, _NAP_NS) / 1e9)
+                if os.getppid() != parent:
+                    raise _OrphanedError
+                continue
+            stop = bisect_right(due, now, at, min(at + _BATCH, len(due)))
+            yield block + at, channels[at:stop], due[at:stop]
+            at = stop
+
+
+def _pass_on(pipe: int, waiting: bytearray) -> None:
+    if waiting:
+        with suppress(BlockingIOError):
+            del waiting[: os.write(pipe, waiting)]
+
+
+def _widen(pipe: int) -> None:
+    """Ask for a larger pipe, where that can be done: fewer turns for the same tokens."""
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        # Refused to who is over the user's share; the pipe works as it is.
+        with suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+
+def main(
+    *, load: str, counters: str, pipes: list[int], limit: int, speed: float, intake: str
+) -> dict[str, Any]:
+    """Publish a load once.
+
+    Args:
+        load: Its directory.
+        counters: The counters' file.
+        pipes: Descriptors of the pipes.
+        limit: Messages a queue, or bytes ahead of a single intake.
+        speed: Times as fast as the load says.
+        intake: `threads` or `single`.
+
+    Returns:
+        `start_ns` and `end_ns` of the monotonic clock (the start, and when the last
+        message was published), `cpu_s`, and percentiles.
+    """
+    opened = Load.open(Path(load))
+    shared = Counters(Path(counters))
+    print(READY, flush=True)
+    sys.stdin.readline()
+    used = time.process_time()
+    start = time.monotonic_ns() + _HEAD_START_NS
+    if intake == "single":
+        track = publish_ahead(opened, shared, start=start, speed=speed, pipe=pipes[0], limit=limit)
+    else:
+        track = publish_to_queues(
+            opened, shared, start=start, speed=speed, pipes=pipes, limit=limit
+        )
+    used = time.process_time() - used
+    for pipe in pipes:
+        os.close(pipe)
+    end = start + round(int(opened.due[-1]) / speed) + track.late_us[-1] * 1000
+    return {"start_ns": start, "end_ns": end, "cpu_s": used, **track.values()}
+
+
+if __name__ == "__main__":
+    try:
+        print(json.dumps(main(**json.loads(sys.argv[1]))))
+    except (_OrphanedError, BrokenPipeError, KeyboardInterrupt):
+        sys.exit(1)

@@ -1,0 +1,197 @@
+"""One run: a load into a backend, and what came of it as seen from outside."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.backends.base import Backend
+from benchmarks.harness import usage
+from benchmarks.harness.child import ChildError, run_child
+from benchmarks.harness.counters import Counters
+from benchmarks.loads.base import Load
+from benchmarks.samples import Status
+from benchmarks.side import Values, warm_cache
+
+Intake = Literal["threads", "single"]
+
+QUEUE = 10
+"""Messages that the queue of a topic holds."""
+AHEAD_BYTES = 512 << 20
+"""Payload bytes that may wait for a single intake."""
+
+_COUNT_S = 900.0
+_COUNT_FAILED_S = 60.0
+_START_S = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How a load is published.
+
+    Attributes:
+        speed: Times as fast as the load says.
+        intake: `threads`: a thread and a queue a topic. `single`: one thread takes all,
+            in the order of publication, for a recorder that has its own threads and queues.
+        queue: Messages that a topic's queue holds.
+        ahead_bytes: Payload bytes that may wait for a single intake.
+        timeout_s: A run is ended after it; None for thrice its duration and five minutes.
+    """
+
+    speed: float = 1.0
+    intake: Intake = "threads"
+    queue: int = QUEUE
+    ahead_bytes: int = AHEAD_BYTES
+    timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.speed > 0:
+            raise ValueError(f"speed is {self.speed}; give a number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a run, as a sample wants it.
+
+    Attributes:
+        status: `ok`, `missing`, `failed`.
+        values: What was measured; of a failure, until then.
+        reason: Of a status that is not `ok`.
+    """
+
+    status: Status
+    values: Mapping[str, Any]
+    reason: str = ""
+
+
+def run(
+    load: Load, backend: type[Backend], directory: Path, setting: Setting | None = None
+) -> Outcome:
+    """Publish a load into a backend, close it, and count what another process finds in it.
+
+    Values: `published`, `dropped`, `errors` (inserts that raised), `persisted` (counted
+    afterwards), `lost` (taken without an error and not found), `topics` (published,
+    dropped, persisted of each), `published_bytes`, `persisted_bytes`, `due_s` (from the
+    first until the last message should be published), `publish_s` (until it was),
+    `wall_s` (from the first publication until `finish` had returned), `depth_*` and
+    `late_ms_*` (percentiles), `cpu_s` of the logger, `publisher_cpu_s`, `server_cpu_s`,
+    `server_peak_rss`, `peak_rss` (without the payload file), `disk_bytes`, `steal_s` and
+    `other_cpu_s` of the machine (the kernel's writing threads are among the others),
+    `spin_ms`.
+
+    Args:
+        load: What; its directory must stay where it is.
+        backend: A class at the top of a module.
+        directory: Empty and nobody else's. The caller removes it.
+        setting: How.
+
+    Raises:
+        ValueError: The load has no messages.
+    """
+    setting = setting or Setting()
+    if not len(load):
+        raise ValueError(f"the load {load.name!r} has no messages; nothing can be measured")
+    directory = directory.resolve()
+    data = directory / "data"
+    data.mkdir()
+    common = {
+        "load": str(load.payloads.parent.resolve()),
+        "backend": f"{backend.__module__}:{backend.__qualname__}",
+        "directory": str(data),
+    }
+    counters = directory / "counters"
+    single = setting.intake == "single"
+    arguments = {
+        **common,
+        "publishing": {
+            "counters": str(counters),
+            "speed": setting.speed,
+            "intake": setting.intake,
+            "limit": setting.ahead_bytes if single else setting.queue,
+        },
+    }
+    timeout = setting.timeout_s
+    if timeout is None:
+        timeout = 3 * load.duration_s / setting.speed + _START_S
+    warm_cache([load.payloads])
+    try:
+        values = run_child("benchmarks.harness.logger:log", arguments, directory, timeout)
+    except ChildError as error:
+        values = {"status": "failed", "reason": str(error)}
+    status, reason = values.pop("status"), values.pop("reason")
+    if "peak_rss" in values:
+        values["peak_rss"] -= values.pop("peak_rss_mapped", 0)
+    if status == "missing" or not counters.is_file():
+        return Outcome(status, {}, reason)
+    values["due_s"] = load.duration_s / setting.speed
+    values["disk_bytes"] = usage.disk_bytes(data)
+    try:
+        limit_s = _COUNT_S if status == "ok" else _COUNT_FAILED_S
+        found = run_child("benchmarks.harness.logger:count", common, directory, limit_s)
+    except ChildError as error:
+        found = {"status": "failed", "reason": str(error)}
+    if status == "ok" and found["status"] != "ok":
+        status, reason = "failed", f"opened again, it cannot be counted: {found['reason']}"
+    counts = found.get("counts")
+    wrong = _account(values, load, Counters(counters), counts)
+    if status == "ok" and wrong:
+        status, reason = "failed", wrong
+    return Outcome(status, values, reason)
+
+
+def _account(
+    values: Values, load: Load, counters: Counters, counts: Mapping[str, int] | None
+) -> str:
+    """Put what was published and what was found side by side.
+
+    Returns:
+        What does not fit; empty when all does.
+    """
+    published, dropped = _by_topic(load, counters.published()), _by_topic(load, counters.dropped)
+    values["published"] = sum(published.values())
+    values["dropped"] = sum(dropped.values())
+    values["errors"] = sum(counters.errors)
+    # In the order of the rows, so those that were due are the first ones.
+    values["published_bytes"] = int(load.length[: values["published"]].sum())
+    values["topics"] = {topic: [n, dropped[topic]] for topic, n in published.items()}
+    if counts is None:
+        return ""
+    for topic, row in values["topics"].items():
+        row.append(counts.get(topic, 0))
+    persisted = sum(counts.values())
+    values["persisted"] = persisted
+    values["lost"] = sum(counters.taken) - values["errors"] - persisted
+    if persisted == values["published"]:
+        values["persisted_bytes"] = values["published_bytes"]
+    else:
+        means = _mean_lengths(load)
+        values["persisted_bytes"] = round(sum(n * means.get(t, 0.0) for t, n in counts.items()))
+    for topic, count in counts.items():
+        if count > published.get(topic, 0) - dropped.get(topic, 0):
+            return (
+                f"{topic}: {count} messages were found, more than the "
+                f"{published.get(topic, 0) - dropped.get(topic, 0)} that it was given"
+            )
+    return ""
+
+
+def _by_topic(load: Load, numbers: list[int] | memoryview) -> Counter[str]:
+    """Numbers of channels added up by topic: a topic may have several channels."""
+    found: Counter[str] = Counter()
+    for channel, number in zip(load.channels, numbers, strict=True):
+        found[channel.topic] += number
+    return found
+
+
+def _mean_lengths(load: Load) -> dict[str, float]:
+    """Mean payload length of each topic, bytes."""
+    counts = np.bincount(load.channel, minlength=len(load.channels))
+    sums = np.bincount(load.channel, weights=load.length, minlength=len(load.channels))
+    messages = _by_topic(load, counts.tolist())
+    lengths = _by_topic(load, sums.tolist())
+    return {topic: lengths[topic] / count for topic, count in messages.items() if count}

@@ -1,0 +1,162 @@
+"""The subscribers: a thread a topic, or one intake, that hand messages to the backend."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.backends.base import Backend, BackendFailedError
+from benchmarks.harness.publisher import TOKEN
+
+if TYPE_CHECKING:
+    from benchmarks.harness.counters import Counters
+    from benchmarks.loads.base import Load
+
+_QUEUE_READ = 16 * TOKEN
+_INTAKE_READ = 8192 * TOKEN
+
+
+class Subscribers:
+    """Threads that take messages from pipes until these end or the backend fails.
+
+    A message whose insert raises anything but `BackendFailedError` is lost and counted,
+    as in a logger that must go on.
+
+    Args:
+        load: Where the payloads lie.
+        backend: Where they go.
+        counters: Of this run.
+
+    Attributes:
+        failed: Set when the backend cannot go on.
+        failure: Why.
+        first_error: What the first insert that raised has said.
+    """
+
+    def __init__(self, load: Load, backend: Backend, counters: Counters) -> None:
+        self.failed = threading.Event()
+        self.failure = ""
+        self.first_error = ""
+        self._load = load
+        self._backend = backend
+        self._counters = counters
+        self._payloads = load.map()
+        # Every page is looked at once, so that no subscriber waits for it to be mapped.
+        np.frombuffer(self._payloads, np.uint8)[::4096].max(initial=0)
+        self._threads: list[threading.Thread] = []
+
+    def start(self, pipes: Sequence[int], *, single: bool) -> None:
+        """Start taking messages.
+
+        Args:
+            pipes: A descriptor a channel, or one for all; closed at the end.
+            single: One intake takes everything.
+        """
+        if single:
+            self._add(self._take_all, pipes[0])
+        else:
+            for channel, pipe in enumerate(pipes):
+                self._add(self._take_one, pipe, channel)
+        for thread in self._threads:
+            thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait until all is taken.
+
+        Returns:
+            Whether it is, within about that time.
+        """
+        deadline = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(deadline - time.monotonic(), 0))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _add(self, take: Callable[..., None], *arguments: int) -> None:
+        # A daemon: one that hangs in a dead backend does not keep the process.
+        self._threads.append(
+            threading.Thread(target=self._guard, args=(take, *arguments), daemon=True)
+        )
+
+    def _guard(self, take: Callable[..., None], pipe: int, *arguments: int) -> None:
+        try:
+            take(pipe, *arguments)
+        except BackendFailedError as error:
+            self._fail(str(error) or "the backend failed")
+        except Exception as error:
+            self._fail(f"a subscriber failed: {error!r}")
+            raise
+        finally:
+            os.close(pipe)
+
+    def _fail(self, reason: str) -> None:
+        if not self.failed.is_set():
+            self.failure = reason
+            self.failed.set()
+
+    def _take_one(self, pipe: int, channel: int) -> None:
+        """Take the messages of one channel."""
+        offset, length, payloads = self._load.offset, self._load.length, self._payloads
+        insert, taken = self._backend.insert, self._counters.taken
+        stop, now = self.failed.is_set, time.time_ns
+        count = 0
+        while data := os.read(pipe, _QUEUE_READ):
+            for row in memoryview(data).cast("q"):
+                if stop():
+                    return
+                # Out of the queue one by one: those read with it still wait.
+                count += 1
+                taken[channel] = count
+                start = offset.item(row)
+                payload = bytes(payloads[start : start + length.item(row)])
+                try:
+                    insert(channel, now(), payload)
+                except BackendFailedError:
+                    raise
+                except Exception as error:
+                    self._count_error(channel, error)
+
+    def _take_all(self, pipe: int) -> None:
+        """Take the messages of all channels, in the order in which they were published."""
+        load, payloads = self._load, self._payloads
+        insert, taken = self._backend.insert, self._counters.taken
+        taken_bytes = self._counters.taken_bytes
+        stop, now = self.failed.is_set, time.time_ns
+        counts = [0] * len(load.channels)
+        total = 0
+        rest = b""
+        while data := os.read(pipe, _INTAKE_READ):
+            # A large write may have been cut anywhere.
+            data = rest + data
+            whole = len(data) // TOKEN * TOKEN
+            rest = data[whole:]
+            rows = np.frombuffer(data, "<i8", whole // TOKEN)
+            for channel, start, size in zip(
+                load.channel[rows].tolist(),
+                load.offset[rows].tolist(),
+                load.length[rows].tolist(),
+                strict=True,
+            ):
+                if stop():
+                    return
+                counts[channel] += 1
+                taken[channel] = counts[channel]
+                payload = bytes(payloads[start : start + size])
+                try:
+                    insert(channel, now(), payload)
+                except BackendFailedError:
+                    raise
+                except Exception as error:
+                    self._count_error(channel, error)
+                # Only now: what is being inserted still takes its memory.
+                total += size
+                taken_bytes[0] = total
+
+    def _count_error(self, channel: int, error: Exception) -> None:
+        self._counters.errors[channel] += 1
+        if not self.first_error:
+            self.first_error = f"{type(error).__name__}: {error}"[:500]

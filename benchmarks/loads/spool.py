@@ -1,0 +1,188 @@
+"""Writes a load: payloads to the flat file as they come, columns at the end."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from benchmarks.loads.base import PAYLOADS, Load
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from hybridlog.demo.wire import Template
+    from hybridlog_storage.messages import Channel
+
+_BUFFER = 1 << 20
+_BLOCK = 16 << 20
+"""Bytes of payloads that are made at once."""
+_ABOUT = "load.json"
+
+_Columns = tuple["NDArray[np.int32]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]"]
+
+
+class Spool:
+    """A load that is being written. Use it as a context manager.
+
+    Messages may come in any order. Payloads do not stay in memory, only 28 bytes a
+    message do. When the block ends with an error, the payloads are removed.
+
+    Args:
+        directory: Made when it is not there; a load that lies in it is replaced.
+
+    Raises:
+        UsageError: The directory cannot be written to.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._at = 0
+        self._columns: list[_Columns] = []
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            # From here on until it is finished, no load lies here.
+            (directory / _ABOUT).unlink(missing_ok=True)
+            self._file = (directory / PAYLOADS).open("wb", buffering=_BUFFER)
+        except OSError as error:
+            raise UsageError(
+                f"{directory}: no load can be written here ({error.strerror or error}); "
+                "choose another directory"
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+        if kind is not None:
+            (self._directory / PAYLOADS).unlink(missing_ok=True)
+
+    def rows(self, channel: int, rows: NDArray[np.uint8], log_time: NDArray[np.int64]) -> None:
+        """Add messages of one channel that are equally long.
+
+        Args:
+            channel: Its index.
+            rows: uint8[n, size], a payload each.
+            log_time: int64[n], ns since the epoch.
+        """
+        count, size = rows.shape
+        self._file.write(np.ascontiguousarray(rows).data)
+        self._add(
+            np.full(count, channel, np.int32),
+            log_time,
+            self._at + size * np.arange(count, dtype=np.int64),
+            np.full(count, size, np.int64),
+        )
+        self._at += count * size
+
+    def template(
+        self,
+        channel: int,
+        template: Template,
+        columns: Mapping[str, NDArray[Any]],
+        log_time: NDArray[np.int64],
+    ) -> None:
+        """Add copies of a message with other values, a block at a time.
+
+        Args:
+            channel: Its index.
+            template: The message.
+            columns: By field path, as `Template.rows` takes them.
+            log_time: int64[n], ns since the epoch.
+        """
+        step = max(1, _BLOCK // template.size)
+        for first in range(0, len(log_time), step):
+            part = slice(first, first + step)
+            times = log_time[part]
+            values = {path: column[part] for path, column in columns.items()}
+            self.rows(channel, template.rows(values, len(times)), times)
+
+    def messages(
+        self,
+        channel: NDArray[np.int32],
+        payloads: Iterable[bytes | memoryview],
+        log_time: NDArray[np.int64],
+    ) -> None:
+        """Add messages of any length.
+
+        Args:
+            channel: int32[n], index of each one's channel.
+            payloads: n of them.
+            log_time: int64[n], ns since the epoch.
+        """
+        length = np.fromiter(map(self._file.write, payloads), np.int64, len(log_time))
+        ends = self._at + np.cumsum(length)
+        self._add(channel, log_time, ends - length, length)
+        self._at += int(length.sum())
+
+    def finish(
+        self,
+        name: str,
+        seed: int | None,
+        channels: Sequence[Channel],
+        seconds: float | None = None,
+    ) -> Load:
+        """Order what was added by log time, and save it.
+
+        A message is due as long after the first one as its log time is after that of the
+        first one. Of equal log times, the one that was added first comes first.
+
+        Args:
+            name: Of the load.
+            seed: From which it was made; None for a real log.
+            channels: One a topic.
+            seconds: Leave out what is due this long after the start, or later.
+
+        Raises:
+            UsageError: There is no message.
+        """
+        if not self._columns:
+            raise UsageError(f"{name}: no messages; choose a longer time or another log")
+        if not self._at:
+            # An empty file could not be mapped.
+            self._file.write(b"\0")
+        self._file.close()
+        channel, log_time, offset, length = (
+            np.concatenate(parts) for parts in zip(*self._columns, strict=True)
+        )
+        order = np.argsort(log_time, kind="stable")
+        due = log_time[order] - log_time[order[0]]
+        if seconds is not None:
+            due = due[: np.searchsorted(due, round(seconds * 1e9))]
+            order = order[: len(due)]
+        load = Load(
+            name=name,
+            seed=seed,
+            channels=tuple(channels),
+            channel=channel[order],
+            due=due,
+            log_time=log_time[order],
+            offset=offset[order],
+            length=length[order],
+            payloads=self._directory / PAYLOADS,
+        )
+        load.save(self._directory)
+        return load
+
+    def _add(
+        self,
+        channel: NDArray[np.int32],
+        log_time: NDArray[np.int64],
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+    ) -> None:
+        if len(log_time):
+            self._columns.append(
+                (channel.astype(np.int32), log_time.astype(np.int64), offset, length)
+            )

@@ -1,0 +1,52 @@
+"""Serialised messages to index documents, a chunk's worth at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.micro.inputs import DRIVE, SMALL, read
+from benchmarks.micro.isolation import need
+
+CASES = {
+    "pose": (SMALL, "/pose", 1000),
+    "imu": (SMALL, "/imu/data", 1000),
+    "tf": (SMALL, "/tf", 1000),
+    "scan": (DRIVE, "/scan", 80),
+    "image": (DRIVE, "/camera/left/image_raw", 8),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
+    """Bodies of the documents, and what stands around them."""
+    name, topic, count = CASES[case]
+    stream = read(bags / name, topic, count)
+    codec_for = need("hybridlog.schema.codec", "codec_for").codec_for
+    found = need("hybridlog_storage.index_documents", "DocumentAssembler", "Origin")
+    stored_chunk = need("hybridlog_storage.segment_writer", "StoredChunk").StoredChunk
+    batch: Any = stream.batches(count)[0]
+    chunk = stored_chunk(
+        segment=1,
+        offset=4096,
+        length=len(batch.buffer),
+        trailer=0,
+        batch=batch,
+        seq=np.arange(count),
+        compressed_size=len(batch.buffer),
+    )
+    codec = codec_for(stream.channel())
+    assembler = found.DocumentAssembler(found.Origin("recording", 1, topic, False))
+
+    def transcode() -> int:
+        documents = 0
+        for group in codec.bodies(batch.buffer, batch.offset, batch.length):
+            table = assembler.assemble(chunk, group.rows, group.body, group.error)
+            assert group.error is None
+            documents += len(table)
+        return documents
+
+    assert benchmark(transcode) == count

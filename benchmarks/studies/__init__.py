@@ -1,0 +1,1 @@
+"""The three studies: which cases, how often, and what is left to do."""

@@ -1,0 +1,113 @@
+"""Study 2: what is kept of whole logs, published as they were recorded; Figure 5."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.samples import Sample
+from benchmarks.studies.replays import MADE, Replay, chosen_logs, replays
+from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
+from benchmarks.studies.throughput import Case, short
+
+STUDY = "persistence"
+QUICK_SECONDS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which logs, how long, how often.
+
+    Attributes:
+        seconds: Most of each log that is published, in its own time.
+        made: Names of the logs that are made.
+        logs: Real logs, files and directories.
+        chosen: With some of the real logs that lie beside the checkout, if there are any.
+        repetitions: Of each log with each backend.
+        backends: Names of those that take part; None for all.
+    """
+
+    seconds: float = 60.0
+    made: Sequence[str] = MADE
+    logs: Sequence[Path] = ()
+    chosen: bool = True
+    repetitions: int = 3
+    backends: Sequence[str] | None = None
+
+    @classmethod
+    def usual(cls, *, quick: bool) -> Settings:
+        """Those of a full or of a quick run: the beginning of each log that is made, once."""
+        return cls(seconds=QUICK_SECONDS, chosen=False, repetitions=1) if quick else cls()
+
+    def header(self) -> dict[str, Any]:
+        """What a journal says of these settings."""
+        values = asdict(self)
+        values["made"] = list(self.made)
+        values["logs"] = [str(path) for path in self.logs]
+        values["backends"] = None if self.backends is None else list(self.backends)
+        return {STUDY: values}
+
+    def replays(self, seed: int) -> list[Replay]:
+        """The logs.
+
+        Raises:
+            SourceError: There is no log at a path.
+            ValueError: A name in `made` is not known, or `seconds` is not above 0.
+        """
+        logs = [*(chosen_logs() if self.chosen else ()), *self.logs]
+        return replays(seed, self.seconds, logs, self.made)
+
+
+def plan(context: Context, settings: Settings | None = None) -> list[Case]:
+    """All runs in the order in which they are done, those of the journal included.
+
+    The backends take turns within a log, so that what disturbs the machine for a while
+    hits all of them alike.
+
+    Raises:
+        SourceError: There is no log at a path.
+        ValueError: A backend or a log is not known.
+    """
+    settings = settings or Settings.usual(quick=context.quick)
+    return _plan(context, settings, settings.replays(context.seed))
+
+
+def expected_seconds(context: Context, settings: Settings | None = None) -> float:
+    """About how long the runs take that are still to be done."""
+    return sum(case.seconds for case in plan(context, settings) if context.to_do(case.sample))
+
+
+def run(context: Context, settings: Settings | None = None) -> None:
+    """Do what is still to be done.
+
+    Raises:
+        SourceError: There is no log at a path, or nothing of it can be read.
+        ValueError: A backend or a log is not known.
+    """
+    settings = settings or Settings.usual(quick=context.quick)
+    found = settings.replays(context.seed)
+    by_name = {replay.name: replay for replay in found}
+    for sample, seconds in _plan(context, settings, found):
+        replay = by_name[sample.case["log"]]
+        context.run(sample, partial(replay.load, context), seconds=seconds)
+
+
+def _plan(context: Context, settings: Settings, found: Sequence[Replay]) -> list[Case]:
+    names = list(chosen(context.backends, settings.backends))
+    return [
+        Case(
+            Sample(STUDY, _case(replay.case, context.speed), name, repetition),
+            replay.seconds / context.speed + RUN_OVERHEAD_S,
+        )
+        for repetition in range(settings.repetitions)
+        for replay in found
+        for name in names
+    ]
+
+
+def _case(case: Mapping[str, Any], speed: float) -> dict[str, Any]:
+    # Runs at another speed are others; at the usual one the case is that of the paper.
+    return dict(case) if speed == 1 else {**case, "speed": short(speed)}

@@ -1,0 +1,157 @@
+"""Study 3: the paper's questions about teleoperation, Table 1, and three more.
+
+Every backend is filled with the same load as fast as it takes it, closed, opened again,
+and asked in its own language. All answers are known from the plan of the load; one that
+is wrong makes the sample a failure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.loads.hcr_like import hcr_like
+from benchmarks.loads.truth import Truth
+from benchmarks.questions import run as turns
+from benchmarks.questions.askers import ASKERS, SAME
+from benchmarks.questions.base import QUESTIONS, true_answers
+from benchmarks.questions.run import Turn
+from benchmarks.samples import Sample
+from benchmarks.studies.runs import Context, chosen
+
+if TYPE_CHECKING:
+    from benchmarks.harness.run import Outcome
+    from benchmarks.loads.base import Load
+
+STUDY = "queries"
+_VERSION = 1
+"""Goes up when the generator makes other messages from the same seed."""
+_SIDE = "benchmarks.questions.sides:ask"
+_OVERHEAD_S = 6.0
+# Seconds for each minute of the load: filling, then asking; measured on two processors.
+_PER_MINUTE_S = {"sqlite_udf": 6.0}
+_USUAL_PER_MINUTE_S = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much there is to ask about, and how often it is asked.
+
+    Attributes:
+        sessions: Of the load.
+        minutes: Length of each session, at least 1.
+        repetitions: Of each question, after the first time; what takes more than 10 s is
+            asked once.
+        backends: Names of those that take part; None for all.
+    """
+
+    sessions: int = 8
+    minutes: float = 10.0
+    repetitions: int = 5
+    backends: Sequence[str] | None = None
+
+    @classmethod
+    def usual(cls, *, quick: bool) -> Settings:
+        """Those of a full or of a quick run."""
+        return cls(sessions=1, minutes=4.0, repetitions=2) if quick else cls()
+
+    def header(self) -> dict[str, Any]:
+        """What a journal says of these settings."""
+        values = asdict(self)
+        values["backends"] = None if self.backends is None else list(self.backends)
+        return {STUDY: values}
+
+
+def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
+    """Every backend's turn, those that the journal has included.
+
+    Raises:
+        ValueError: A backend is not known.
+    """
+    settings = settings or Settings.usual(quick=context.quick)
+    minutes = settings.sessions * settings.minutes
+    found = []
+    for name, kind in chosen(context.backends, settings.backends).items():
+        if kind.kind == "none" or name in SAME:
+            continue  # what is not kept cannot be asked about
+        rows = ASKERS.get(name, {})
+        samples = [
+            Sample(STUDY, _case(question, settings), row, repetition)
+            for row in rows or [name]
+            for question in QUESTIONS
+            for repetition in range(settings.repetitions)
+        ]
+        seconds = _OVERHEAD_S + minutes * _PER_MINUTE_S.get(name, _USUAL_PER_MINUTE_S)
+        found.append(Turn(name, rows, samples, seconds))
+    return found
+
+
+def expected_seconds(context: Context, settings: Settings | None = None) -> float:
+    """About how long the turns take that are still to be done."""
+    return sum(turn.seconds for turn in plan(context, settings) if turns.to_do(context, turn))
+
+
+def run(context: Context, settings: Settings | None = None) -> None:
+    """Do what is still to be done.
+
+    Raises:
+        ValueError: A backend is not known.
+    """
+    settings = settings or Settings.usual(quick=context.quick)
+
+    def load() -> Load:
+        return make_load(context, settings)
+
+    def samples_of(outcome: Outcome, results: Sequence[turns.Result]) -> Iterable[Sample]:
+        directory = load().payloads.parent
+        truth = true_answers(Truth.open(directory))
+        for result in results:
+            yield from _samples(outcome, result, truth, settings)
+
+    arguments = {"questions": list(QUESTIONS), "repetitions": settings.repetitions}
+    for turn in plan(context, settings):
+        turns.do(context, turn, side=_SIDE, load=load, arguments=arguments, samples_of=samples_of)
+
+
+def make_load(context: Context, settings: Settings) -> Load:
+    """The load, made once; its truth lies beside it."""
+    about = {
+        "version": _VERSION,
+        "seed": context.seed,
+        "sessions": settings.sessions,
+        "minutes": settings.minutes,
+    }
+    return context.load(
+        "questions",
+        about,
+        lambda directory: hcr_like(
+            directory, seed=context.seed, sessions=settings.sessions, minutes=settings.minutes
+        ),
+    )
+
+
+def _samples(
+    outcome: Outcome, result: turns.Result, truth: dict[str, Any], settings: Settings
+) -> Iterable[Sample]:
+    """One sample a repetition; one in all of a question that was too slow to ask again."""
+    question = result["question"]
+    error = result.get("error", "")
+    values = dict(outcome.values)
+    if result["index_bytes"] is not None:
+        values["index_bytes"] = result["index_bytes"]
+    times: list[float] = []
+    if not error:
+        values |= {"answer": result["answer"], "cold_ms": result["cold_ms"]}
+        times = result["ms"]
+    if not times:
+        values[turns.ONCE] = True
+        times = [result.get("cold_ms", 0.0)]
+    for repetition, ms in enumerate(times):
+        wanted = Sample(STUDY, _case(question, settings), result["row"], repetition)
+        timed = values if error else {**values, "ms": ms}
+        yield turns.judged(wanted, timed, truth[question], error)
+
+
+def _case(question: str, settings: Settings) -> dict[str, Any]:
+    return {"question": question, "sessions": settings.sessions, "minutes": settings.minutes}

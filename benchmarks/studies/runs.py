@@ -1,0 +1,188 @@
+"""What the studies share: one run of one case, kept in the journal, done once."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.harness.run import Setting
+from benchmarks.harness.run import run as run_load
+from benchmarks.loads.base import Load
+from benchmarks.samples import Journal, Sample, Status
+
+if TYPE_CHECKING:
+    from benchmarks.backends.base import Backend
+    from benchmarks.progress import Steps
+
+RUN_OVERHEAD_S = 3.0
+"""About what a run takes besides publishing: processes, counting."""
+SERVER_OVERHEAD_S = 5.0
+"""About what a server adds: it is started and ended twice."""
+
+_PART = "part-"
+
+
+@dataclass
+class Context:
+    """Where and how studies run.
+
+    Attributes:
+        work: Directory for loads (kept) and the data of runs (removed after each).
+        backends: Those that take part, by name, in the order in which they take turns.
+        journal: Where samples go, and where those lie that need not be run again.
+        steps: Where the progress goes.
+        quick: Small cases.
+        seed: Of all loads.
+        speed: Times as fast as the loads say.
+        timeout_s: A run is ended after it; None to let it depend on its duration.
+        missing: Why backends are missing that were found so: they are not tried again.
+    """
+
+    work: Path
+    backends: Mapping[str, type[Backend]]
+    journal: Journal
+    steps: Steps
+    quick: bool = False
+    seed: int = 1
+    speed: float = 1.0
+    timeout_s: float | None = None
+    missing: dict[str, str] = field(default_factory=dict)
+
+    def load(self, name: str, settings: Mapping[str, Any], make: Callable[[Path], Load]) -> Load:
+        """A load that is made once.
+
+        Args:
+            name: What it is, for people who look into the work directory.
+            settings: All that it depends on, values that JSON can hold.
+            make: Makes it in an empty directory.
+        """
+        text = json.dumps([name, settings], sort_keys=True)
+        place = self.work / "loads" / f"{name}-{sha256(text.encode()).hexdigest()[:16]}"
+        if not Load.is_complete(place):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            part = Path(tempfile.mkdtemp(prefix=_PART, dir=place.parent))
+            try:
+                make(part)
+                shutil.rmtree(place, ignore_errors=True)
+                part.rename(place)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+        return Load.open(place)
+
+    def to_do(self, sample: Sample) -> bool:
+        """Whether a run has still to be done: it is not in the journal as a success."""
+        return not self.journal.has(sample)
+
+    def run(
+        self,
+        wanted: Sample,
+        load: Callable[[], Load],
+        *,
+        seconds: float,
+        speed: float | None = None,
+    ) -> Sample:
+        """Run one case with one backend once, unless the journal has it.
+
+        Args:
+            wanted: Study, case, backend and repetition.
+            load: Gives the load; called only when it is needed.
+            seconds: About how long it takes.
+            speed: Times as fast as the load says; None for this context's.
+
+        Returns:
+            The sample, which is in the journal.
+        """
+        if not self.to_do(wanted):
+            return self.journal.samples[wanted.key]
+        reason = self.missing.get(wanted.backend)
+        if reason is not None:
+            sample = _filled(wanted, "missing", {}, reason)
+            self.journal.add(sample)
+            return sample
+        with self.steps.step(describe_run(wanted), seconds):
+            sample = self._run(wanted, load(), self.speed if speed is None else speed)
+        self.journal.add(sample)
+        if sample.status == "missing":
+            self.missing[wanted.backend] = sample.reason
+        return sample
+
+    def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
+        backend = self.backends[wanted.backend]
+        setting = Setting(speed=speed, intake=backend.intake, timeout_s=self.timeout_s)
+        with run_directory(self.work) as directory:
+            outcome = run_load(load, backend, directory, setting)
+        return _filled(wanted, outcome.status, outcome.values, outcome.reason)
+
+
+def chosen(
+    backends: Mapping[str, type[Backend]], names: Sequence[str] | None
+) -> dict[str, type[Backend]]:
+    """Some of the backends, in the order of all.
+
+    Args:
+        backends: All, by name.
+        names: Which; None for all.
+
+    Raises:
+        ValueError: One is not known; the message names those that are.
+    """
+    if names is None:
+        return dict(backends)
+    unknown = [name for name in names if name not in backends]
+    if unknown:
+        raise ValueError(
+            f"there is no backend {', '.join(map(repr, unknown))}; there are {', '.join(backends)}"
+        )
+    return {name: kind for name, kind in backends.items() if name in names}
+
+
+def describe_run(sample: Sample) -> str:
+    """A run in a line of progress."""
+    case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
+    return f"{sample.study}: {sample.backend}, {case}, run {sample.repetition + 1}"
+
+
+def overhead_s(backend: type[Backend]) -> float:
+    """About what a run of a backend takes besides publishing, seconds."""
+    has_server = backend.kind in {"database", "hybrid"}
+    return RUN_OVERHEAD_S + (SERVER_OVERHEAD_S if has_server else 0.0)
+
+
+@contextmanager
+def run_directory(work: Path) -> Iterator[Path]:
+    """An empty directory for one run, removed with all that is in it, however the run ends.
+
+    What runs of processes that were killed have left behind goes, too.
+    """
+    runs = work / "runs"
+    runs.mkdir(parents=True, exist_ok=True)
+    for left in runs.iterdir():
+        if not _is_alive(left.name.split("-")[0]):
+            shutil.rmtree(left, ignore_errors=True)
+    directory = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=runs))
+    try:
+        yield directory
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+def _is_alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (ValueError, ProcessLookupError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _filled(wanted: Sample, status: Status, values: Mapping[str, Any], reason: str) -> Sample:
+    return replace(wanted, status=status, values=dict(values), reason=reason)
