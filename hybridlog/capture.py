@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,6 @@ from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.messages import Batch, Channel
 
 
 class Capture:
@@ -82,14 +81,6 @@ class Capture:
             settings,
             behind,
         )
-
-    def append(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Take a batch; `batch.channel` indexes `channels`.
-
-        Raises:
-            DiskFullError: no space; what was flushed before stays.
-        """
-        self.writer.append(batch, channels)
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Bring the recording to its end; `entry` is then complete.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
 
-_LARGE = 1 << 17  # bytes from which a payload is a batch of its own, and is not copied first
+_LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and is not copied first
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.02  # the writing thread looks so often when little comes
@@ -262,10 +262,17 @@ class LiveRecording:
         if not inbox:
             return
         for group in _groups(inbox):
-            batch = _batch(group)
-            self._capture.append(batch, self._channels)
+            size = sum(len(message.payload) for message in group)
+            if len(group) == 1:
+                one = group[0]
+                channel = self._channels[one.channel]
+                self._capture.writer.append_one(
+                    channel, one.payload, one.log_time, one.publish_time, one.sequence
+                )
+            else:
+                self._capture.writer.append(_batch(group), self._channels)
             with self._lock:
-                self._unwritten -= batch.payload_bytes
+                self._unwritten -= size
                 self._room.notify()
 
 

@@ -31,6 +31,7 @@ BLOCK = 4096
 """Bytes of a block; every device's own blocks divide it."""
 _STAGE = 4 << 20
 _DIRECT = getattr(os, "O_DIRECT", 0)
+_PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
@@ -47,7 +48,7 @@ class AppendFile:
         self.position = position
         """Bytes in the file."""
         self._fd = fd
-        self._stage = mmap.mmap(-1, _STAGE) if direct else None
+        self._stage = mmap.mmap(-1, _STAGE, flags=_PRIVATE) if direct else None
         self._filled = 0  # bytes in the stage; the first of them belongs at `position - filled`
 
     @classmethod

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.opcode import Opcode
 
+from hybridlog_storage.buffers import buffers
 from hybridlog_storage.copying import copy_payloads, windows
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Buffer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEAD = MESSAGE_HEAD.itemsize
+_ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
 
 
 class ChunkBuilder:
@@ -30,6 +33,7 @@ class ChunkBuilder:
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
+        self._rows: list[tuple[int, int, int, int, int, int, int]] = []
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
         self.opened = 0.0
@@ -46,6 +50,7 @@ class ChunkBuilder:
             batch: n messages, n > 0.
             seq: int64[n], their arrival numbers.
         """
+        self._settle()
         if not self._used:
             self.first_log_time = int(batch.log_time[0])
             self.opened = time.monotonic()
@@ -70,6 +75,42 @@ class ChunkBuilder:
             )
         )
 
+    def append_one(
+        self,
+        payload: Buffer,
+        *,
+        channel: int,
+        log_time: int,
+        publish_time: int,
+        sequence: int,
+        seq: int,
+    ) -> None:
+        """Copy one message in: for payloads so large that a batch of one costs more.
+
+        Args:
+            payload: The serialized message.
+            channel: The segment's channel id.
+            log_time: Nanoseconds since the epoch.
+            publish_time: Nanoseconds since the epoch.
+            sequence: The sender's number.
+            seq: Arrival number.
+        """
+        if not self._used:
+            self.first_log_time = log_time
+            self.opened = time.monotonic()
+        length = len(payload)
+        start = self._used + _HEAD
+        self._grow(start + length)
+        self._buffer[self._used : start] = np.frombuffer(
+            _ONE_HEAD.pack(
+                Opcode.MESSAGE, length + (_HEAD - 9), channel, sequence, log_time, publish_time
+            ),
+            np.uint8,
+        )
+        self._buffer[start : start + length] = np.frombuffer(payload, np.uint8)
+        self._used = start + length
+        self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
+
     def take(self) -> tuple[Batch, NDArray[np.int64], int]:
         """Everything collected, and an empty builder again.
 
@@ -77,6 +118,7 @@ class ChunkBuilder:
             The messages, over the chunk's uncompressed content; their arrival numbers;
             the content's size in bytes (the batch's buffer may be longer).
         """
+        self._settle()
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]
@@ -92,13 +134,32 @@ class ChunkBuilder:
         )
         return whole, np.concatenate([seq for _, seq in pieces]), used
 
+    def _settle(self) -> None:
+        """Make columns of the messages that came one by one."""
+        if not self._rows:
+            return
+        offset, length, channel, log_time, publish_time, sequence, seq = zip(
+            *self._rows, strict=True
+        )
+        self._rows = []
+        batch = Batch(
+            self._buffer.data,
+            np.array(offset, np.int64),
+            np.array(length, np.int64),
+            np.array(channel, np.int32),
+            np.array(log_time, np.int64),
+            np.array(publish_time, np.int64),
+            np.array(sequence, np.uint32),
+        )
+        self._pieces.append((batch, np.array(seq, np.int64)))
+
     def _grow(self, size: int) -> None:
         if size <= len(self._buffer):
             return
         # Memory that is not used is not touched either, so where payloads are large there
         # is room for the whole chunk at once, and nothing is copied twice.
         large = size * 8 > self._capacity
-        larger = np.empty(max(size, self._capacity if large else 2 * size), np.uint8)
+        larger = buffers.take(max(size, self._capacity if large else 2 * size))
         larger[: self._used] = self._buffer[: self._used]
         self._buffer = larger
 

@@ -20,6 +20,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
+from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.errors import SegmentError
@@ -177,7 +178,7 @@ class SegmentReader:
             if place.trailer >= 0:
                 trailer = memoryview(data)[place.length :]
             else:
-                trailer = memoryview(self._trailer(place))
+                trailer = self._trailer(place)
             # The indexes say where messages start; walking the records is the slow way.
             batch = messages_at(content, message_starts(trailer))
             if batch is None:
@@ -191,22 +192,23 @@ class SegmentReader:
             self.number, place.offset, place.length, len(trailer), batch, seq, compressed
         )
 
-    def _read(self, offset: int, length: int) -> bytes:
+    def _read(self, offset: int, length: int) -> memoryview:
         if offset + length > self.size:
             raise SegmentError(
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
                 f"{offset + length} are referred to: the file was cut short."
             )
         try:
-            data = os.pread(self._fd, length, offset)
+            data = buffers.take(length).data[:length]
+            count = os.preadv(self._fd, [data], offset)
         except OSError as error:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
-        if len(data) != length:
-            raise SegmentError(f"{self.path} gives {len(data)} bytes of {length} at {offset}.")
+        if count != length:
+            raise SegmentError(f"{self.path} gives {count} bytes of {length} at {offset}.")
         self.bytes_read += length
         return data
 
-    def _trailer(self, place: ChunkPlace) -> bytes:
+    def _trailer(self, place: ChunkPlace) -> memoryview:
         """Walk the records behind a chunk as far as its arrival numbers."""
         start = at = place.offset + place.length
         while at + 9 <= self.size:

@@ -503,7 +503,10 @@ class RecordingWriter:
         present = np.flatnonzero(np.bincount(batch.channel)).tolist()
         ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
         for index in present:
-            known = self._channel(channels[index], batch, index)
+            channel = channels[index]
+            if channel not in self._known:
+                self._channel(channel, float(batch.length[batch.channel == index].mean()))
+            known = self._known[channel]
             ids[index], cluster[index] = known.channel_id, known.cluster
         own = Batch(
             batch.buffer,
@@ -525,6 +528,39 @@ class RecordingWriter:
         self.totals.messages += len(batch)
         self.totals.payload_bytes += batch.payload_bytes
         self._drain(limit=4)
+
+    def append_one(
+        self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
+    ) -> None:
+        """Take one message; for large payloads this costs less than a batch.
+
+        Raises:
+            DiskFullError: no space; what was flushed before stays.
+        """
+        known = self._channel(channel, len(payload))
+        key = known.cluster
+        builder = self._clusters.get(key)
+        if builder is None:
+            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
+        if len(builder):
+            size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
+            away = abs(log_time - builder.first_log_time)
+            is_far = key != _SHARED and away >= self.settings.chunk_span_ns
+            if is_far or size > self.settings.chunk_size:
+                self._close_chunk(key)
+        builder.append_one(
+            payload,
+            channel=known.channel_id,
+            log_time=log_time,
+            publish_time=publish_time,
+            sequence=sequence,
+            seq=self._next_seq,
+        )
+        self._next_seq += 1
+        self.totals.messages += 1
+        self.totals.payload_bytes += len(payload)
+        if len(builder) >= self.settings.chunk_size:
+            self._close_chunk(key)
 
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Keep an attachment or a metadata record of the source."""
@@ -571,7 +607,8 @@ class RecordingWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._disk.shutdown(wait=True, cancel_futures=True)
 
-    def _channel(self, channel: Channel, batch: Batch, index: int) -> _Known:
+    def _channel(self, channel: Channel, mean: float) -> _Known:
+        """What is known of a channel; at its first message, from its mean payload bytes."""
         known = self._known.get(channel)
         if known is None:
             if len(self._known) >= _MAX_CHANNELS:
@@ -580,7 +617,6 @@ class RecordingWriter:
             if channel.schema is not None:
                 schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
             channel_id = len(self._known) + 1
-            mean = float(batch.length[batch.channel == index].mean())
             cluster = channel_id if mean >= self.settings.large_payload else _SHARED
             known = self._known[channel] = _Known(channel_id, schema_id, cluster)
             self.channels[channel_id] = channel
