@@ -66,7 +66,7 @@ class Absent(Backend):
 
 
 @dataclass(frozen=True)
-class Settings:
+class FewSettings:
     """Of a study that does nothing."""
 
     sizes: Sequence[int] = (5000,)
@@ -75,7 +75,7 @@ class Settings:
     repetitions: int = 2
 
     @classmethod
-    def usual(cls, *, quick: bool) -> Settings:
+    def usual(cls, *, quick: bool) -> FewSettings:
         return cls(messages=5) if quick else cls()
 
     def header(self) -> dict[str, Any]:
@@ -85,7 +85,7 @@ class Settings:
 class Study:
     """Stands in for a module of `benchmarks.studies`; `during` is called in every run."""
 
-    Settings = Settings
+    Settings = FewSettings
 
     def __init__(self) -> None:
         self.ran: list[str] = []
@@ -93,7 +93,7 @@ class Study:
         self.status = "ok"
         self.during: Callable[[Sample], None] = lambda sample: None
 
-    def _plan(self, context: Context, settings: Settings) -> list[Sample]:
+    def _plan(self, context: Context, settings: FewSettings) -> list[Sample]:
         return [
             Sample(
                 "throughput",
@@ -107,10 +107,10 @@ class Study:
             for repetition in range(settings.repetitions)
         ]
 
-    def expected_seconds(self, context: Context, settings: Settings) -> float:
+    def expected_seconds(self, context: Context, settings: FewSettings) -> float:
         return 1.0 * sum(context.to_do(sample) for sample in self._plan(context, settings))
 
-    def run(self, context: Context, settings: Settings) -> None:
+    def run(self, context: Context, settings: FewSettings) -> None:
         self.contexts.append(context)
         for sample in self._plan(context, settings):
             if not context.to_do(sample):
@@ -419,8 +419,13 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_every_option_is_handed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[Any] = []
-    monkeypatch.setattr(campaign, "run", lambda choices, words: asked.append(choices) or 0)
+    asked: list[campaign.Choices] = []
+
+    def take(choices: campaign.Choices, words: Sequence[str]) -> int:
+        asked.append(choices)
+        return 0
+
+    monkeypatch.setattr(campaign, "run", take)
     log = tmp_path / "a.bag"
     given = (
         f"--quick -b mcap -o {tmp_path} --sizes 5kB --rates 4 --messages 3 --topics 2 "
@@ -520,6 +525,16 @@ def test_the_time_left_follows_the_pace() -> None:
         now[0] += 1000.0
         assert steps.left_s > 50.0
     assert steps.left_s >= 0.0
+
+
+def test_a_part_with_fewer_steps_than_expected_is_over_all_the_same() -> None:
+    now = [0.0]
+    steps = Steps(100.0, None, None, clock=lambda: now[0])
+    with steps.step("", 1.0):
+        now[0] += 1.0
+    steps.reach(60.0)
+    # The pace is that of the steps that were done, not of those that were left out.
+    assert steps.left_s == pytest.approx(40.0)
 
 
 def test_a_step_that_fails_does_not_count(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,162 @@
+"""Samples of a journal, as the sections of a report ask for them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from benchmarks.report import numbers
+from benchmarks.report.look import ordered
+from benchmarks.report.model import Cell, Value
+from benchmarks.samples import Sample
+
+MB = 1e6
+GB = 1e9
+
+K = TypeVar("K", bound=Hashable)
+
+
+class Book:
+    """Samples by study.
+
+    Args:
+        samples: All of a journal.
+    """
+
+    def __init__(self, samples: Iterable[Sample]) -> None:
+        self.all = list(samples)
+
+    def good(self, study: str) -> list[Sample]:
+        """Samples of a study that went well."""
+        return [one for one in self.all if one.study == study and one.status == "ok"]
+
+    def bad(self, status: str) -> list[Sample]:
+        """Samples that are `missing` or `failed`, of all studies."""
+        return [one for one in self.all if one.status == status]
+
+
+def grouped(samples: Iterable[Sample], key: Callable[[Sample], K]) -> dict[K, list[Sample]]:
+    """Samples by what `key` says of each, in their order."""
+    found: dict[K, list[Sample]] = defaultdict(list)
+    for sample in samples:
+        found[key(sample)].append(sample)
+    return dict(found)
+
+
+def by_case(samples: Iterable[Sample], *names: str) -> dict[tuple[Any, ...], list[Sample]]:
+    """Samples by parts of their case, the least first; those that lack one are left out."""
+    whole = [one for one in samples if all(name in one.case for name in names)]
+    found = grouped(whole, lambda one: tuple(one.case[name] for name in names))
+    return dict(sorted(found.items(), key=lambda item: tuple(map(_sortable, item[0]))))
+
+
+def _sortable(part: object) -> tuple[bool, float, str]:
+    if isinstance(part, int | float):
+        return False, float(part), ""
+    return True, 0.0, str(part)
+
+
+def by_backend(samples: Iterable[Sample]) -> dict[str, list[Sample]]:
+    """Samples by backend, in the order of every table."""
+    found = grouped(samples, lambda one: one.backend)
+    return {name: found[name] for name in ordered(found)}
+
+
+def backends(samples: Iterable[Sample]) -> list[str]:
+    """Names of the backends in samples, in the order of every table."""
+    return ordered(sample.backend for sample in samples)
+
+
+def value(samples: Iterable[Sample], measure: Callable[[Sample], float | None]) -> Value | None:
+    """One measure of several repetitions; None when no sample has it."""
+    found = (measure(sample) for sample in samples)
+    return Value.of(number for number in found if number is not None)
+
+
+def middle(samples: Iterable[Sample], measure: Callable[[Sample], float | None]) -> float | None:
+    """The median of one measure; None when no sample has it."""
+    found = value(samples, measure)
+    return None if found is None else found.median
+
+
+def named(name: str, scale: float = 1.0) -> Callable[[Sample], float | None]:
+    """The measure that a sample has by this name, over `scale`."""
+
+    def measure(sample: Sample) -> float | None:
+        found = number(sample.values, name)
+        return None if found is None else found / scale
+
+    return measure
+
+
+def number(values: Mapping[str, Any], name: str) -> float | None:
+    """A number among values; None when there is none by that name."""
+    found = values.get(name)
+    if isinstance(found, bool) or not isinstance(found, int | float):
+        return None
+    return float(found)
+
+
+def ratio(sample: Sample, over: str, under: str) -> float | None:
+    """One value over another; None when either is missing or the second is 0."""
+    upper, lower = number(sample.values, over), number(sample.values, under)
+    return None if upper is None or not lower else upper / lower
+
+
+def throughput(sample: Sample) -> float | None:
+    """MB/s: bytes found in the backend over the time of the whole run."""
+    found = ratio(sample, "persisted_bytes", "wall_s")
+    return None if found is None else found / MB
+
+
+def offered(sample: Sample) -> float | None:
+    """MB/s that were published."""
+    found = ratio(sample, "published_bytes", "publish_s")
+    return None if found is None else found / MB
+
+
+def offered_messages(sample: Sample) -> float | None:
+    """Messages a second that were published."""
+    return ratio(sample, "published", "publish_s")
+
+
+def persisted(sample: Sample) -> float | None:
+    """Percent of the published messages that were found in the backend."""
+    found = ratio(sample, "persisted", "published")
+    return None if found is None else 100 * found
+
+
+def percents(samples: Iterable[Sample]) -> Cell:
+    """The persisted share of some repetitions, as text that never rounds up to 100."""
+    found = value(samples, persisted)
+    return None if found is None else numbers.percents(found)
+
+
+def is_whole(samples: Sequence[Sample]) -> bool:
+    """Whether nothing was dropped in any of some repetitions."""
+    return bool(samples) and all((persisted(one) or 0) >= 100 for one in samples)
+
+
+def cpu_per_gb(name: str) -> Callable[[Sample], float | None]:
+    """CPU seconds by one name over the GB that were kept."""
+
+    def measure(sample: Sample) -> float | None:
+        found = ratio(sample, name, "persisted_bytes")
+        return None if found is None else found * GB
+
+    return measure
+
+
+def repetitions(samples: Sequence[Sample]) -> str:
+    """How many repetitions stand behind figures: `5 repetitions`, `2 to 5 repetitions`."""
+    counts = sorted(
+        len(group)
+        for group in grouped(samples, lambda one: (one.backend, str(dict(one.case)))).values()
+    )
+    if not counts:
+        return "no repetitions"
+    low, high = counts[0], counts[-1]
+    if low == high:
+        return f"{low} repetition{'s' if low != 1 else ''}"
+    return f"{low} to {high} repetitions"

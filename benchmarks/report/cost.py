@@ -1,0 +1,214 @@
+"""What keeping a stream costs: CPU time, memory, disk; and whether all was on time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.report.book import (
+    MB,
+    Book,
+    by_backend,
+    by_case,
+    cpu_per_gb,
+    named,
+    number,
+    ratio,
+    repetitions,
+    value,
+)
+from benchmarks.report.look import OURS, databases, title
+from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
+from benchmarks.report.numbers import number as shown
+from benchmarks.report.numbers import size, times
+from benchmarks.samples import Sample
+
+_STUDY = "throughput"
+
+
+def section(book: Book) -> Section | None:
+    """CPU seconds a GB, peak memory, bytes on the disk; None without samples."""
+    samples = book.good(_STUDY)
+    if not samples:
+        return None
+    text = (
+        "CPU time of the logger's process and of the servers it started, over the payload that "
+        "was kept; the publisher's is not in it. All rates together: where everything is kept, "
+        "the rate hardly matters.",
+        "Memory is the kernel's high-water mark of resident memory: of the logger without the "
+        "payload file that it maps, of servers with what their processes share counted once.",
+    )
+    return Section(
+        "cost",
+        "What it costs: processor, memory, disk",
+        text,
+        (_graph(samples),),
+        (_cpu(samples), _memory(samples), _disk(samples)),
+    )
+
+
+def findings(book: Book) -> list[str]:
+    """CPU time of ours against the thriftiest database, at the least and the greatest size."""
+    samples = book.good(_STUDY)
+    found = []
+    cases = by_case(samples, "size")
+    ends = list(cases)[:1] + list(cases)[-1:] if len(cases) > 1 else list(cases)
+    for case in ends:
+        medians = {
+            name: one.median
+            for name, group in by_backend(cases[case]).items()
+            if (one := value(group, _cpu_both)) is not None
+        }
+        others = [name for name in databases(medians) if medians[name]]
+        if not medians.get(OURS) or not others:
+            continue
+        best = min(others, key=lambda name: medians[name])
+        found.append(
+            f"At {size(case[0])} a message, a GB costs hybridlog {shown(medians[OURS])} s of CPU "
+            f"time; the thriftiest database, {title(best)}, takes {shown(medians[best])} s "
+            f"({times(medians[best] / medians[OURS])} as much)."
+        )
+    return found
+
+
+def timing(book: Book) -> Section | None:
+    """How late the publisher was, and how deep the queues were."""
+    samples = [one for one in book.all if one.status == "ok" and "late_ms_p99" in one.values]
+    if not samples:
+        return None
+    tables = tuple(
+        Table(
+            f"{study}: queues and publisher",
+            (
+                "backend",
+                "queue depth p50",
+                "p90",
+                "p99",
+                "most",
+                "publisher late p50, ms",
+                "p99, ms",
+                "most, ms",
+            ),
+            tuple(
+                (
+                    title(name),
+                    *(_median_of(group, f"depth_{part}") for part in ("p50", "p90", "p99")),
+                    _most(group, "depth_max"),
+                    *(_median_of(group, f"late_ms_{part}") for part in ("p50", "p99")),
+                    _most(group, "late_ms_max"),
+                )
+                for name, group in by_backend(of_study).items()
+            ),
+            f"Medians over all runs of the study ({len(of_study)}); “most” is of any run.",
+            title(OURS),
+        )
+        for study in ("throughput", "persistence", "ceiling", "speed-up")
+        if (of_study := [one for one in samples if one.study == study])
+    )
+    text = (
+        "A queue holds ten messages; the depth is what a message finds ahead of it in its "
+        "topic's queue. A publisher that is late while a backend is busy is short of processor "
+        "time: logger and publisher share the machine, as they do on a robot.",
+    )
+    return Section("timing", "On time: queues and publisher", text, (), tables)
+
+
+def _cpu_both(sample: Sample) -> float | None:
+    own = cpu_per_gb("cpu_s")(sample)
+    servers = cpu_per_gb("server_cpu_s")(sample)
+    return None if own is None else own + (servers or 0.0)
+
+
+def _graph(samples: Sequence[Sample]) -> Graph:
+    lines = []
+    for name, group in by_backend(samples).items():
+        points = ((float(n), value(one, _cpu_both)) for (n,), one in by_case(group, "size").items())
+        lines.append(Line(name, tuple((x, y) for x, y in points if y is not None)))
+    return Graph(
+        "cpu",
+        "CPU seconds for a GB of payload",
+        "Logger and servers together; less is better. Median over all rates; the bars reach from "
+        f"the least to the greatest. {repetitions(samples)} a stream.",
+        "lines",
+        (Panel("", tuple(lines)),),
+        "message size",
+        "CPU s / GB",
+        log_x=True,
+        log_y=True,
+        ticks=tuple((float(n), size(n)) for (n,) in by_case(samples, "size")),
+    )
+
+
+def _cpu(samples: Sequence[Sample]) -> Table:
+    cases = list(by_case(samples, "size"))
+    ends = [cases[0], cases[-1]] if len(cases) > 1 else cases
+    columns = ["backend"]
+    for (n,) in ends:
+        columns += [f"{size(n)}: logger", f"{size(n)}: servers"]
+    rows: list[tuple[Cell, ...]] = []
+    for name, group in by_backend(samples).items():
+        row: list[Cell] = [title(name)]
+        for case in ends:
+            of_size = by_case(group, "size").get(case, [])
+            row += [value(of_size, cpu_per_gb(part)) for part in ("cpu_s", "server_cpu_s")]
+        rows.append(tuple(row))
+    return Table(
+        "CPU seconds for a GB of payload",
+        tuple(columns),
+        tuple(rows),
+        "Median (least…greatest) over all rates and repetitions.",
+        title(OURS),
+    )
+
+
+def _memory(samples: Sequence[Sample]) -> Table:
+    rows = tuple(
+        (
+            title(name),
+            value(group, named("peak_rss", MB)),
+            value(group, named("server_peak_rss", MB)),
+        )
+        for name, group in by_backend(samples).items()
+    )
+    return Table(
+        "Peak memory, MB",
+        ("backend", "logger", "servers"),
+        rows,
+        "Median (least…greatest) over all streams and repetitions.",
+        title(OURS),
+    )
+
+
+def _disk(samples: Sequence[Sample]) -> Table:
+    cases = by_case(samples, "size")
+    rows = tuple(
+        (
+            title(name),
+            *(
+                value(
+                    [one for one in group if one.backend == name],
+                    lambda one: ratio(one, "disk_bytes", "persisted_bytes"),
+                )
+                for group in cases.values()
+            ),
+        )
+        for name in by_backend(samples)
+    )
+    return Table(
+        "Bytes on the disk over bytes of payload",
+        ("backend", *(size(n) for (n,) in cases)),
+        rows,
+        "Everything below the backend's directory after it was closed: journals, logs and space "
+        "set aside included, which weighs most in short streams.",
+        title(OURS),
+    )
+
+
+def _median_of(samples: Sequence[Sample], name: str) -> Cell:
+    found = value(samples, named(name))
+    return None if found is None else shown(found.median)
+
+
+def _most(samples: Sequence[Sample], name: str) -> Cell:
+    known = [one for sample in samples if (one := number(sample.values, name)) is not None]
+    found = Value.of(known)
+    return None if found is None else shown(found.high)
