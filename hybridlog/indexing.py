@@ -178,8 +178,9 @@ class Lag:
         if path.exists():
             # It may be sealed, and renamed, at this moment.
             with suppress(SegmentError):
-                return SegmentReader(path, segment)
-        return SegmentReader(path.with_name(f"{segment:06d}{SEALED_SUFFIX}"), segment)
+                return SegmentReader(path, segment, direct=True)
+        sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
+        return SegmentReader(sealed, segment, direct=True)
 
 
 class _Forgotten(NamedTuple):

@@ -17,6 +17,7 @@ import heapq
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, cast
@@ -36,7 +37,14 @@ from hybridlog.query.plan import (
     Task,
     count_given,
 )
-from hybridlog.query.times import TIME_LIMIT, TimeLike, format_time, parse_range, parse_time
+from hybridlog.query.times import (
+    TIME_LIMIT,
+    DurationLike,
+    TimeLike,
+    format_time,
+    parse_range,
+    parse_time,
+)
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.index_documents import key_bound
@@ -46,8 +54,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.query.intervals import Intervals
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.messages import Batch
 
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
@@ -223,6 +232,7 @@ class Query:
     _every: int = 1
     _reverse: bool = False
     _fields: tuple[str, ...] | None = None
+    _windows: Intervals | None = None
     counters: Counters = field(default_factory=Counters, compare=False)
     """What the last answer has cost."""
 
@@ -316,6 +326,46 @@ class Query:
         """The same question about one of its topics."""
         return self._in([topic], self.recording_ids)
 
+    def during(self, intervals: Intervals) -> Query:
+        """Only messages whose log time is in one of some intervals of their recording.
+
+        A message in several of them is given once. Given twice, both must hold.
+
+        Args:
+            intervals: From `intervals`, `changes` or `windows` of any query of this store.
+        """
+        if self._windows is not None:
+            intervals = self._windows.common(intervals)
+        return self._with(_windows=intervals.merged())
+
+    def before(self, events: Query, length: DurationLike) -> Query:
+        """Only messages that came at most so long before an event, in its recording.
+
+        The event's own log time is not part of it: `t - length <= time < t`.
+
+        Args:
+            events: Its messages are the events.
+            length: A duration: `"5min"`, seconds, a `timedelta`.
+
+        Raises:
+            TimeError: `length` is no duration.
+        """
+        return self.during(events.windows(before=length))
+
+    def around(self, events: Query, before: DurationLike = 0, after: DurationLike = 0) -> Query:
+        """Only messages near an event, in its recording: `t - before <= time < t + after`.
+
+        Args:
+            events: Its messages are the events.
+            before: How long before an event it begins, a duration.
+            after: How long after an event it ends, a duration.
+
+        Raises:
+            TimeError: One of both is no duration.
+            UsageError: Both are zero.
+        """
+        return self.during(events.windows(before, after))
+
     def just_at(self, moment: TimeLike) -> Query:
         """Only the message that was current at a time: the last one not after it.
 
@@ -327,9 +377,10 @@ class Query:
 
     def _current(self, moment: TimeLike) -> tuple[Query, Message]:
         """The message that was current at a time, and the question that has it as its answer."""
-        if self._bounds is not None or self._clock != "log":
+        if not self.is_unbounded or self._clock != "log":
             raise UsageError(
-                "A message at a time is the last one by log time; `between` and `clock` do not fit."
+                "A message at a time is the last one by log time; `between`, `during` and "
+                "`clock` do not fit."
             )
         moments: list[tuple[int, int, RecordingEntry]] = []
         for recording in self._recordings():
@@ -417,6 +468,95 @@ class Query:
             documents = bson.decode_all(raw)
             yield from (documents[row] for row in rows.tolist())
 
+    def intervals(
+        self,
+        at_least: DurationLike | None = None,
+        length: DurationLike | None = None,
+        max_gap: DurationLike | None = None,
+    ) -> Intervals:
+        """When the predicate of `where` holds: the longest intervals in which it does.
+
+        At any time the state is what the last message of the topic by then says (by log
+        time, then arrival); before the first one it is unknown, and no interval. It goes
+        on until the next message, or the end of the recording. The range of `between`
+        cuts intervals off, and what held when it began is known from before. Without
+        `where`, any message holds: with `max_gap`, that is when the topic was alive.
+
+        Args:
+            at_least: Only intervals of at least this length.
+            length: Each interval cut into as many of exactly this length as fit into it,
+                one after the other from its beginning.
+            max_gap: A message is believed for this long; without, until the next one.
+
+        Returns:
+            Their `messages` are those that satisfy the predicate.
+
+        Raises:
+            UsageError: several topics, `limit`, `every`, `reverse`, or another clock than
+                the log's.
+            TimeError: no duration, or a range outside of all recordings.
+            DatabaseError: MongoDB is away.
+        """
+        from hybridlog.moments import states
+
+        with self._costing():
+            found = states(self, max_gap)
+        if at_least is not None:
+            found = found.at_least(at_least)
+        return found if length is None else found.cut(length)
+
+    def changes(
+        self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
+    ) -> Intervals:
+        """When fields changed: runs of messages that differ from the one before them.
+
+        A step is a message of which any of the fields differs from that of the message
+        before it, of those that satisfy `where`, in the same recording. Steps with no more
+        than `pause` between them are one change, whatever lies between. A change begins
+        at the log time of its first step, and ends 1 ns after that of its last one.
+
+        Args:
+            fields: Paths (`position`, `position.x`). Long arrays are compared by their
+                summaries, the only thing of them that the index holds.
+            pause: Longest time between steps of one change.
+            tolerance: Numbers that differ by at most so much are the same.
+
+        Returns:
+            Their `messages` are the steps.
+
+        Raises:
+            TopicError: there is no such field.
+            UsageError: no field, several topics, `limit`, `every`, `reverse`, or another
+                clock than the log's.
+            TimeError: no duration, or a range outside of all recordings.
+            DatabaseError: MongoDB is away.
+        """
+        from hybridlog.moments import changes
+
+        if not fields:
+            raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
+        self.fields(*fields)  # refuses what there is not
+        with self._costing():
+            return changes(self, fields, pause, tolerance)
+
+    def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
+        """Time around each message: `t - before <= time < t + after`, within its recording.
+
+        There is one a message, so they may overlap; `during` and `merged` join them.
+
+        Args:
+            before: How long before it the window begins, a duration.
+            after: How long after it the window ends, a duration.
+
+        Raises:
+            TimeError: one of both is no duration.
+            UsageError: both are zero, or `limit` or `every` of several topics.
+            DatabaseError: MongoDB is away.
+        """
+        from hybridlog.moments import windows
+
+        return windows(self, before, after)
+
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
         from hybridlog.tables import arranged, collect
@@ -469,21 +609,54 @@ class Query:
 
     @property
     def is_unbounded(self) -> bool:
-        """Whether all times are wanted."""
-        return self._bounds is None
+        """Whether all times are wanted: neither `between` nor `during`."""
+        return self._bounds is None and self._windows is None
 
     @property
     def is_reversed(self) -> bool:
         """Whether the latest message comes first."""
         return self._reverse
 
+    @property
+    def filter(self) -> dict[str, object]:
+        """What was given to `where`, as one MongoDB filter; empty for everything."""
+        return self._filter({})
+
+    def spans(self) -> list[tuple[RecordingEntry, tuple[int, int]]]:
+        """Which log time `[begin, end)`, ns, of each recording is asked about.
+
+        Raises:
+            TimeError: The range is empty, or outside of all recordings.
+            UsageError: The range is by another clock.
+        """
+        if self._bounds is not None and self._clock != "log":
+            raise UsageError(f"Intervals are of log time; a range by {self._clock} does not fit.")
+        found: list[tuple[RecordingEntry, tuple[int, int]]] = []
+        outside: list[tuple[RecordingEntry, tuple[int, int]]] = []
+        for recording in self._recordings():
+            bounds = self._bounds_in(recording)
+            if recording.span is None:
+                continue
+            if bounds is not None and self._is_outside(bounds, recording):
+                outside.append((recording, bounds))
+                continue
+            start, end = _span(recording)
+            if bounds is not None:
+                start, end = max(start, bounds[0]), min(end, bounds[1])
+            found.extend((recording, span) for span in self._windows_in(recording, (start, end)))
+        if outside and not found and self._windows is None:
+            self._refuse(outside)
+        return found
+
     def beginnings(self) -> Iterator[tuple[RecordingEntry, int]]:
         """Recordings in which the time range begins after the recording does, and when, ns."""
         for recording in self._recordings():
             bounds = self._bounds_in(recording) if self._clock == "log" else None
             start, end = _span(recording)
-            if bounds is not None and start < bounds[0] < min(end, bounds[1]):
-                yield recording, bounds[0]
+            begin, stop = bounds or (start, end)
+            windows = self._windows_in(recording, (max(begin, start), min(end, stop)))
+            if windows and start < windows[0][0]:
+                yield recording, windows[0][0]
 
     def size_hint(self) -> int:
         """Bytes of payload, about: what a progress bar counts up to."""
@@ -491,7 +664,8 @@ class Query:
         for recording in self._recordings():
             start, end = _span(recording)
             begin, stop = self._bounds_in(recording) or (start, end)
-            share = max(min(end, stop) - max(start, begin), 0) / max(end - start, 1)
+            windows = self._windows_in(recording, (max(start, begin), min(end, stop)))
+            share = sum(high - low for low, high in windows) / max(end - start, 1)
             total += share * sum(
                 c.stats.payload_bytes for c in recording.channels if c.topic in self.topics
             )
@@ -544,7 +718,22 @@ class Query:
             TIME_LIMIT - 1 if stop is None else parse_time(stop, start=start, end=end),
         )
 
-    def _targets(self, lanes: list[Lane]) -> list[Target]:
+    def _windows_in(
+        self, recording: RecordingEntry, span: tuple[int, int]
+    ) -> list[tuple[int, int]]:
+        """What of a span of log time is asked about: all of it, or parts, apart and in order."""
+        begin, end = span
+        if begin >= end:
+            return []
+        if self._windows is None:
+            return [span]
+        rows = self._windows.of_recording(recording.id).tolist()
+        return [
+            (max(begin, low), min(end, high)) for low, high in rows if low < end and high > begin
+        ]
+
+    def _targets(self, lanes: list[Lane], *, with_chunks: bool = True) -> list[Target]:
+        """What is wanted of each recording; without chunks when the index alone answers."""
         targets = []
         wanted = set(self.topics)
         outside: list[tuple[RecordingEntry, tuple[int, int]]] = []
@@ -561,11 +750,33 @@ class Query:
             if bounds is not None and self._is_outside(bounds, recording):
                 outside.append((recording, bounds))
                 continue
-            chunks = self.store.chunks(recording, list(mine), bounds, self._clock)
-            targets.append(Target(recording, mine, bounds, chunks))
-        if outside and not targets:
+            windows = None
+            if self._windows is not None:
+                windows = self._windows.of_recording(recording.id)
+                if not len(windows):
+                    continue
+            chunks = self._chunks(recording, list(mine), bounds, windows) if with_chunks else []
+            targets.append(Target(recording, mine, bounds, chunks, windows))
+        if outside and not targets and self._windows is None:
             self._refuse(outside)
         return targets
+
+    def _chunks(
+        self,
+        recording: RecordingEntry,
+        channels: list[int],
+        bounds: tuple[int, int] | None,
+        windows: NDArray[np.int64] | None,
+    ) -> list[ChunkEntry]:
+        """Chunks that may hold what is wanted; those between windows are among them."""
+        clock = self._clock
+        if windows is not None and (bounds is None or clock == "log"):
+            low, high = bounds or (0, TIME_LIMIT - 1)
+            bounds = max(low, int(windows[0, 0])), min(high, int(windows[-1, 1]))
+            clock = "log"
+            if bounds[0] >= bounds[1]:
+                return []
+        return self.store.chunks(recording, channels, bounds, clock)
 
     def _is_outside(self, bounds: tuple[int, int], recording: RecordingEntry) -> bool:
         """Whether a range is empty, or by the log clock beside a recording."""
@@ -615,6 +826,16 @@ class Query:
         fresh = Counters()
         for name in fresh.__dataclass_fields__:
             setattr(self.counters, name, getattr(fresh, name))
+
+    @contextmanager
+    def _costing(self) -> Iterator[None]:
+        """Counts from zero, and takes the time, while an answer is made."""
+        self._reset()
+        started = time.monotonic()
+        try:
+            yield
+        finally:
+            self.counters.elapsed_s = time.monotonic() - started
 
     def empty_plan(self) -> Plan:
         """The channels of the question, and nothing to read."""
@@ -678,25 +899,54 @@ class Query:
                             found.setdefault(key, []).append(reference.off[rows])
         return {key: np.sort(np.concatenate(parts)) for key, parts in found.items()}
 
-    def _conditions(self, recording: RecordingEntry) -> dict[str, object]:
-        """The query's time range in one recording as a MongoDB filter."""
+    def _conditions(
+        self, recording: RecordingEntry, window: tuple[int, int] | None = None
+    ) -> dict[str, object]:
+        """The query's time range in one recording, or in a part of it, as a MongoDB filter."""
         bounds = self._bounds_in(recording)
         conditions: dict[str, object] = {"_meta.rec": recording.id}
-        if bounds is None:
-            return conditions
-        begin, end = bounds
-        if self._clock == "log":
-            conditions["_id"] = {"$gte": key_bound(begin), "$lt": key_bound(end)}
-        else:
+        if bounds is not None and self._clock != "log":
             name = STAMP if self._clock == "header" else "_meta.pub"
-            conditions[name] = {"$gte": begin, "$lt": end}
+            conditions[name] = {"$gte": bounds[0], "$lt": bounds[1]}
+            bounds = None
+        span = window or bounds
+        if span is not None:
+            conditions["_id"] = {"$gte": key_bound(span[0]), "$lt": key_bound(span[1])}
         return conditions
+
+    def _parts(self, targets: Sequence[Target]) -> list[dict[str, object]]:
+        """MongoDB filters that together find what is wanted, each in order after the other.
+
+        A collection is read in one sweep when all times are wanted, and else a window at a
+        time: windows of several recordings that overlap in time go together.
+        """
+        if self._windows is None:
+            conditions = [self._conditions(target.recording) for target in targets]
+            return [_any_of(conditions)] if conditions else []
+        found: list[tuple[int, int, RecordingEntry]] = []
+        for target in targets:
+            bounds = target.bounds if self._clock == "log" else None
+            windows = self._windows_in(target.recording, bounds or (0, TIME_LIMIT - 1))
+            found.extend((*window, target.recording) for window in windows)
+        groups: list[list[dict[str, object]]] = []
+        reach = -1
+        for begin, end, recording in sorted(found, key=lambda item: item[:2]):
+            if begin >= reach:
+                groups.append([])
+            groups[-1].append(self._conditions(recording, (begin, end)))
+            reach = max(reach, end)
+        parts = [_any_of(group) for group in groups]
+        return parts[::-1] if self._reverse else parts
 
     def _count(self) -> int:
         lanes: list[Lane] = []
         self._reset()
-        targets = self._targets(lanes)
-        if self._bounds is None and not self._filters:
+        has_index = self.store.database is not None
+        if self._filters and not has_index:
+            self.store.database_for("A predicate")
+        is_known = self.is_unbounded and not self._filters
+        targets = self._targets(lanes, with_chunks=not has_index and not is_known)
+        if is_known:
             return sum(
                 channel.stats.messages
                 for target in targets
@@ -704,15 +954,12 @@ class Query:
                 if channel.id in target.lanes
             )
         if self.store.database is None:
-            if self._filters:
-                self.store.database_for("A predicate")
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
         return sum(
-            self.store.database.count(
-                collection_of(topic), self._filter(self._conditions(target.recording))
-            )
+            self.store.database.count(collection_of(topic), self._filter(part))
             for target in targets
+            for part in self._parts([target])
             for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()})
         )
 
@@ -730,36 +977,40 @@ class Query:
         database = self.store.database_for("Reading index documents")
         lanes: list[Lane] = []
         self._reset()
-        targets = [t for t in self._targets(lanes) if self._has(t, lanes, topic)]
-        conditions = [self._conditions(t.recording) for t in targets]
-        if not conditions:
-            return
-        own = conditions[0] if len(conditions) == 1 else {"$or": conditions}
+        found = self._targets(lanes, with_chunks=False)
+        targets = [t for t in found if self._has(t, lanes, topic)]
         started = time.monotonic()
         taken = given = 0
-        for raw in database.find_raw(
-            collection_of(topic),
-            self._filter(own),
-            projection,
-            sort=[("_id", -1)] if self._reverse else None,
-            limit=(self._limit or 0) if self._every == 1 else 0,
-            batch_size=10_000,
-        ):
-            count = len(split(raw))
-            rows = np.arange((-taken) % self._every, count, self._every)
-            if self._limit is not None:
-                rows = rows[: self._limit - given]
-            given += len(rows)
-            self.counters.documents_read += count
-            self.counters.elapsed_s = time.monotonic() - started
-            yield raw, rows, taken
-            taken += count
-            if self._limit is not None and given >= self._limit:
-                return
+        for part in self._parts(targets):
+            most = 0 if self._limit is None else self._limit - given
+            for raw in database.find_raw(
+                collection_of(topic),
+                self._filter(part),
+                projection,
+                # With an index of the user's, documents come in its order unless told.
+                sort=[("_id", -1 if self._reverse else 1)],
+                limit=most if self._every == 1 else 0,
+                batch_size=10_000,
+            ):
+                count = len(split(raw))
+                rows = np.arange((-taken) % self._every, count, self._every)
+                if self._limit is not None:
+                    rows = rows[: self._limit - given]
+                given += len(rows)
+                self.counters.documents_read += count
+                self.counters.elapsed_s = time.monotonic() - started
+                yield raw, rows, taken
+                taken += count
+                if self._limit is not None and given >= self._limit:
+                    return
 
     @staticmethod
     def _has(target: Target, lanes: list[Lane], topic: str) -> bool:
         return any(lanes[i].channel.topic == topic for i in target.lanes.values())
+
+
+def _any_of(filters: list[dict[str, object]]) -> dict[str, object]:
+    return filters[0] if len(filters) == 1 else {"$or": filters}
 
 
 def _span(recording: RecordingEntry) -> tuple[int, int]:

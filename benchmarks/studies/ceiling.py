@@ -59,7 +59,9 @@ class Settings:
     @classmethod
     def usual(cls, *, quick: bool) -> Settings:
         """Those of a full or of a quick run."""
-        return cls(sizes=QUICK_SIZES, seconds=1.5, messages=30) if quick else cls()
+        if not quick:
+            return cls()
+        return cls(sizes=QUICK_SIZES, seconds=1.0, messages=20, halvings=0)
 
     def header(self) -> dict[str, Any]:
         """What a journal says of these settings."""

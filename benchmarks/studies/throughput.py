@@ -51,7 +51,7 @@ class Settings:
         """Those of a full or of a quick run: the extremes of each axis, once."""
         if not quick:
             return cls()
-        return cls(sizes=QUICK_SIZES, rates=QUICK_RATES, messages=60, repetitions=1)
+        return cls(sizes=QUICK_SIZES, rates=QUICK_RATES, messages=20, repetitions=1)
 
     def header(self) -> dict[str, Any]:
         """What a journal says of these settings."""

@@ -126,6 +126,29 @@ BetweenOption = Annotated[
         metavar="T0 T1",
     ),
 ]
+WhereOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Only messages that satisfy this, such as 'ranges.min < 0.5 and "
+        "scan_time > 0'. Repeatable.",
+        metavar="PREDICATE",
+    ),
+]
+CountOption = Annotated[bool, typer.Option("--count", help="Only print how many.")]
+OneTopicOption = Annotated[
+    str,
+    typer.Option(
+        "--topic",
+        "-t",
+        help="Full name, or an unambiguous short one (scan).",
+        metavar="TOPIC",
+        autocompletion=complete_topic,
+    ),
+]
+AtLeastOption = Annotated[
+    str | None,
+    typer.Option(help="Only those of at least this length, such as 60s.", metavar="DURATION"),
+]
 ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing files.")]
 
 
@@ -287,14 +310,7 @@ def fetch(
         str | None,
         typer.Option(help="Only the message that was current at this time.", metavar="T"),
     ] = None,
-    where: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Only messages that satisfy this, such as 'ranges.min < 0.5 and "
-            "scan_time > 0'. Repeatable.",
-            metavar="PREDICATE",
-        ),
-    ] = None,
+    where: WhereOption = None,
     recording: RecordingOption = None,
     limit: Annotated[
         int | None,
@@ -306,7 +322,23 @@ def fetch(
         str | None,
         typer.Option(help="Only these fields, with commas between them.", metavar="A,B.C"),
     ] = None,
-    count: Annotated[bool, typer.Option("--count", help="Only print how many.")] = False,
+    event: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            help="Only messages near those of TOPIC that satisfy PREDICATE, such as: rosout "
+            "'level >= 8'. Needs --before or --after.",
+            metavar="TOPIC PREDICATE",
+        ),
+    ] = None,
+    before: Annotated[
+        str | None,
+        typer.Option(help="From so long before each event, such as 5min.", metavar="DURATION"),
+    ] = None,
+    after: Annotated[
+        str | None,
+        typer.Option(help="Until so long after each event.", metavar="DURATION"),
+    ] = None,
+    count: CountOption = False,
     form: Annotated[
         FetchFormat | None,
         typer.Option(
@@ -349,6 +381,9 @@ def fetch(
             every,
             reverse,
             fields,
+            event,
+            before,
+            after,
             count,
             form.value if form else None,
             output,
@@ -356,6 +391,89 @@ def fetch(
             mongo,
             quiet,
         )
+    )
+
+
+@app.command()
+def intervals(
+    topic: OneTopicOption,
+    store: StoreOption = None,
+    between: BetweenOption = None,
+    where: WhereOption = None,
+    recording: RecordingOption = None,
+    at_least: AtLeastOption = None,
+    length: Annotated[
+        str | None,
+        typer.Option(
+            help="Cut each into as many of exactly this length as fit, one after the other.",
+            metavar="DURATION",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        str | None,
+        typer.Option(
+            help="Believe a message for so long; without, until the next one.",
+            metavar="DURATION",
+        ),
+    ] = None,
+    count: CountOption = False,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Show when the messages of a topic satisfied a predicate.
+
+    The state is what the last message said, until the next one or the end of the recording.
+    """
+    from hybridlog.cli import intervals as command
+
+    asked = command.Asked(store, topic, between, where, recording, at_least, mongo)
+    command.show_states(
+        asked, length=length, max_gap=max_gap, count=count, as_json=as_json, quiet=quiet
+    )
+
+
+@app.command()
+def changes(
+    topic: OneTopicOption,
+    fields: Annotated[
+        str,
+        typer.Option(help="Which fields, with commas between them.", metavar="A,B.C"),
+    ],
+    store: StoreOption = None,
+    between: BetweenOption = None,
+    where: WhereOption = None,
+    recording: RecordingOption = None,
+    pause: Annotated[
+        str,
+        typer.Option(help="Longest time between steps of one change.", metavar="DURATION"),
+    ] = "1s",
+    tolerance: Annotated[
+        float,
+        typer.Option(help="Numbers that differ by at most so much are the same.", metavar="X"),
+    ] = 0.0,
+    at_least: AtLeastOption = None,
+    count: CountOption = False,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Show when fields of a topic changed.
+
+    A step is a message that differs from the one before it; steps that follow each other
+    within --pause are one change.
+    """
+    from hybridlog.cli import intervals as command
+
+    asked = command.Asked(store, topic, between, where, recording, at_least, mongo)
+    command.show_changes(
+        asked,
+        fields,
+        pause=pause,
+        tolerance=tolerance,
+        count=count,
+        as_json=as_json,
+        quiet=quiet,
     )
 
 
@@ -466,3 +584,26 @@ def demo(
     from hybridlog.demo import tour
 
     raise typer.Exit(tour.run(directory, duration_s=duration, seed=seed))
+
+
+@app.command(
+    # What follows belongs to the benchmarks, their own --help included.
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
+def bench(
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Of the benchmarks: all --quick, report, --list-backends, throughput --help.",
+            metavar="ARGUMENT",
+        ),
+    ] = None,
+) -> None:
+    """Measure it beside databases and files.
+
+    Needs the source tree. The arguments are those of `python -m benchmarks`; without any, it
+    lists what there is.
+    """
+    from hybridlog.cli import bench as command
+
+    command.run(arguments or [])

@@ -57,6 +57,9 @@ class Choices:
     every: int
     reverse: bool
     fields: str | None
+    event: tuple[str, str] | None
+    before: str | None
+    after: str | None
     count: bool
     form: str | None
     output: Path | None
@@ -82,7 +85,7 @@ def run(choices: Choices) -> None:
             _write_file(query, form, path, choices)
         sys.stdout.flush()
         if not choices.quiet:
-            _closing_line(query.counters, time.monotonic() - started, count=choices.count)
+            closing_line(query.counters, time.monotonic() - started, count=choices.count)
             _tell_gaps(store, query, choices)
 
 
@@ -164,10 +167,14 @@ def _query(store: Store, choices: Choices) -> Query:
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)
+    if choices.event is not None:
+        topic, predicate = choices.event
+        events = question(store, [topic], choices.recording).where(predicate)
+        query = query.around(events, choices.before or 0, choices.after or 0)
     for predicate in choices.where or ():
         query = query.where(predicate)
     if choices.fields is not None:
-        query = query.fields(*_names(choices.fields))
+        query = query.fields(*names_of(choices.fields))
     if choices.at is not None:
         return query.just_at(choices.at)
     if choices.every > 1:
@@ -179,7 +186,12 @@ def _query(store: Store, choices: Choices) -> Query:
     return query
 
 
-def _names(text: str) -> list[str]:
+def names_of(text: str) -> list[str]:
+    """The fields of --fields, each once.
+
+    Raises:
+        UsageError: One of them is empty.
+    """
     names = [name.strip() for name in text.split(",")]
     if not all(names):
         raise UsageError(f"--fields wants names with commas between them, not {text!r}.")
@@ -187,6 +199,7 @@ def _names(text: str) -> list[str]:
 
 
 def _form(choices: Choices) -> str:
+    _check_event(choices)
     if choices.at is not None:
         for given, option in (
             (choices.between is not None, "--between"),
@@ -194,6 +207,7 @@ def _form(choices: Choices) -> str:
             (choices.every > 1, "--every"),
             (choices.reverse, "--reverse"),
             (choices.clock != "log", "--clock"),
+            (choices.event is not None, "--event"),
         ):
             if given:
                 raise UsageError(f"--at asks for one message, by log time; {option} does not fit.")
@@ -206,6 +220,14 @@ def _form(choices: Choices) -> str:
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen; use --format csv or parquet with -o.")
     return form
+
+
+def _check_event(choices: Choices) -> None:
+    near = choices.before is not None or choices.after is not None
+    if near and choices.event is None:
+        raise UsageError("--before and --after of what? Say it with --event TOPIC PREDICATE.")
+    if choices.event is not None and not near:
+        raise UsageError("How long before or after the events? Say it with --before or --after.")
 
 
 def form_of(path: Path) -> str:
@@ -253,7 +275,14 @@ def _for_json(table: pa.Table, query: Query) -> pa.Table:
     return table.add_column(0, "log_time_ns", time_ns)
 
 
-def _closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
+def closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
+    """Say what an answer has cost.
+
+    Args:
+        counters: What was counted.
+        elapsed: Seconds, with opening the store.
+        count: The answer was a number, not messages.
+    """
     taken = f"{output.size(counters.bytes_read)} read from disk"
     if counters.chunks_read:
         taken += f" in {output.counted(counters.chunks_read, 'chunk')}"

@@ -47,6 +47,9 @@ _INSTANTS: Final[Mapping[str, Literal["time", "duration"]]] = {
 }
 _ID_BYTES = 20
 _KEY = np.dtype([("time", ">u8"), ("recording", ">u4"), ("seq", ">u8")])
+_KEY_HEAD = np.void(b"\x23\0\0\0\x05_id\0\x14\0\0\0\0")
+"""What stands before the key in a document that has nothing else: 35 bytes, binary, 20 bytes."""
+_KEY_DOCUMENT = np.dtype([("head", "V14"), ("key", _KEY), ("end", "u1")])
 _REFERENCE = {"seg": "_meta.ref.seg", "chunk": "_meta.ref.chunk", "off": "_meta.ref.off"}
 
 
@@ -87,6 +90,35 @@ class ReferenceColumns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class KeyColumns:
+    """The keys of index documents.
+
+    Attributes:
+        time: int64[n], log time, ns.
+        recording: int64[n], number of the recording.
+        seq: int64[n], arrival number in the recording.
+    """
+
+    time: NDArray[np.int64]
+    recording: NDArray[np.int64]
+    seq: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of keys."""
+        return len(self.time)
+
+    def take(self, rows: NDArray[np.intp] | slice) -> KeyColumns:
+        """The chosen keys."""
+        return KeyColumns(self.time[rows], self.recording[rows], self.seq[rows])
+
+    def place_after(self, time: int, seq: int) -> int:
+        """How many keys of one recording, in order, are not after a place."""
+        low = int(np.searchsorted(self.time, time, "left"))
+        high = int(np.searchsorted(self.time, time, "right"))
+        return low + int(np.searchsorted(self.seq[low:high], seq, "right"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BsonPart:
     """Documents of a batch that have the same fields.
 
@@ -123,6 +155,24 @@ def reference_columns(batch: bytes) -> ReferenceColumns:
             nor an `_id`.
     """
     return _references(_pieces(read_columns(batch)))
+
+
+def key_columns(batch: bytes) -> KeyColumns:
+    """The keys of the index documents of a batch, in document order.
+
+    Args:
+        batch: Documents one after the other, projected to `_id`.
+
+    Raises:
+        StoreError: A document is malformed, or its `_id` is no key of ours.
+    """
+    if len(batch) % _KEY_DOCUMENT.itemsize:
+        raise _strange("_id")
+    documents = np.frombuffer(batch, _KEY_DOCUMENT)
+    if len(documents) and (documents["head"] != _KEY_HEAD).any():
+        raise _strange("_id")
+    keys = documents["key"]
+    return KeyColumns(*(keys[name].astype(np.int64) for name in ("time", "recording", "seq")))
 
 
 def records_from_bson(

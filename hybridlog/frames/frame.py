@@ -13,7 +13,7 @@ from hybridlog.frames.arrow import large_text
 from hybridlog.frames.ragged import Ragged
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +30,33 @@ def frame_of(log_time: NDArray[np.int64], columns: Iterable[tuple[str, Finished]
     data = {name: _array(column) for name, column in columns}
     index = pd.DatetimeIndex(log_time.view("M8[ns]"), name="log_time", copy=False)
     return pd.DataFrame(data, index=index.tz_localize("UTC"), copy=False)
+
+
+def frame_of_intervals(
+    names: Sequence[str],
+    recording: NDArray[np.int32],
+    begin: NDArray[np.int64],
+    end: NDArray[np.int64],
+    messages: NDArray[np.int64],
+) -> pd.DataFrame:
+    """A frame of intervals, one a row.
+
+    Args:
+        names: Ids of recordings.
+        recording: int32[n], index into `names`.
+        begin: int64[n], ns since the epoch.
+        end: int64[n], ns since the epoch.
+        messages: int64[n].
+    """
+    chosen = np.array(names, object)[recording] if len(names) else np.empty(0, object)
+    data = {
+        "recording": pd.array(chosen, dtype=_string_dtype()),
+        "begin": pd.DatetimeIndex(begin.view("M8[ns]")).tz_localize("UTC").array,
+        "end": pd.DatetimeIndex(end.view("M8[ns]")).tz_localize("UTC").array,
+        "duration": (end - begin).view("m8[ns]"),
+        "messages": messages,
+    }
+    return pd.DataFrame(data)
 
 
 def _array(column: Finished) -> Any:

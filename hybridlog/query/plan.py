@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from hybridlog.indexing import STAMP
+from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
@@ -88,12 +89,27 @@ class Target:
         lanes: Index of each wanted channel in the plan's lanes, by channel id.
         bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
         chunks: The chunks that may hold it.
+        windows: int64[n, 2], `[begin, end)` of log time, apart and in order: only messages
+            in one of them; None for all.
     """
 
     recording: RecordingEntry
     lanes: Mapping[int, int]
     bounds: tuple[int, int] | None
     chunks: Sequence[ChunkEntry]
+    windows: NDArray[np.int64] | None = None
+
+    def touches(self, first: int, last: int) -> bool:
+        """Whether a chunk may have messages in a window.
+
+        Args:
+            first: Log time of its first message, ns.
+            last: Log time of its last message, ns.
+        """
+        if self.windows is None:
+            return True
+        place = int(np.searchsorted(self.windows[:, 1], first, "right"))
+        return place < len(self.windows) and bool(self.windows[place, 0] <= last)
 
 
 ChunkKey = tuple[str, int, int]
@@ -160,7 +176,7 @@ class Plan:
         for target in self.targets:
             for chunk in target.chunks:
                 span = chunk.span(target.lanes)
-                if span is not None:
+                if span is not None and target.touches(*span):
                     count = sum(s.messages for c, s in chunk.stats.items() if c in target.lanes)
                     found.append(Task(target, chunk, *span, count))
         if self.reverse:
@@ -282,6 +298,11 @@ class Sweep:
         bounds = task.target.bounds
         if bounds is not None:
             mask &= self._inside(batch, lane_of, mask, bounds)
+        windows = task.target.windows
+        if windows is not None:
+            place = np.searchsorted(windows[:, 1], batch.log_time, "right")
+            begins = np.append(windows[:, 0], TIME_LIMIT - 1)
+            mask &= begins[place] <= batch.log_time
         if mask.all():
             batch.channel = lane_of
             return Piece(batch, seq)

@@ -47,6 +47,9 @@ TimeLike: TypeAlias = (
 )
 """What `parse_time` takes; `datetime` and `pandas.Timestamp` are dates."""
 
+DurationLike: TypeAlias = "str | float | timedelta"
+"""What `parse_duration` takes."""
+
 TIME_LIMIT = 2**63
 """Times lie below this many nanoseconds (the year 2262)."""
 
@@ -179,7 +182,7 @@ def parse_between(
     return parse_range(low, high, start=start, end=end)
 
 
-def parse_duration(text: str | float | timedelta) -> int:
+def parse_duration(text: DurationLike) -> int:
     """A length of time in nanoseconds, not negative.
 
     Args:

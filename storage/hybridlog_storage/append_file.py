@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 BLOCK = 4096
 """Bytes of a block; every device's own blocks divide it."""
 _STAGE = 4 << 20
-_DIRECT = getattr(os, "O_DIRECT", 0)
+DIRECT: int = getattr(os, "O_DIRECT", 0)
+"""Flag of direct reads and writes, 0 where there are none."""
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
@@ -59,9 +60,9 @@ class AppendFile:
             OSError: It exists, or cannot be made.
         """
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        if _DIRECT:
+        if DIRECT:
             try:
-                return cls(os.open(path, flags | _DIRECT, 0o644), direct=True)
+                return cls(os.open(path, flags | DIRECT, 0o644), direct=True)
             except OSError as error:
                 if error.errno not in _REFUSED:
                     raise
@@ -171,6 +172,6 @@ class AppendFile:
 
     def _give_up_direct(self, error: OSError) -> None:
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        if not flags & _DIRECT:
+        if not flags & DIRECT:
             raise error
-        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~_DIRECT)
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)

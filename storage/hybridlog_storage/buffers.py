@@ -31,10 +31,17 @@ class Buffers:
         self._spare: dict[int, list[mmap.mmap]] = {}
         self._spare_bytes = 0
 
-    def take(self, size: int) -> NDArray[np.uint8]:
-        """A buffer of at least `size` bytes, whatever they are."""
+    def take(self, size: int, *, whole_pages: bool = False) -> NDArray[np.uint8]:
+        """A buffer of at least `size` bytes, whatever they are.
+
+        Args:
+            size: Bytes.
+            whole_pages: Whether it must begin at a page of memory; large ones always do.
+        """
         if size < _LEAST:
-            return np.empty(size, np.uint8)
+            if not whole_pages:
+                return np.empty(size, np.uint8)
+            size = _LEAST
         size = 1 << (size - 1).bit_length()
         with self._lock:
             spare = self._spare.get(size)

@@ -10,6 +10,7 @@ import os
 import stat
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -20,6 +21,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
+from hybridlog_storage.append_file import BLOCK, DIRECT
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import decompress
@@ -92,17 +94,24 @@ class SegmentSummary:
 class SegmentReader:
     """One sealed segment file.
 
+    Args:
+        path: The file.
+        number: Its number in the recording.
+        direct: Read past the page cache, if the file system allows it: for what was just
+            written that way, and will not be read again soon.
+
     Raises:
         SegmentError: the file is missing or cannot be opened.
     """
 
-    def __init__(self, path: Path, number: int) -> None:
+    def __init__(self, path: Path, number: int, *, direct: bool = False) -> None:
         self.path = path
         self.number = number
+        self._direct = direct and bool(DIRECT)
         cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
             # Whatever lies there, opening it must not wait.
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+            self._fd = self._open(path)
         except OSError as error:
             problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
             raise SegmentError(problem) from error
@@ -112,6 +121,14 @@ class SegmentReader:
             raise SegmentError(f"Segment {path} is no ordinary file. {cure}")
         self.size = about.st_size
         self.bytes_read = 0
+
+    def _open(self, path: Path) -> int:
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
+        if self._direct:
+            with suppress(OSError):
+                return os.open(path, flags | DIRECT)
+            self._direct = False
+        return os.open(path, flags)
 
     def close(self) -> None:
         """Give the file back."""
@@ -198,15 +215,19 @@ class SegmentReader:
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
                 f"{offset + length} are referred to: the file was cut short."
             )
+        # Direct reads start and end at whole blocks, in the file and in memory.
+        ahead = offset % BLOCK if self._direct else 0
+        wanted = ahead + length
+        size = wanted + -wanted % BLOCK if self._direct else wanted
+        buffer = buffers.take(size, whole_pages=self._direct).data
         try:
-            data = buffers.take(length).data[:length]
-            count = os.preadv(self._fd, [data], offset)
+            count = os.preadv(self._fd, [buffer[:size]], offset - ahead)
         except OSError as error:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
-        if count != length:
-            raise SegmentError(f"{self.path} gives {count} bytes of {length} at {offset}.")
+        if count < wanted:
+            raise SegmentError(f"{self.path} gives {count - ahead} bytes of {length} at {offset}.")
         self.bytes_read += length
-        return data
+        return buffer[ahead:wanted]
 
     def _trailer(self, place: ChunkPlace) -> memoryview:
         """Walk the records behind a chunk as far as its arrival numbers."""

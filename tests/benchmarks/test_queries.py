@@ -360,6 +360,35 @@ def test_the_small_parts() -> None:
         assert tasks.checksum(odd) == tasks.checksum(np.array([1, 0, 0], np.float32))
 
 
+def test_a_task_that_is_slow_is_done_once(
+    monkeypatch: pytest.MonkeyPatch, work: Path, tmp_path: Path
+) -> None:
+    asked = context(tmp_path, work, backends={"sqlite_json1": able("sqlite_json1")})
+    load = reading.make_load(asked, SHORT)
+    results = tmp_path / "results"
+    (tmp_path / "data").mkdir()
+    monkeypatch.setattr(sides, "SLOW_S", 0.0)
+    monkeypatch.setattr(reading, "SLOW_S", 0.0)
+    values = sides.read(
+        load=str(load.payloads.parent),
+        backend="benchmarks.backends.sqlite:SqliteJson1",
+        directory=str(tmp_path / "data"),
+        rows=askers.READERS["sqlite_json1"],
+        repetitions=2,
+        results=str(results),
+    )
+    assert (values["status"], values["reason"]) == ("ok", "")
+    told = [json.loads(line) for line in results.read_text().splitlines()]
+    assert [(t["task"], t["repetition"]) for t in told] == [(name, 0) for name in tasks.TASKS]
+    truth = tasks.true_answers(load, 1)
+    assert reading.expected_seconds(asked, SHORT) > 0
+    for result in told:
+        outcome = SimpleNamespace(values=values)
+        asked.journal.add(reading._sample(outcome, result, truth, SHORT))  # type: ignore[arg-type]
+    assert {s.status for s in asked.journal.samples.values()} == {"ok"}
+    assert reading.expected_seconds(asked, SHORT) == 0
+
+
 def test_slices_begin_and_end_between_scans(work: Path, tmp_path: Path) -> None:
     load = reading.make_load(context(tmp_path, work), SHORT)
     scans = np.sort(load.log_time[tasks._rows(load, tasks.SCAN)])

@@ -26,8 +26,8 @@ def at_opening(patch: pytest.MonkeyPatch) -> None:
     real = os.open
 
     def refuse(path: Path, flags: int, *mode: int) -> int:
-        if flags & append_file._DIRECT:
-            os.close(real(path, flags & ~append_file._DIRECT, *mode))
+        if flags & append_file.DIRECT:
+            os.close(real(path, flags & ~append_file.DIRECT, *mode))
             raise OSError(errno.EINVAL, "no direct writes here")
         return real(path, flags, *mode)
 
@@ -41,7 +41,7 @@ def at_writing(patch: pytest.MonkeyPatch) -> None:
     real = os.pwrite
 
     def refuse(fd: int, data: memoryview, position: int) -> int:
-        if fcntl.fcntl(fd, fcntl.F_GETFL) & append_file._DIRECT:
+        if fcntl.fcntl(fd, fcntl.F_GETFL) & append_file.DIRECT:
             raise OSError(errno.EINVAL, "no direct writes here")
         return real(fd, data, position)
 
@@ -50,7 +50,7 @@ def at_writing(patch: pytest.MonkeyPatch) -> None:
 
 def without(patch: pytest.MonkeyPatch) -> None:
     """There is no such flag at all."""
-    patch.setattr(append_file, "_DIRECT", 0)
+    patch.setattr(append_file, "DIRECT", 0)
 
 
 @pytest.mark.parametrize("refusal", [never, at_opening, at_writing, without])

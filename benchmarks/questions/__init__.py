@@ -1,0 +1,1 @@
+"""What is asked of a backend that holds a load, in its own language."""

@@ -1,0 +1,107 @@
+"""Questions to hybridlog in its own words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.questions.base import (
+    ARM,
+    ERROR,
+    GRIPPER,
+    ROSOUT,
+    VIEWPOINT,
+    Asker,
+    Reading,
+    checked,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from benchmarks.backends.base import Backend
+    from hybridlog.store import Store
+
+
+class _Stored:
+    """The backend's store."""
+
+    store: Store
+
+    def start(self, backend: Backend) -> None:
+        from benchmarks.backends.hybridlog_store import Hybridlog
+
+        assert isinstance(backend, Hybridlog)
+        self.store = backend.store
+
+
+class ApiAsker(_Stored, Asker):
+    """One call a question, but for Q4, which is a join by time."""
+
+    def index_bytes(self) -> int | None:
+        return index_bytes(self.store)
+
+    def closings(self) -> int:
+        return self.store.topic(GRIPPER).where("position == 0").count()
+
+    def behind(self) -> int:
+        return self.store.topic(VIEWPOINT).where("position.x <= 0").count()
+
+    def positions(self) -> list[float]:
+        axes = [f"position.{axis}" for axis in "xyz"]
+        frame = self.store.topic(VIEWPOINT).where("position.x <= 0").fields(*axes).to_pandas()
+        return [float(len(frame)), *map(float, frame[axes].sum())]
+
+    def in_region(self) -> int:
+        region = (
+            "pose.position.z > 1 and -0.5 < pose.position.y < 0.5 and 0.5 < pose.position.x < 1"
+        )
+        return self.store.topic(ARM).where(region).count()
+
+    def grasps(self, half_ns: int) -> int:
+        closings = (
+            self.store.topic(GRIPPER).where("position == 0").windows(f"{half_ns}ns", f"{half_ns}ns")
+        )
+        in_front = self.store.topic(VIEWPOINT).where("position.x >= 0").during(closings)
+        frame = in_front.fields("position.x").to_pandas()
+        times = frame.index.to_numpy("datetime64[ns]").astype(np.int64)
+        first = np.searchsorted(times, [window.begin_ns for window in closings])
+        after = np.searchsorted(times, [window.end_ns for window in closings])
+        return int((first < after).sum())
+
+    def changes(self) -> int:
+        # The viewpoint comes every 33 ms: a pause of less than two of these is none.
+        viewpoint = self.store.topic(VIEWPOINT)
+        return len(viewpoint.changes("position", "orientation", pause="50ms"))
+
+    def closed_minutes(self) -> list[int]:
+        found = self.store.topic(GRIPPER).where("position == 0").intervals(length="1min")
+        return checked(minute.begin_ns for minute in found)
+
+    def before_errors(self) -> int:
+        errors = self.store.topic(ROSOUT).where(f"level == {ERROR}")
+        return self.store.all_topics().before(errors, "5min").count()
+
+
+def index_bytes(store: Store) -> int:
+    """Bytes on the disk of all that is not in the segments: documents and catalog."""
+    database = store.database_for("Its size")
+    sizes = [database.stats(name) for name in database.list_collections()]
+    return sum(size.storage_bytes + size.index_bytes for size in sizes)
+
+
+class HybridlogReading(_Stored, Reading):
+    """Through the index of chunks."""
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        query = self.store.topic(topic).between(f"{begin}ns", f"{end}ns").fields("ranges")
+        return np.stack(list(query.to_pandas()["ranges"]))
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        found: NDArray[np.float32] = self.store.topic(topic).at(f"{time}ns").decode().ranges
+        return found
+
+    def table(self, topic: str) -> pd.DataFrame:
+        return self.store.topic(topic).to_pandas()

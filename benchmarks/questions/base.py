@@ -1,0 +1,203 @@
+"""The questions of study 3, what must be answered, and what answers them.
+
+Each system has a class of its own that asks in the system's own language. All answers
+are plain values, compared with what the load's plan says must be found.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from operator import methodcaller
+from typing import TYPE_CHECKING, ClassVar, Final
+
+if TYPE_CHECKING:
+    from benchmarks.backends.base import Backend
+    from benchmarks.loads.truth import Truth
+    from hybridlog_storage.messages import Channel
+
+GRIPPER: Final = "/r_gripper_controller/command"
+VIEWPOINT: Final = "/rviz_camera_publisher/camera_pose"
+ARM: Final = "/r_cart/command_pose"
+ROSOUT: Final = "/rosout"
+ERROR: Final = 8
+"""Level of a system error."""
+
+SECOND_NS: Final = 10**9
+MINUTE_NS: Final = 60 * SECOND_NS
+BEFORE_NS: Final = 5 * MINUTE_NS
+WIDE_NS: Final = SECOND_NS // 2
+"""Half of the window of Q4, as the code in the paper's appendix has it."""
+NEAR_NS: Final = SECOND_NS // 10
+"""The same as the paper's text has it."""
+SLOW_S = 10.0
+"""What takes longer is not asked again."""
+_CHECK = 1_000_000_007
+
+Answer = int | list[int] | list[float]
+"""A number, or a number and what else tells one answer from another."""
+Window = tuple[int, int]
+"""`[begin, end)`, ns."""
+
+
+class Asker(ABC):
+    """Asks one open backend.
+
+    Args:
+        backend: Open, with the load in it.
+        channels: Those of the load.
+    """
+
+    def __init__(self, backend: Backend, channels: Sequence[Channel]) -> None:
+        self.topics = list(dict.fromkeys(channel.topic for channel in channels))
+        self.start(backend)
+
+    @abstractmethod
+    def start(self, backend: Backend) -> None:
+        """Connect, define functions."""
+
+    @abstractmethod
+    def closings(self) -> int:
+        """Q1: how many times was the right gripper closed."""
+
+    @abstractmethod
+    def behind(self) -> int:
+        """Q2, as the appendix counts it: viewpoints behind the robot."""
+
+    @abstractmethod
+    def positions(self) -> list[float]:
+        """Q2, as its text asks: those viewpoints; their number, sums of x, y and z."""
+
+    @abstractmethod
+    def in_region(self) -> int:
+        """Q3: how many times was the gripper moved in a region."""
+
+    @abstractmethod
+    def grasps(self, half_ns: int) -> int:
+        """Q4: closings with a viewpoint in front of the robot nearer than half the window."""
+
+    @abstractmethod
+    def changes(self) -> int:
+        """How many times did the user change the viewpoint."""
+
+    @abstractmethod
+    def closed_minutes(self) -> list[int]:
+        """Non-overlapping minutes in which the gripper was closed: `checked(begins)`."""
+
+    @abstractmethod
+    def before_errors(self) -> int:
+        """Messages of all topics in the five minutes before each system error."""
+
+    def index_bytes(self) -> int | None:
+        """Bytes on the disk of what serves questions alone; None when that is not told."""
+        return None
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to give back
+        """Give back what `start` took."""
+
+
+QUESTIONS: Final[dict[str, Callable[[Asker], Answer]]] = {
+    "Q1": methodcaller("closings"),
+    "Q2": methodcaller("behind"),
+    "Q3": methodcaller("in_region"),
+    "Q4": methodcaller("grasps", WIDE_NS),
+    "Q2 positions": methodcaller("positions"),
+    "Q4 ±0.1 s": methodcaller("grasps", NEAR_NS),
+    "viewpoint changes": methodcaller("changes"),
+    "closed minutes": methodcaller("closed_minutes"),
+    "before errors": methodcaller("before_errors"),
+}
+"""By name; the first four are those of the paper's Table 1."""
+
+
+def true_answers(truth: Truth) -> dict[str, Answer]:
+    """What must be answered, by question."""
+    return {
+        "Q1": truth.q1,
+        "Q2": truth.q2,
+        "Q3": truth.q3,
+        "Q4": truth.q4_wide,
+        "Q2 positions": [float(truth.q2), *map(float, truth.q2_sum)],
+        "Q4 ±0.1 s": truth.q4_near,
+        "viewpoint changes": truth.viewpoint_changes,
+        "closed minutes": checked(truth.closed_minutes),
+        "before errors": truth.before_errors,
+    }
+
+
+def checked(times: Iterable[int]) -> list[int]:
+    """How many times, ns, and a number that nearly every other list of times changes."""
+    listed = [int(time) for time in times]
+    return [len(listed), sum(listed) % _CHECK]
+
+
+def whole_minutes(closed: Iterable[Window]) -> list[int]:
+    """Where the minutes begin into which intervals can be cut."""
+    return [
+        begin + minute * MINUTE_NS
+        for begin, end in closed
+        for minute in range((end - begin) // MINUTE_NS)
+    ]
+
+
+def windows_before(errors: Iterable[int]) -> list[Window]:
+    """The five minutes before each error, those that overlap as one."""
+    found: list[Window] = []
+    for error in sorted(errors):
+        begin = error - BEFORE_NS
+        if found and begin <= found[-1][1]:
+            found[-1] = (found[-1][0], error)
+        else:
+            found.append((begin, error))
+    return found
+
+
+class Reading(ABC):
+    """Reads messages back from one open backend.
+
+    Args:
+        backend: Open, with the load in it.
+        channels: Those of the load.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = (
+        "angular_velocity.x",
+        "angular_velocity.y",
+        "angular_velocity.z",
+        "linear_acceleration.x",
+        "linear_acceleration.y",
+        "linear_acceleration.z",
+    )
+    """What is compared of an IMU's table."""
+
+    def __init__(self, backend: Backend, channels: Sequence[Channel]) -> None:
+        self.channels = channels
+        self.start(backend)
+
+    @abstractmethod
+    def start(self, backend: Backend) -> None:
+        """Connect, define functions."""
+
+    @abstractmethod
+    def slice(self, topic: str, begin: int, end: int) -> Rows:
+        """Field `ranges` of the messages with a log time in `[begin, end)`, in order."""
+
+    @abstractmethod
+    def last(self, topic: str, time: int) -> Row:
+        """Field `ranges` of the last message with a log time up to `time`."""
+
+    @abstractmethod
+    def table(self, topic: str) -> pd.DataFrame:
+        """All messages of a topic in the order of log time, at least with `columns`."""
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to give back
+        """Give back what `start` took."""
+
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    Row = NDArray[np.float32]
+    Rows = NDArray[np.float32]

@@ -1,0 +1,206 @@
+"""Questions to MongoDB: the paper's appendix A through pymongo, and aggregations.
+
+They run unchanged against the collections of our own MongoDB backends and against those
+that hybridlog writes: names, paths and the date in `_meta.inserted_at` are the same.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.questions.api import index_bytes
+from benchmarks.questions.base import (
+    ARM,
+    ERROR,
+    GRIPPER,
+    ROSOUT,
+    VIEWPOINT,
+    Asker,
+    Reading,
+    checked,
+    whole_minutes,
+    windows_before,
+)
+from hybridlog_storage.collection_names import collection_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+    from pymongo import MongoClient
+    from pymongo.collection import Collection
+    from pymongo.database import Database
+
+    from benchmarks.backends.base import Backend
+
+_EPOCH = datetime(1970, 1, 1)  # UTC: so pymongo takes and gives dates
+
+
+class MongoAsker(Asker):
+    """Q1 to Q4 as in the appendix, word for word but for JavaScript's syntax.
+
+    The appendix takes the length of the list of rows that Q4 has looked up, in which a
+    closing without a viewpoint has a null; only rows that were found are counted here.
+    """
+
+    def start(self, backend: Backend) -> None:
+        from benchmarks.backends.mongo_json import MongoJson
+
+        assert isinstance(backend, MongoJson)
+        self._database: Database[dict[str, Any]] = backend.database
+
+    def closings(self) -> int:
+        return self._of(GRIPPER).count_documents({"position": 0.0})
+
+    def behind(self) -> int:
+        return self._of(VIEWPOINT).count_documents({"position.x": {"$lte": 0}})
+
+    def positions(self) -> list[float]:
+        found = self._of(VIEWPOINT).find({"position.x": {"$lte": 0}}, {"_id": 0, "position": 1})
+        rows = [tuple(row["position"][axis] for axis in "xyz") for row in found]
+        sums = np.array(rows).reshape(-1, 3).sum(axis=0)
+        return [float(len(rows)), *map(float, sums)]
+
+    def in_region(self) -> int:
+        return self._of(ARM).count_documents(
+            {
+                "pose.position.z": {"$gt": 1},
+                "pose.position.y": {"$gt": -0.5, "$lt": 0.5},
+                "pose.position.x": {"$gt": 0.5, "$lt": 1},
+            }
+        )
+
+    def grasps(self, half_ns: int) -> int:
+        half = timedelta(microseconds=half_ns // 1000)
+        viewpoints = self._of(VIEWPOINT)
+        found = 0
+        for closing in self._of(GRIPPER).find({"position": 0.0}):
+            time = closing["_meta"]["inserted_at"]
+            row = viewpoints.find_one(
+                {
+                    "position.x": {"$gte": 0},
+                    "_meta.inserted_at": {"$lt": time + half, "$gt": time - half},
+                }
+            )
+            found += row is not None
+        return found
+
+    def changes(self) -> int:
+        """With window functions, which MongoDB has from version 5 on."""
+        by_time = {"t": 1}
+        last = {"last": {"$shift": {"output": "$pose", "by": -1}}}
+        before = {"before": {"$shift": {"output": "$differs", "by": -1, "default": False}}}
+        pose = {"p": "$position", "o": "$orientation"}
+        found = self._of(VIEWPOINT).aggregate(
+            [
+                {"$project": {"_id": 0, "t": "$_meta.t", "pose": pose}},
+                {"$setWindowFields": {"sortBy": by_time, "output": last}},
+                {
+                    "$set": {
+                        "differs": {"$and": [{"$ne": ["$last", None]}, {"$ne": ["$pose", "$last"]}]}
+                    }
+                },
+                {"$setWindowFields": {"sortBy": by_time, "output": before}},
+                {"$match": {"differs": True, "before": False}},
+                {"$count": "n"},
+            ],
+            allowDiskUse=True,
+        )
+        return next((int(row["n"]) for row in found), 0)
+
+    def closed_minutes(self) -> list[int]:
+        by_time = {"t": 1}
+        before = {"before": {"$shift": {"output": "$closed", "by": -1}}}
+        until = {"until": {"$shift": {"output": "$t", "by": 1}}}
+        closed = {"$eq": ["$position", 0.0]}
+        found = self._of(GRIPPER).aggregate(
+            [
+                {"$project": {"_id": 0, "t": "$_meta.t", "closed": closed}},
+                {"$setWindowFields": {"sortBy": by_time, "output": before}},
+                {"$match": {"$expr": {"$ne": ["$closed", "$before"]}}},
+                {"$setWindowFields": {"sortBy": by_time, "output": until}},
+                {"$match": {"closed": True, "until": {"$ne": None}}},
+            ],
+            allowDiskUse=True,
+        )
+        return checked(whole_minutes((row["t"], row["until"]) for row in found))
+
+    def before_errors(self) -> int:
+        errors = self._of(ROSOUT).find({"level": ERROR}, {"_meta.t": 1})
+        windows = windows_before(row["_meta"]["t"] for row in errors)
+        return sum(
+            self._of(topic).count_documents(
+                {"_meta.inserted_at": {"$gte": _date(begin), "$lt": _date(end)}}
+            )
+            for topic in self.topics
+            for begin, end in windows
+        )
+
+    def index_bytes(self) -> int | None:
+        """All indexes, with the one on `_id` that every collection has."""
+        self._database.client.admin.command("fsync")  # sizes are those of the last checkpoint
+        return int(self._database.command("dbStats")["indexSize"])
+
+    def _of(self, topic: str) -> Collection[dict[str, Any]]:
+        return self._database[collection_of(topic)]
+
+
+class HybridlogAppendixAsker(MongoAsker):
+    """The same questions, through pymongo, to the collections that hybridlog writes."""
+
+    def start(self, backend: Backend) -> None:
+        from pymongo import MongoClient
+
+        from benchmarks.backends.hybridlog_store import Hybridlog
+
+        assert isinstance(backend, Hybridlog)
+        database = backend.store.database_for("These questions")
+        self._client: MongoClient[dict[str, Any]] = MongoClient(database.address)
+        self._database = self._client[database.name]
+        self._store = backend.store
+
+    def index_bytes(self) -> int | None:
+        return index_bytes(self._store)
+
+    def close(self) -> None:
+        self._client.close()
+
+
+class MongoReading(Reading):
+    """By `_meta.inserted_at`, which is what the indexes are on."""
+
+    def start(self, backend: Backend) -> None:
+        from benchmarks.backends.mongo_json import MongoJson
+
+        assert isinstance(backend, MongoJson)
+        self._database = backend.database
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        rows = self._database[collection_of(topic)].find(
+            {"_meta.inserted_at": {"$gte": _date(begin), "$lt": _date(end)}},
+            {"_id": 0, "ranges": 1},
+            sort=[("_meta.inserted_at", 1)],
+        )
+        return np.array([row["ranges"] for row in rows], np.float32)
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        row = self._database[collection_of(topic)].find_one(
+            {"_meta.inserted_at": {"$lte": _date(time)}},
+            {"_id": 0, "ranges": 1},
+            sort=[("_meta.inserted_at", -1)],
+        )
+        assert row is not None
+        return np.array(row["ranges"], np.float32)
+
+    def table(self, topic: str) -> pd.DataFrame:
+        import pandas as pd
+
+        rows = self._database[collection_of(topic)].find({}, {"_id": 0})
+        frame = pd.json_normalize(list(rows))
+        return frame.sort_values("_meta.t", kind="stable")
+
+
+def _date(time: int) -> datetime:
+    return _EPOCH + timedelta(milliseconds=time // 1_000_000)

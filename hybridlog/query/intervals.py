@@ -1,0 +1,372 @@
+"""Intervals of log time: what states, changes and windows around events are answered with.
+
+All intervals are half-open, `begin <= time < end`, and each belongs to one recording:
+nothing is ever joined from one recording to the next. They are columns, not objects; an
+`Interval` is made when one is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
+from hybridlog.schema.column import ranges
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
+Span = tuple[int, int]
+"""`[begin, end)` in nanoseconds."""
+
+MOST_PIECES = 10_000_000
+"""Most intervals that `Intervals.cut` makes."""
+_LAST = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A stretch of log time of one recording.
+
+    Attributes:
+        recording: Id of the recording.
+        begin_ns: First nanosecond, since the epoch.
+        end_ns: First nanosecond after it.
+        messages: How many messages it was made from.
+    """
+
+    recording: str
+    begin_ns: int
+    end_ns: int
+    messages: int
+
+    def __repr__(self) -> str:
+        return (
+            f"<Interval {self.recording} {format_time(self.begin_ns)} "
+            f"{format_duration(self.duration_ns)}>"
+        )
+
+    @property
+    def duration_ns(self) -> int:
+        """Its length, nanoseconds."""
+        return self.end_ns - self.begin_ns
+
+
+class Intervals:
+    """Intervals, ordered by their beginning. Immutable: each step gives new ones.
+
+    Args:
+        recordings: Ids, in the order in which intervals that begin together are given.
+        recording: int32[n], index into `recordings`.
+        begin: int64[n], ns since the epoch.
+        end: int64[n], ns; never before `begin`.
+        messages: int64[n], how many messages each was made from.
+    """
+
+    __slots__ = ("_begin", "_end", "_messages", "_recording", "_recordings")
+
+    def __init__(
+        self,
+        recordings: tuple[str, ...],
+        recording: NDArray[np.int32],
+        begin: NDArray[np.int64],
+        end: NDArray[np.int64],
+        messages: NDArray[np.int64],
+    ) -> None:
+        order = np.lexsort((end, recording, begin))
+        self._recordings = recordings
+        self._recording: NDArray[np.int32] = recording[order]
+        self._begin: NDArray[np.int64] = begin[order]
+        self._end: NDArray[np.int64] = end[order]
+        self._messages: NDArray[np.int64] = messages[order]
+
+    @classmethod
+    def of(cls, parts: Iterable[tuple[str, NDArray[np.int64]]]) -> Intervals:
+        """Intervals out of parts of recordings.
+
+        Args:
+            parts: Id of a recording, and int64[n, 3]: begin, end, messages. A recording
+                may have several parts.
+        """
+        ids: dict[str, int] = {}
+        rows: list[NDArray[np.int64]] = [np.empty((0, 3), np.int64)]
+        codes: list[NDArray[np.int32]] = [np.empty(0, np.int32)]
+        for name, part in parts:
+            rows.append(part)
+            codes.append(np.full(len(part), ids.setdefault(name, len(ids)), np.int32))
+        begin, end, messages = np.ascontiguousarray(np.concatenate(rows).T)
+        return cls(tuple(ids), np.concatenate(codes), begin, end, messages)
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self._begin)
+
+    def __iter__(self) -> Iterator[Interval]:
+        """One by one."""
+        columns = (self._recording, self._begin, self._end, self._messages)
+        for code, begin, end, count in zip(*(c.tolist() for c in columns), strict=True):
+            yield Interval(self._recordings[code], begin, end, count)
+
+    def __getitem__(self, place: int) -> Interval:
+        """One of them; a negative place counts from the end."""
+        return Interval(
+            self._recordings[self._recording[place]],
+            int(self._begin[place]),
+            int(self._end[place]),
+            int(self._messages[place]),
+        )
+
+    def __repr__(self) -> str:
+        return f"<Intervals {len(self)}, {format_duration(self.duration_ns)} in all>"
+
+    @property
+    def duration_ns(self) -> int:
+        """Sum of their lengths, nanoseconds; where they overlap, time counts twice."""
+        return int((self._end - self._begin).sum())
+
+    def at_least(self, length: DurationLike) -> Intervals:
+        """Only those of at least this length.
+
+        Raises:
+            TimeError: it is no duration.
+        """
+        return self._take(self._end - self._begin >= parse_duration(length))
+
+    def cut(self, length: DurationLike) -> Intervals:
+        """Each cut into as many pieces of exactly this length as fit into it.
+
+        The first piece begins where the interval begins, each where the one before it
+        ends; what is left over at the end is dropped. `messages` stays that of the whole.
+
+        Raises:
+            TimeError: it is no duration.
+            UsageError: it is zero, or there would be too many pieces.
+        """
+        size = parse_duration(length)
+        if size == 0:
+            raise UsageError("Intervals cannot be cut into pieces of no length.")
+        count = (self._end - self._begin) // size
+        if int(count.sum()) > MOST_PIECES:
+            raise UsageError(
+                f"That is {int(count.sum())} intervals; ask for longer ones, or in a time range."
+            )
+        source = np.repeat(np.arange(len(self)), count)
+        number = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
+        begin = self._begin[source] + number * size
+        return Intervals(
+            self._recordings, self._recording[source], begin, begin + size, self._messages[source]
+        )
+
+    def widened(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
+        """Each begins and ends so much earlier and later; they may overlap then.
+
+        Raises:
+            TimeError: one of both is no duration.
+        """
+        begin = np.maximum(self._begin, parse_duration(before)) - parse_duration(before)
+        later = parse_duration(after)
+        end = np.minimum(self._end, _LAST - later) + later
+        return Intervals(self._recordings, self._recording, begin, end, self._messages)
+
+    def merged(self) -> Intervals:
+        """Those of one recording that overlap or touch as one; empty ones are dropped."""
+        return Intervals.of(
+            (name, joined(self._rows_of(code))) for code, name in enumerate(self._recordings)
+        )
+
+    def common(self, other: Intervals) -> Intervals:
+        """What is in both: times of a recording that intervals of either have.
+
+        `messages` is 0: there are no messages that these were made from.
+        """
+        parts = []
+        for name in self._recordings:
+            mine, theirs = self.of_recording(name), other.of_recording(name)
+            # Each pair that meets: those of theirs that end after mine begins, and so on.
+            low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")
+            high = np.searchsorted(theirs[:, 0], mine[:, 1], "left")
+            count = np.maximum(high - low, 0)
+            one, pair = np.repeat(np.arange(len(mine)), count), ranges(low, count)
+            begin = np.maximum(mine[one, 0], theirs[pair, 0])
+            end = np.minimum(mine[one, 1], theirs[pair, 1])
+            parts.append((name, np.stack([begin, end, np.zeros_like(begin)], axis=1)))
+        return Intervals.of(parts)
+
+    def within(self, spans: Mapping[str, Span]) -> Intervals:
+        """Each without what lies outside of its recording; they stay as many.
+
+        Args:
+            spans: `[begin, end)`, ns, by id of the recording.
+        """
+        bounds = np.array([spans[name] for name in self._recordings], np.int64).reshape(-1, 2)
+        low, high = bounds[self._recording].T
+        begin: NDArray[np.int64] = np.clip(self._begin, low, high)
+        end: NDArray[np.int64] = np.clip(self._end, low, high)
+        return Intervals(self._recordings, self._recording, begin, end, self._messages)
+
+    def of_recording(self, recording: str) -> NDArray[np.int64]:
+        """What of one recording is covered: int64[n, 2], begin and end, apart, in order."""
+        if recording not in self._recordings:
+            return np.empty((0, 2), np.int64)
+        return joined(self._rows_of(self._recordings.index(recording)))[:, :2]
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
+        from hybridlog.frames.frame import frame_of_intervals
+
+        return frame_of_intervals(
+            self._recordings, self._recording, self._begin, self._end, self._messages
+        )
+
+    def _rows_of(self, code: int) -> NDArray[np.int64]:
+        rows = np.flatnonzero(self._recording == code)
+        return np.stack([self._begin[rows], self._end[rows], self._messages[rows]], axis=1)
+
+    def _take(self, rows: NDArray[np.bool_]) -> Intervals:
+        return Intervals(
+            self._recordings,
+            self._recording[rows],
+            self._begin[rows],
+            self._end[rows],
+            self._messages[rows],
+        )
+
+
+def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Intervals of one recording that overlap or touch, as one; empty ones are dropped.
+
+    Args:
+        rows: int64[n, 3]: begin, end, messages; ordered by begin.
+
+    Returns:
+        The same of fewer: messages are added up.
+    """
+    rows = rows[rows[:, 1] > rows[:, 0]]
+    if not len(rows):
+        return rows
+    reach = np.maximum.accumulate(rows[:, 1])
+    first = np.flatnonzero(np.concatenate([[True], rows[1:, 0] > reach[:-1]]))
+    last = np.append(first[1:], len(rows)) - 1
+    messages = np.add.reduceat(rows[:, 2], first)
+    return np.stack([rows[first, 0], reach[last], messages], axis=1)
+
+
+def clipped(rows: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
+    """Intervals (int64[n, 3]) without what lies outside of a span; none of them empty."""
+    begin = np.maximum(rows[:, 0], span[0])
+    end = np.minimum(rows[:, 1], span[1])
+    kept = end > begin
+    return np.stack([begin[kept], end[kept], rows[kept, 2]], axis=1)
+
+
+class Holding:
+    """Turns what each message says of a state into the intervals in which it holds.
+
+    A message says whether the state holds from its log time on, until the next one, and
+    for at most `max_gap`. Of messages of one log time the last one counts.
+
+    Args:
+        max_gap: Most nanoseconds for which a message is believed; None for any.
+    """
+
+    def __init__(self, max_gap: int | None) -> None:
+        self._max_gap = max_gap
+        self._time = np.empty(0, np.int64)
+        self._holds = np.empty(0, np.bool_)
+        self._count = np.empty(0, np.int64)
+        self._open = np.empty((0, 3), np.int64)
+
+    def add(
+        self, time: NDArray[np.int64], holds: NDArray[np.bool_], *, counted: bool = True
+    ) -> NDArray[np.int64]:
+        """Take the next messages.
+
+        Args:
+            time: int64[n], log times, ascending, none before those of the last call.
+            holds: bool[n], what each message says.
+            counted: Whether they count as messages of an interval.
+
+        Returns:
+            int64[k, 3], begin, end, messages: intervals that are known to have ended.
+        """
+        time = np.concatenate([self._time, time])
+        holds = np.concatenate([self._holds, holds])
+        count = np.zeros(len(time), np.int64)
+        count[: len(self._count)] = self._count
+        if counted:
+            count[len(self._count) :] = holds[len(self._count) :]
+        # The last log time may go on in the next call.
+        whole = int(np.searchsorted(time, time[-1])) if len(time) else 0
+        self._time, self._holds, self._count = time[whole:], holds[whole:], count[whole:]
+        following = int(time[-1]) if whole else 0
+        return self._extend(time[:whole], holds[:whole], count[:whole], following)
+
+    def finish(self, end: int) -> NDArray[np.int64]:
+        """The rest, after the last message.
+
+        Args:
+            end: Where the recording ends, ns; not before any message.
+        """
+        ended = self._extend(self._time, self._holds, self._count, end)
+        return np.concatenate([ended, self._open])
+
+    def _extend(
+        self,
+        time: NDArray[np.int64],
+        holds: NDArray[np.bool_],
+        count: NDArray[np.int64],
+        following: int,
+    ) -> NDArray[np.int64]:
+        """Intervals of some log times that are complete, the open one first."""
+        if not len(time):
+            return np.empty((0, 3), np.int64)
+        first = np.flatnonzero(np.concatenate([[True], time[1:] != time[:-1]]))
+        last = np.append(first[1:], len(time)) - 1
+        begin = time[first]
+        end = np.append(begin[1:], following)
+        if self._max_gap is not None:
+            end = np.minimum(end, np.minimum(begin, _LAST - self._max_gap) + self._max_gap)
+        rows = np.stack([begin, end, np.add.reduceat(count, first)], axis=1)[holds[last]]
+        rows = joined(np.concatenate([self._open, rows]))
+        self._open = rows[-1:]
+        return rows[:-1]
+
+
+class Changing:
+    """Turns steps, messages that differ from the one before, into changes.
+
+    Args:
+        pause: Most nanoseconds between two steps of one change.
+    """
+
+    def __init__(self, pause: int) -> None:
+        self._pause = pause
+        self._open = np.empty((0, 3), np.int64)
+
+    def add(self, time: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Take the log times of the next steps, in order.
+
+        Returns:
+            int64[k, 3], begin, end, steps: changes that are known to have ended.
+        """
+        if not len(time):
+            return np.empty((0, 3), np.int64)
+        times = np.stack([time, time + 1, np.ones_like(time)], axis=1)
+        rows = np.concatenate([self._open, times])
+        # An open change ends one nanosecond after its last step.
+        apart = rows[1:, 0] - (rows[:-1, 1] - 1) > self._pause
+        first = np.flatnonzero(np.concatenate([[True], apart]))
+        last = np.append(first[1:], len(rows)) - 1
+        steps = np.add.reduceat(rows[:, 2], first)
+        found = np.stack([rows[first, 0], rows[last, 1], steps], axis=1)
+        self._open = found[-1:]
+        return found[:-1]
+
+    def finish(self) -> NDArray[np.int64]:
+        """The change that was still open, if any."""
+        return self._open

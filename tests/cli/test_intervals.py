@@ -1,0 +1,140 @@
+"""`hybridlog intervals`, `changes`, and `fetch --event`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.independent import Seen, read_bag
+
+from .running import run
+
+SECOND = 10**9
+GRIPPER = ("-t", "r_gripper_controller/command", "-r", "robot")
+
+
+@pytest.fixture(scope="module")
+def seen(logs: Path) -> list[Seen]:
+    """What the robot said, by log time."""
+    return sorted(read_bag(logs / "robot.bag"), key=lambda m: m.log_time)
+
+
+def decoded(seen: list[Seen], topic: str, kind: str) -> list[tuple[int, Any]]:
+    """Log times and messages of a topic as rosbags decodes them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC)
+    mine = [m for m in seen if m.topic == topic]
+    return [(m.log_time, types.deserialize_ros1(m.payload, kind)) for m in mine]
+
+
+@pytest.fixture(scope="module")
+def speeds(seen: list[Seen]) -> list[tuple[int, float]]:
+    odometry = decoded(seen, "/odom", "nav_msgs/msg/Odometry")
+    return [(time, message.twist.twist.linear.x) for time, message in odometry]
+
+
+def test_intervals_as_json(store: Path, seen: list[Seen], speeds: list[tuple[int, float]]) -> None:
+    done = run(
+        "intervals", "-t", "odom", "-r", "robot", "--where", "twist.twist.linear.x > 0.5",
+        "--json", store=store,
+    )  # fmt: skip
+    want: list[list[int]] = []
+    ends = [*[time for time, _ in speeds][1:], seen[-1].log_time + 1]
+    for (time, speed), end in zip(speeds, ends, strict=True):
+        if speed > 0.5:
+            if want and want[-1][1] == time:
+                want[-1] = [want[-1][0], end, want[-1][2] + 1]
+            else:
+                want.append([time, end, 1])
+    assert want
+    assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
+    assert {r["recording"] for r in done.json} == {"robot"}
+    assert done.err.endswith(" s\n")
+    assert "0 B read from disk" in done.err
+
+
+def test_intervals_as_a_table(store: Path) -> None:
+    asked = ("intervals", "-t", "odom", "-r", "robot", "--where", "twist.twist.linear.x > -9")
+    done = run(*asked, store=store)
+    assert done.lines[0].split() == ["recording", "begin", "end", "duration", "messages"]
+    assert len(done.lines) == 2
+    assert run(*asked, "--count", "-q", store=store).out == "1\n"
+    assert run(*asked, "--length", "1s", "--count", "-q", store=store).out == "5\n"
+    assert run(*asked, "--at-least", "1min", store=store).out == ""
+    none = run(*asked, "--at-least", "1min", store=store)
+    assert none.err.startswith("No interval.")
+    assert run(*asked, "--at-least", "1min", "--json", store=store).json == []
+    assert run(*asked, "--between", "+1s", "+2s", "--json", store=store).json[0]["messages"] > 10
+    assert len(run(*asked, "--max-gap", "1ms", "--json", store=store).json) > 100
+
+
+def test_changes(store: Path, seen: list[Seen]) -> None:
+    topic, kind = "/rviz_camera_publisher/camera_pose", "geometry_msgs/msg/Pose"
+    poses = decoded(seen, topic, kind)
+    steps = [
+        time
+        for (time, now), (_, last) in zip(poses[1:], poses, strict=False)
+        if (now.position, now.orientation) != (last.position, last.orientation)
+    ]
+    want: list[list[int]] = []
+    for time in steps:
+        if want and time - want[-1][1] + 1 <= SECOND // 2:
+            want[-1] = [want[-1][0], time + 1, want[-1][2] + 1]
+        else:
+            want.append([time, time + 1, 1])
+    asked = ("changes", "-t", "camera_pose", "-r", "robot", "--fields", "position, orientation")
+    done = run(*asked, "--pause", "500ms", "--json", store=store)
+    assert want
+    assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
+    assert run(*asked, "--pause", "500ms", "--count", "-q", store=store).out == f"{len(want)}\n"
+    assert run(*asked, "--tolerance", "1e9", "--count", "-q", store=store).out == "0\n"
+    assert run(*asked, "--at-least", "1h", "--count", "-q", store=store).out == "0\n"
+
+
+def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
+    errors = [
+        time
+        for time, message in decoded(seen, "/rosout", "rosgraph_msgs/msg/Log")
+        if message.level >= 2
+    ]
+    assert errors
+    near = ("fetch", "-t", "**", "-r", "robot", "--event", "rosout", "level >= 2")
+
+    def wanted(before: int, after: int) -> list[Seen]:
+        return [m for m in seen if any(t - before <= m.log_time < t + after for t in errors)]
+
+    before = run(*near, "--before", "300ms", "--count", "-q", store=store)
+    assert before.out == f"{len(wanted(3 * SECOND // 10, 0))}\n"
+    both = wanted(SECOND // 10, SECOND // 5)
+    done = run(*near, "--before", "0.1s", "--after", "200ms", "-F", "raw", "-q", store=store)
+    assert sorted(done.raw) == sorted(b"".join(m.payload for m in both))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("fetch", "-t", "odom", "--before", "5s"), "--event TOPIC PREDICATE"),
+        (("fetch", "-t", "odom", "--event", "rosout", "level > 1"), "--before or --after"),
+        (("fetch", "-t", "odom", "--event", "rosout", "levl > 1", "--after", "1s"), "levl"),
+        (("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "x"), "duration"),
+        (
+            ("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "1s", "--at", "0"),
+            "--event does not fit",
+        ),
+        (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
+        (("intervals", *GRIPPER, "--where", "position ="), "value"),
+        (("intervals", *GRIPPER, "--at-least", "soon"), "not a duration"),
+        (("intervals", *GRIPPER, "--length", "0"), "no length"),
+        (("changes", *GRIPPER, "--fields", "positoin"), "position"),
+        (("changes", *GRIPPER, "--fields", "position,"), "commas"),
+        (("changes", *GRIPPER, "--fields", "position", "--tolerance", "-1"), "tolerance"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_what_is_refused(store: Path, arguments: tuple[str, ...], said: str) -> None:
+    done = run(*arguments, store=store, code=2)
+    assert said in done.err
+    assert done.out == ""

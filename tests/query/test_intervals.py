@@ -1,0 +1,641 @@
+"""Intervals, changes and windows against loops over decoded messages, written naively."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+import hybridlog as hl
+from hybridlog import moments
+from hybridlog.query.intervals import Changing, Holding, Interval, Intervals
+from hybridlog.query.unequal import unequal
+from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.data import DATA, needs_data
+
+SECOND = 10**9
+BASE = 1_748_937_600 * SECOND
+Rows = list[tuple[int, int, int]]
+
+
+def listed(rows: np.ndarray[Any, Any]) -> Rows:
+    return [(int(b), int(e), int(m)) for b, e, m in rows]
+
+
+def intervals(*rows: tuple[str, int, int]) -> Intervals:
+    return Intervals.of((name, np.array([[begin, end, 1]], np.int64)) for name, begin, end in rows)
+
+
+# --- the parts ------------------------------------------------------------------------
+
+
+def naive_holding(said: Sequence[tuple[int, bool]], end: int, max_gap: int | None) -> Rows:
+    """Looks at every nanosecond."""
+    holds = set()
+    for now in range(end):
+        past = [(time, holding) for time, holding in said if time <= now]
+        if past and past[-1][1] and (max_gap is None or now - past[-1][0] < max_gap):
+            holds.add(now)
+    found: Rows = []
+    for now in sorted(holds):
+        if now - 1 not in holds:
+            found.append((now, now + 1, 0))
+        found[-1] = (found[-1][0], now + 1, 0)
+    return [(b, e, sum(h and b <= t < e for t, h in said)) for b, e, _ in found]
+
+
+said = st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=25).map(
+    lambda rows: sorted(rows, key=lambda row: row[0])
+)
+
+
+@given(said, st.none() | st.integers(1, 6), st.lists(st.integers(0, 25), max_size=4))
+def test_a_state_holds_until_the_next_message(
+    rows: list[tuple[int, bool]], max_gap: int | None, cuts: list[int]
+) -> None:
+    holding = Holding(max_gap)
+    found = []
+    places = [0, *sorted(min(cut, len(rows)) for cut in cuts), len(rows)]
+    for begin, end in pairwise(places):
+        part = rows[begin:end]
+        time = np.array([t for t, _ in part], np.int64)
+        found += listed(holding.add(time, np.array([h for _, h in part], np.bool_)))
+    found += listed(holding.finish(24))
+    assert found == naive_holding(rows, 24, max_gap)
+
+
+@given(st.lists(st.integers(0, 40), max_size=20), st.integers(0, 6), st.integers(1, 5))
+def test_steps_that_are_near_are_one_change(times: list[int], pause: int, block: int) -> None:
+    times = sorted(times)
+    changing = Changing(pause)
+    found = []
+    for place in range(0, len(times), block):
+        found += listed(changing.add(np.array(times[place : place + block], np.int64)))
+    found += listed(changing.finish())
+    want: Rows = []
+    for time in times:
+        if want and time - (want[-1][1] - 1) <= pause:
+            want[-1] = (want[-1][0], time + 1, want[-1][2] + 1)
+        else:
+            want.append((time, time + 1, 1))
+    assert found == want
+
+
+spans = st.lists(
+    st.tuples(st.sampled_from("ab"), st.integers(0, 20), st.integers(0, 6)).map(
+        lambda row: (row[0], row[1], row[1] + row[2])
+    ),
+    max_size=8,
+)
+
+
+def covered(rows: Iterator[Interval] | Intervals) -> set[tuple[str, int]]:
+    return {(row.recording, t) for row in rows for t in range(row.begin_ns, row.end_ns)}
+
+
+@given(spans, spans)
+def test_intervals_cover_what_sets_of_times_do(
+    one: list[tuple[str, int, int]], other: list[tuple[str, int, int]]
+) -> None:
+    left, right = intervals(*one), intervals(*other)
+    assert [row.begin_ns for row in left] == sorted(begin for _, begin, _ in one)
+    merged = left.merged()
+    assert covered(merged) == covered(left)
+    assert covered(left.common(right)) == covered(left) & covered(right)
+    for name in "ab":
+        rows = merged.of_recording(name).tolist()
+        assert rows == left.of_recording(name).tolist()
+        # Apart: none of them touches the next one.
+        assert all(high < low for (_, high), (low, _) in pairwise(rows))
+    assert len(left.widened("3ns", "2ns")) == len(one)
+    wide = {(n, t) for n, b, e in one for t in range(max(b - 3, 0), e + 2)}
+    assert covered(left.widened("3ns", "2ns")) == wide
+    inside = left.within({"a": (5, 12), "b": (0, 3)})
+    assert covered(inside) == covered(left) & {
+        *(("a", t) for t in range(5, 12)),
+        *(("b", t) for t in range(3)),
+    }
+    pieces = left.cut("2ns")
+    want = [(n, b + 2 * k, b + 2 * k + 2) for n, b, e in one for k in range((e - b) // 2)]
+    assert sorted((p.recording, p.begin_ns, p.end_ns) for p in pieces) == sorted(want)
+    assert len(left.at_least("4ns")) == sum(e - b >= 4 for _, b, e in one)
+
+
+def test_intervals_as_a_frame() -> None:
+    found = intervals(("b", BASE, BASE + 5), ("a", BASE - 1, BASE + 1))
+    frame = found.to_pandas()
+    assert list(frame.columns) == ["recording", "begin", "end", "duration", "messages"]
+    assert frame["recording"].tolist() == ["a", "b"]
+    assert frame["begin"].tolist() == [pd.Timestamp(t, tz="UTC") for t in (BASE - 1, BASE)]
+    assert frame["end"].iloc[1] == pd.Timestamp(BASE + 5, tz="UTC")
+    assert frame["duration"].tolist() == [pd.Timedelta(2), pd.Timedelta(5)]
+    assert found.duration_ns == 7
+    assert (found[0].recording, found[-1].end_ns) == ("a", BASE + 5)
+    assert "5ns" in repr(found[1])
+    assert "2, 7ns" in repr(found)
+    empty = intervals().to_pandas()
+    assert len(empty) == 0
+    assert empty.dtypes.tolist() == frame.dtypes.tolist()
+
+
+def test_intervals_refuse_what_cannot_be() -> None:
+    found = intervals(("a", 0, 10**15))
+    with pytest.raises(UsageError, match="no length"):
+        found.cut(0)
+    with pytest.raises(UsageError, match="intervals"):
+        found.cut("1ns")
+    with pytest.raises(TimeError):
+        found.at_least("soon")
+    assert found.widened(after=timedelta(days=100_000))[0].end_ns <= 2**63 - 1
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, -0.0, 1.0, 1.25, math.nan, math.inf, -math.inf]),
+            st.sampled_from([b"", b"a", b"b", b"ab"]),
+            st.lists(st.integers(0, 1), max_size=3),
+        ),
+        min_size=2,
+        max_size=12,
+    ),
+    st.sampled_from([0.0, 0.25]),
+)
+def test_rows_differ_as_their_values_do(
+    rows: list[tuple[float, bytes, list[int]]], tolerance: float
+) -> None:
+    texts, lists = [row[1] for row in rows], [row[2] for row in rows]
+    column = Records(
+        {
+            "x": Scalars(np.array([row[0] for row in rows])),
+            "s": Strings(
+                np.frombuffer(b"".join(texts), np.uint8),
+                np.cumsum([0, *map(len, texts)]).astype(np.int64),
+            ),
+            "v": Arrays(
+                Scalars(np.array([n for row in lists for n in row], np.int64)),
+                np.cumsum([0, *map(len, lists)]).astype(np.int64),
+            ),
+        },
+        len(rows),
+    )
+    one = np.arange(1, len(rows))
+    found = unequal(column, one, one - 1, tolerance).tolist()
+
+    def same(a: float, b: float) -> bool:
+        return a == b or (a != a and b != b) or abs(a - b) <= tolerance
+
+    want = [not (same(a[0], b[0]) and a[1:] == b[1:]) for a, b in zip(rows[1:], rows, strict=False)]
+    assert found == want
+
+
+# --- in a store -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Said:
+    """A message of the model: what was written, and when."""
+
+    time: int
+    topic: str
+    value: dict[str, Any]
+
+
+class Model:
+    """Two recordings that overlap in time, and the naive answers about them."""
+
+    def __init__(self, logs: dict[str, list[Said]]) -> None:
+        self.logs = {name: sorted(log, key=lambda m: m.time) for name, log in logs.items()}
+
+    def of(self, name: str, topic: str = "/state") -> list[Said]:
+        return [m for m in self.logs[name] if m.topic == topic]
+
+    def span(self, name: str) -> tuple[int, int]:
+        times = [m.time for m in self.logs[name]]
+        return min(times), max(times) + 1
+
+    def states(
+        self, holds: Callable[[Said], bool], between: tuple[int, int], max_gap: int | None
+    ) -> set[tuple[str, int]]:
+        """Every second at whose beginning the state holds."""
+        found = set()
+        for name in self.logs:
+            start, end = self.span(name)
+            for now in range(max(start, between[0]), min(end, between[1]), SECOND):
+                past = [m for m in self.of(name) if m.time <= now]
+                if past and holds(past[-1]) and (max_gap is None or now - past[-1].time < max_gap):
+                    found.add((name, now))
+        return found
+
+    def steps(
+        self, key: Callable[[Said], object], between: tuple[int, int]
+    ) -> set[tuple[str, int]]:
+        found = set()
+        for name in self.logs:
+            mine = self.of(name)
+            for one, other in zip(mine[1:], mine, strict=False):
+                if key(one) != key(other) and between[0] <= one.time < between[1]:
+                    found.add((name, one.time))
+        return found
+
+    def near(
+        self, event: Callable[[Said], bool], before: int, after: int
+    ) -> list[tuple[int, str, str]]:
+        found = []
+        for name, log in self.logs.items():
+            start = self.span(name)[0]
+            moments = [m.time for m in self.of(name) if event(m)]
+            found += [
+                (m.time, name, m.topic)
+                for m in log
+                if any(max(t - before, start) <= m.time < t + after for t in moments)
+            ]
+        return sorted(found)
+
+
+values = st.fixed_dictionaries(
+    {"s": st.integers(0, 2)},
+    optional={
+        "x": st.sampled_from([1, 1.0, 1.5, 2]),
+        "name": st.sampled_from(["", "a", "b"]),
+        "v": st.sampled_from([[], [1.0], [1.0, 2.0], [0.5] * 40]),
+    },
+)
+log = st.lists(
+    st.tuples(st.integers(0, 12), st.sampled_from(["/state", "/state", "/other"]), values),
+    min_size=1,
+    max_size=24,
+)
+
+
+def write_log(path: Path, said: list[tuple[int, str, dict[str, Any]]], mark: int) -> list[Said]:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("State", "jsonschema", b"{}")
+        # The mark makes equal logs different ones.
+        metadata = {"mark": str(mark)}
+        channels: dict[str, int] = {}
+        for topic in ("/state", "/other"):
+            channels[topic] = writer.register_channel(topic, "json", schema, metadata)
+        found = []
+        for second, topic, value in said:
+            time = BASE + second * SECOND
+            writer.add_message(channels[topic], time, json.dumps(value).encode(), time)
+            found.append(Said(time, topic, value))
+        writer.finish()  # type: ignore[no-untyped-call]
+    return found
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    place = tmp_path_factory.mktemp("intervals") / "store"
+    with hl.open(place, create=True, require_database=True) as opened:
+        yield opened
+
+
+_marks = iter(range(10**6))
+
+
+def recorded(store: hl.Store, logs: dict[str, Any]) -> Model:
+    """Put logs in the place of what the store has."""
+    for entry in store.recordings():
+        store.remove(entry.id)
+    said = {}
+    for name, rows in logs.items():
+        path = store.directory.path / f"{name}.mcap"
+        said[name] = write_log(path, rows, next(_marks))
+        store.record(path, name=name, settings=SegmentSettings(chunk_size=1024))
+    return Model(said)
+
+
+HOLDS = {
+    "s == 1": lambda m: m.value["s"] == 1,
+    "s >= 1 and name != 'a'": lambda m: m.value["s"] >= 1 and m.value.get("name", "a") != "a",
+    "x > 1": lambda m: m.value.get("x", 0) > 1,
+}
+
+
+def seconds(found: Intervals) -> set[tuple[str, int]]:
+    """The whole seconds at which intervals hold."""
+    return {
+        (row.recording, t)
+        for row in found
+        for t in range(-(-row.begin_ns // SECOND) * SECOND, row.end_ns, SECOND)
+    }
+
+
+several = settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+@several
+@given(
+    logs=st.fixed_dictionaries({"a": log, "b": log}),
+    text=st.sampled_from(sorted(HOLDS)),
+    between=st.none() | st.tuples(st.integers(-1, 12), st.integers(1, 9)),
+    gap=st.none() | st.integers(1, 4),
+    batch=st.sampled_from([1, 2, 50_000]),
+)
+def test_what_a_store_says_is_what_a_loop_says(
+    store: hl.Store,
+    monkeypatch: pytest.MonkeyPatch,
+    logs: dict[str, Any],
+    text: str,
+    between: tuple[int, int] | None,
+    gap: int | None,
+    batch: int,
+) -> None:
+    monkeypatch.setattr(moments, "_BATCH", batch)
+    model = recorded(store, logs)
+    if "/state" not in store.topics():
+        return
+    query = store.topic("/state")
+    span = (0, 2**62)
+    if between is not None:
+        span = BASE + between[0] * SECOND, BASE + (between[0] + between[1]) * SECOND
+        query = query.between(f"{span[0]}ns", f"{span[1]}ns")
+        names = {r.id for r in store.recordings() if r.id in query.recording_ids}
+        if all(not _meet(model.span(name), span) for name in names):
+            with pytest.raises(TimeError, match="Nothing was recorded"):
+                query.intervals()
+            return
+
+    holds = HOLDS[text]
+    max_gap = None if gap is None else f"{gap}s"
+    found = query.where(text).intervals(max_gap=max_gap)
+    limit = None if gap is None else gap * SECOND
+    assert seconds(found) == model.states(holds, span, limit)
+    for row in found:
+        # Whole: what is before and after is another state, or not asked about.
+        start, end = model.span(row.recording)
+        assert max(start, span[0]) <= row.begin_ns < row.end_ns <= min(end, span[1])
+        mine = [m for m in model.of(row.recording) if row.begin_ns <= m.time < row.end_ns]
+        assert row.messages == sum(holds(m) for m in mine)
+    assert len(found) == len(found.merged())
+    assert query.where(text).intervals(max_gap=max_gap, at_least="2s", length="2s").duration_ns == (
+        sum(row.duration_ns // (2 * SECOND) * 2 * SECOND for row in found)
+    )
+
+    for fields in (("s",), ("x",), ("name", "v"), ("s", "x", "name", "v")):
+        if not any(f in m.value for m in model.of("a") + model.of("b") for f in fields):
+            continue
+        steps = model.steps(_key(fields), span)
+        apart = query.changes(*fields, pause=0)
+        assert {(row.recording, row.begin_ns) for row in apart} == steps, fields
+        joined = query.changes(*fields, pause="2s")
+        assert sum(row.messages for row in joined) == sum(row.messages for row in apart)
+        assert len(joined) == sum(
+            not any((name, t - back * SECOND) in steps for back in (1, 2)) for name, t in steps
+        )
+
+
+def _meet(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    return one[0] < other[1] and other[0] < one[1]
+
+
+def _key(fields: Sequence[str]) -> Callable[[Said], object]:
+    def key(message: Said) -> object:
+        found = []
+        for name in fields:
+            value = message.value.get(name)
+            if isinstance(value, list) and len(value) > 32:
+                value = "long"
+            found.append(json.dumps(float(value) if isinstance(value, int | float) else value))
+        return found
+
+    return key
+
+
+@several
+@given(
+    logs=st.fixed_dictionaries({"a": log, "b": log}),
+    before=st.integers(0, 3),
+    after=st.integers(0, 3),
+    pick=st.tuples(st.integers(1, 3), st.none() | st.integers(0, 5), st.booleans()),
+)
+def test_messages_near_events_are_what_a_loop_finds(
+    store: hl.Store,
+    logs: dict[str, Any],
+    before: int,
+    after: int,
+    pick: tuple[int, int | None, bool],
+) -> None:
+    model = recorded(store, logs)
+    if "/state" not in store.topics() or not before + after:
+        return
+    events = store.topic("/state").where("s == 2")
+    want = model.near(lambda m: m.value["s"] == 2, before * SECOND, after * SECOND)
+    everything = store.all_topics()
+    near = everything.around(events, f"{before}s", timedelta(seconds=after))
+    got = [(m.log_time_ns, m.recording, m.topic) for m in near]
+    assert sorted(got) == want
+    keys = {r.id: r.key for r in store.recordings()}
+    places = [(time, keys[name]) for time, name, _ in got]
+    assert places == sorted(places)
+    assert near.count() == len(want)
+    assert [d["_meta"]["t"] for d in near.documents()] == [w[0] for w in want]
+    assert [m.log_time_ns for m in near.reverse()] == [w[0] for w in want][::-1]
+    windows = events.windows(f"{before}s", f"{after}s")
+    assert len(windows) == events.count()
+    assert [m.seq for m in everything.during(windows)] == [m.seq for m in near]
+
+    state = store.topic("/state").during(windows)
+    times = [w[0] for w in want if w[2] == "/state"]
+    assert (state.to_pandas().index.asi8 if times else np.array([])).tolist() == times
+    assert state.fields("s").to_arrow().num_rows == len(times) == state.where("s >= 0").count()
+    assert [m.log_time_ns for m in state.where("s >= 0")] == times
+    step, most, reverse = pick
+    thinned = times[:: -1 if reverse else 1][::step][:most]
+    query = state.every(step)
+    query = query if most is None else query.limit(most)
+    query = query.reverse() if reverse else query
+    assert [m.log_time_ns for m in query] == thinned
+    assert query.count() == len(thinned)
+    assert [d["_meta"]["t"] for d in query.documents()] == thinned
+    # What holds during the windows is what holds, and is in a window.
+    both = seconds(state.where("s >= 1").intervals())
+    assert both == seconds(store.topic("/state").where("s >= 1").intervals()) & seconds(windows)
+
+
+def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
+    logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
+    model = recorded(store, {"a": logs})
+    database = store.database_for("the test")
+    database.create_index("state", [("s", 1)])
+    query = store.topic("/state").where("s > 2")
+    assert [d["s"] for d in query.documents()] == [9, 8, 7, 6, 5, 4, 3]
+    assert [d["s"] for d in query.reverse().documents()] == [3, 4, 5, 6, 7, 8, 9]
+    assert len(query.intervals()) == 1
+    assert len(query.changes("s", pause=0)) == 6
+    assert seconds(query.intervals()) == model.states(lambda m: m.value["s"] > 2, (0, 2**62), None)
+    database.drop("state")
+
+
+@pytest.fixture
+def plain(store: hl.Store) -> hl.Store:
+    rows = [(second, "/state", {"s": second % 2, "x": 1.5}) for second in range(10)]
+    recorded(store, {"a": [*rows, (20, "/other", {"s": 0})]})
+    return store
+
+
+def test_what_held_before_the_range_holds_when_it_begins(plain: hl.Store) -> None:
+    query = plain.topic("/state").where("s == 1").between("+1500ms", "+2s")
+    (found,) = query.intervals()
+    assert (found.begin_ns, found.end_ns) == (BASE + 3 * SECOND // 2, BASE + 2 * SECOND)
+    assert found.messages == 0
+    assert query.count() == 0
+
+
+def test_the_last_state_holds_until_the_recording_ends(plain: hl.Store) -> None:
+    last = plain.topic("/state").where("s == 1").intervals()[-1]
+    assert (last.begin_ns, last.end_ns) == (BASE + 9 * SECOND, BASE + 20 * SECOND + 1)
+    believed = plain.topic("/state").where("s == 1").intervals(max_gap="2s")[-1]
+    assert believed.end_ns == BASE + 11 * SECOND
+    (alive,) = plain.topic("/state").intervals(max_gap="1s")
+    assert (alive.begin_ns, alive.end_ns, alive.messages) == (BASE, BASE + 10 * SECOND, 10)
+
+
+def test_nothing_found_is_no_error(plain: hl.Store) -> None:
+    query = plain.topic("/state")
+    none = query.where("s == 7")
+    assert len(none.intervals()) == 0
+    assert list(none.windows("5s")) == []
+    assert len(query.changes("x")) == 0
+    nothing = plain.all_topics().before(none, "5min")
+    assert nothing.count() == 0
+    assert list(nothing) == []
+    assert list(nothing.documents()) == []
+    assert nothing.during(query.intervals()).count() == 0
+    assert len(query.during(none.intervals()).intervals()) == 0
+
+
+def test_a_message_in_two_windows_is_given_once(plain: hl.Store) -> None:
+    events = plain.topic("/state").where("s == 1")
+    near = plain.topic("/state").before(events, "3s")
+    assert near.count() == len(list(near)) == 9
+    assert len(events.windows("3s")) == 5
+    assert len(events.windows("3s").merged()) == 1
+
+
+def test_times_within_windows_by_another_clock(plain: hl.Store) -> None:
+    windows = plain.topic("/state").where("s == 1").windows(after="1s")
+    query = plain.topic("/state").during(windows)
+    assert query.between("+2s", "+6s").count() == 2
+    assert [m.log_time_ns for m in query.between("+2s", "+6s")] == [
+        BASE + 3 * SECOND,
+        BASE + 5 * SECOND,
+    ]
+    assert query.between("+2s", "+6s").clock("publish").count() == 2
+    assert len(list(query.between("+2s", "+6s").clock("publish"))) == 2
+
+
+def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
+    query = plain.topic("/state").where("s == 1")
+    for _ in range(2):
+        query.intervals()
+        assert query.counters.documents_read == 10
+        assert query.counters.elapsed_s > 0
+    query.changes("s", "x")
+    assert query.counters.documents_read == 5
+    assert query.counters.bytes_read == query.counters.chunks_read == 0
+    near = plain.topic("/state").before(query, "1s")
+    assert near.to_pandas().attrs["hybridlog"]["chunks_read"] <= 2
+
+
+def test_without_mongodb_windows_still_choose(plain: hl.Store) -> None:
+    windows = plain.topic("/state").where("s == 1").windows("1s")
+    away = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
+    with hl.open(plain.directory.path, mongo=away) as alone:
+        query = alone.all_topics().during(windows)
+        assert query.count() == len(list(query)) == 5
+
+
+def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
+    state = plain.topic("/state")
+    for wrong in (state.limit(1), state.every(2), state.reverse()):
+        with pytest.raises(UsageError, match="do not fit"):
+            wrong.intervals()
+        with pytest.raises(UsageError, match="do not fit"):
+            wrong.changes("s")
+    with pytest.raises(UsageError, match="name one of /other, /state"):
+        plain.all_topics().intervals()
+    with pytest.raises(UsageError, match="publish does not fit"):
+        state.clock("publish").between("+1s", "+2s").intervals()
+    with pytest.raises(UsageError, match="no time"):
+        state.intervals(max_gap=0)
+    with pytest.raises(UsageError, match="Which fields"):
+        state.changes()
+    with pytest.raises(UsageError, match="tolerance"):
+        state.changes("s", tolerance=math.nan)
+    with pytest.raises(UsageError, match="How long"):
+        state.windows()
+    with pytest.raises(UsageError, match="one topic"):
+        plain.all_topics().limit(1).windows("1s")
+    with pytest.raises(TimeError, match="not a duration"):
+        state.windows("soon")
+    with pytest.raises(TimeError, match="Nothing was recorded"):
+        state.between("2020-01-01", "2020-01-02").intervals()
+    with pytest.raises(UsageError, match="during"):
+        plain.topic("/state").during(state.intervals()).at("+1s")
+    with pytest.raises(WhereError):
+        state.where("s <").intervals()
+
+
+# --- real logs ------------------------------------------------------------------------
+
+
+@needs_data
+def test_a_real_log_against_a_loop(tmp_path: Path) -> None:
+    path = DATA / "real" / "auv_ros2.mcap"
+    topic = "/coug2/battery/data"
+    seen: list[tuple[int, float]] = []
+    errors: list[int] = []
+    times: list[int] = []
+    with AnyReader([path]) as reader:
+        for connection, time, raw in reader.messages():
+            times.append(time)
+            if connection.topic == topic:
+                seen.append((time, reader.deserialize(raw, connection.msgtype).voltage))
+            if connection.topic == "/rosout":
+                errors += [time] * (reader.deserialize(raw, connection.msgtype).level >= 30)
+    middle = float(np.median([v for _, v in seen]))
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(path)
+        query = store.topic(topic)
+        found = query.where(f"voltage < {middle!r}").intervals()
+        want = []
+        ends = [*[t for t, _ in seen][1:], max(times) + 1]
+        for (time, value), end in zip(seen, ends, strict=True):
+            if value < middle and want and want[-1][1] == time:
+                want[-1] = (want[-1][0], end)
+            elif value < middle:
+                want.append((time, end))
+        assert len(want) > 10
+        assert [(row.begin_ns, row.end_ns) for row in found] == want
+
+        steps = [t for (t, v), (_, w) in zip(seen[1:], seen, strict=False) if v != w]
+        assert [row.begin_ns for row in query.changes("voltage", pause=0)] == steps
+        assert errors
+        before = store.all_topics().before(store.topic("/rosout").where("level >= 30"), "5s")
+        assert [m.log_time_ns for m in before] == sorted(
+            t for t in times if any(e - 5 * SECOND <= t < e for e in errors)
+        )
+        with pytest.raises(TopicError, match="voltag"):
+            query.changes("voltag")
