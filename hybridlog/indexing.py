@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -153,6 +154,8 @@ class Lag:
         self._recording = recording
         self._behind = behind
         self._reader: SegmentReader | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-reread")
+        self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
 
     def wait(self) -> None:
         """Return once the recorder can spare the processor."""
@@ -161,14 +164,28 @@ class Lag:
 
     def read(self, chunk: _Forgotten) -> StoredChunk:
         """Read a chunk back from its segment, which may still be growing."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is None or ahead[0] is not chunk:
+            return self._thread.submit(self._read, chunk).result()
+        return ahead[1].result()
+
+    def read_ahead(self, chunk: _Forgotten) -> None:
+        """Start to read the chunk that is asked for next."""
+        self._ahead = chunk, self._thread.submit(self._read, chunk)
+
+    def _read(self, chunk: _Forgotten) -> StoredChunk:
         if self._reader is None or self._reader.number != chunk.segment:
-            self.close()
+            self._release()
             self._reader = self._open(chunk.segment)
         self._reader.grow()
         return self._reader.read_chunk(chunk.place)
 
     def close(self) -> None:
-        """Give the segment back."""
+        """Give everything back."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+        self._release()
+
+    def _release(self) -> None:
         if self._reader is not None:
             self._reader.close()
             self._reader = None
@@ -222,6 +239,7 @@ class IndexWriter:
         self.entries: list[ChunkEntry] = []
         self._indexer = indexer
         self._lag = lag
+        self._forgotten: deque[_Forgotten] = deque()
         self._database = database
         self._catalog = Catalog(database)
         self._collections: set[str] = set()
@@ -246,8 +264,8 @@ class IndexWriter:
                 int(chunk.batch.log_time.max()),
                 (),
             )
-            forgotten = _Forgotten(chunk.segment, place, len(chunk.batch))
-            self._maker.submit(self._remember, forgotten, channels).add_done_callback(self._done)
+            self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
+            self._maker.submit(self._remember, channels).add_done_callback(self._done)
             return
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(self._made)
@@ -274,13 +292,19 @@ class IndexWriter:
         if self._lag is not None:
             self._lag.close()
 
-    def _remember(self, chunk: _Forgotten, channels: Mapping[int, Channel]) -> None:
+    def _remember(self, channels: Mapping[int, Channel]) -> None:
+        """Make documents of the first forgotten chunk, while the next one is read."""
         assert self._lag is not None
+        place = self._forgotten.popleft()
         if self.failure is not None:
             with self._lock:
-                self.missed += chunk.messages
+                self.missed += place.messages
             return
-        self._make(self._lag.read(chunk), channels)
+        self._lag.wait()
+        chunk = self._lag.read(place)
+        if self._forgotten:
+            self._lag.read_ahead(self._forgotten[0])
+        self._make(chunk, channels)
 
     def _make(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         if self.failure is not None:
