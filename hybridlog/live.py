@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Self
@@ -34,7 +35,8 @@ _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and is no
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.02  # the writing thread looks so often when little comes
-_BEHIND = 8 << 20  # bytes not yet written from which the index waits
+_BEHIND = 8 << 20  # bytes not yet written from which all that can wait does
+_CALM_S = 1.0  # and for so long afterwards, or it would be the cause of the next delay
 _MOST_NS = 1 << 63
 
 
@@ -97,13 +99,14 @@ class LiveRecording:
         self._started = time.monotonic()
         self._ids: dict[Channel, int] = {}
         self._channels: list[Channel] = []
-        self._inbox: list[_Message] = []
+        self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
         self._unwritten = 0
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
         self._wake = threading.Event()
         self._ended = False
+        self._calm = 0.0
         self._failure: BaseException | None = None
         self._report: RecordReport | None = None
         self._held = ExitStack()
@@ -225,7 +228,9 @@ class LiveRecording:
             raise UsageError(f"The recording {self.id!r} was closed.")
 
     def _behind(self) -> bool:
-        return self._unwritten > _BEHIND and not self._ended
+        if self._unwritten > _BEHIND:
+            self._calm = time.monotonic() + _CALM_S
+        return time.monotonic() < self._calm and not self._ended
 
     def _stop(self) -> None:
         with self._lock:
@@ -258,34 +263,38 @@ class LiveRecording:
     def _take(self) -> None:
         """Lay what has come into chunks."""
         with self._lock:
-            inbox, self._inbox, self._inbox_bytes = self._inbox, [], 0
-        if not inbox:
-            return
-        for group in _groups(inbox):
-            size = sum(len(message.payload) for message in group)
-            if len(group) == 1:
-                one = group[0]
-                channel = self._channels[one.channel]
-                self._capture.writer.append_one(
-                    channel, one.payload, one.log_time, one.publish_time, one.sequence
-                )
-            else:
-                self._capture.writer.append(_batch(group), self._channels)
+            inbox, self._inbox, self._inbox_bytes = self._inbox, deque(), 0
+        while inbox:
+            size = self._lay_down(_next_group(inbox))
+            # What was laid down is not in memory any more, so there is room for as much.
             with self._lock:
                 self._unwritten -= size
                 self._room.notify()
 
+    def _lay_down(self, group: Sequence[_Message]) -> int:
+        """Give some messages to the writer; returns the bytes of their payloads."""
+        if len(group) > 1:
+            batch = _batch(group)
+            self._capture.writer.append(batch, self._channels)
+            return batch.payload_bytes
+        (one,) = group
+        channel = self._channels[one.channel]
+        self._capture.writer.append_one(
+            channel, one.payload, one.log_time, one.publish_time, one.sequence
+        )
+        return len(one.payload)
 
-def _groups(messages: Sequence[_Message]) -> Iterator[Sequence[_Message]]:
-    """Runs of messages for a batch each, in order."""
-    start = size = 0
-    for at, message in enumerate(messages):
-        length = len(message.payload)
-        if at > start and (length >= _LARGE or size >= _MOST_JOINED):
-            yield messages[start:at]
-            start, size = at, 0
-        size += _MOST_JOINED if length >= _LARGE else length
-    yield messages[start:]
+
+def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:
+    """Take the first messages: one large one, or as many smaller ones as make a batch."""
+    group = [inbox.popleft()]
+    size = len(group[0].payload)
+    if size >= _LARGE:
+        return group
+    while inbox and size < _MOST_JOINED and len(inbox[0].payload) < _LARGE:
+        group.append(inbox.popleft())
+        size += len(group[-1].payload)
+    return group
 
 
 def _batch(messages: Sequence[_Message]) -> Batch:
