@@ -110,6 +110,10 @@ class ChunkIndexer:
         )
         return documents, entry
 
+    def prepare(self, channel: Channel) -> None:
+        """Understand a channel's definition before its first message comes."""
+        codec_for(channel, array_limit=self._array_limit).paths()
+
     def reason(self, channel_id: int, channel: Channel) -> str | None:
         """Why a channel's fields are not in the index, None when they are."""
         return self._part(channel_id, channel)[0].reason

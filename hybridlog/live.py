@@ -140,6 +140,15 @@ class LiveRecording:
         """Close it."""
         self.close()
 
+    def expect(self, *channels: Channel) -> None:
+        """Prepare for channels before their first message.
+
+        A definition takes some ten milliseconds to understand, which are better spent
+        while nothing comes yet.
+        """
+        for channel in channels:
+            self._capture.indexer.prepare(channel)
+
     def write(
         self,
         channel: Channel,

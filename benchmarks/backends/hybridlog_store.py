@@ -71,7 +71,8 @@ class Hybridlog(Backend):
         except HybridlogError as error:
             raise BackendMissingError(f"hybridlog: {error}") from error
         if fresh:
-            self._start()
+            # As a recorder would that has just subscribed.
+            self._start().expect(*channels)
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         try:
