@@ -1,8 +1,11 @@
-"""`python -m benchmarks COMMAND …`: the studies, their report, and the speed targets."""
+"""`python -m benchmarks COMMAND …`: the studies, their report, targets, hot paths."""
 
 from __future__ import annotations
 
 import sys
+from importlib import import_module
+
+_WITH_OPTIONS_OF_THEIR_OWN = ("speed", "micro")
 
 
 def main(arguments: list[str], program: str = "python -m benchmarks") -> int:
@@ -16,10 +19,9 @@ def main(arguments: list[str], program: str = "python -m benchmarks") -> int:
         The exit code: 0; 1 when a run failed or answers differ; 2 for wrong usage; 130
         after Ctrl-C; and those of `hybridlog` for what its parts raise.
     """
-    if arguments[:1] == ["speed"]:
-        from benchmarks.speed.command import main as speed
-
-        return speed(arguments[1:])
+    if arguments and arguments[0] in _WITH_OPTIONS_OF_THEIR_OWN:
+        module = import_module(f"benchmarks.{arguments[0]}.command")
+        return int(module.main(arguments[1:]))
     from benchmarks.command import main as command
 
     return command(arguments, program)

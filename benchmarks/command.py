@@ -371,6 +371,19 @@ def speed(
     raise typer.Exit(command(arguments or []))
 
 
+@app.command(
+    add_help_option=False,
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
+def micro(
+    arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
+) -> None:
+    """The hot paths, one at a time, and against another revision."""
+    from benchmarks.micro.command import main as command
+
+    raise typer.Exit(command(arguments or []))
+
+
 def _go(choices: object, *, only_list: bool) -> None:
     from benchmarks import campaign
 

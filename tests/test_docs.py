@@ -501,7 +501,9 @@ def public(thing: type) -> dict[str, Any]:
 
 
 def documented_classes() -> list[type]:
+    from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance import Finding, Tended, Verification
+    from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.plan import Counters
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
@@ -509,7 +511,9 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Tended]
-    return [hl.Store, hl.Query, hl.Message, hl.RecordOptions, SegmentSettings, *results, *checks]
+    asking = [hl.Query, hl.Message, Intervals, Interval]
+    recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
+    return [hl.Store, *asking, *recording, *results, *checks]
 
 
 @pytest.mark.parametrize("thing", documented_classes(), ids=lambda c: c.__name__)

@@ -7,19 +7,17 @@ soon as it is known, so that those of a side that is ended are kept.
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.harness import usage
-from benchmarks.harness.logger import StoppedError
+from benchmarks.harness.logger import StoppedError, ended_by_signals
 from benchmarks.loads.base import Load
 from benchmarks.questions import tasks
 from benchmarks.questions.base import QUESTIONS, SLOW_S, Asker, Reading
@@ -116,7 +114,7 @@ def _filled(
     opened = Load.open(Path(load))
     kind = _named(backend)
     values: Values = {"status": "ok", "reason": "", "spin_ms": usage.spin_ms()}
-    with _ended_by_signals(), Path(results).open("w", encoding="utf-8") as out:
+    with ended_by_signals(), Path(results).open("w", encoding="utf-8") as out:
         try:
             kind.check()
             with _open(kind, directory, opened) as system:
@@ -131,22 +129,6 @@ def _filled(
         except (BackendFailedError, StoppedError) as error:
             values |= {"status": "failed", "reason": str(error)}
     return values
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """SIGTERM ends the block from within, so that what it has started is ended, too."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        # Once: the second one must not disturb the end.
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise StoppedError("the run was ended from outside")
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
