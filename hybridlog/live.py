@@ -21,7 +21,7 @@ import numpy as np
 
 from hybridlog.capture import Capture
 from hybridlog.recorder import RecordReport
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
@@ -164,7 +164,8 @@ class LiveRecording:
             channel: The same object for all messages of a channel.
             payload: The serialized message, of any size. It must not change afterwards.
             log_time: When it was received, ns since the epoch; None for now.
-            publish_time: When it was sent, ns since the epoch; None when not known.
+            publish_time: When it was sent, ns since the epoch; None for the log time, which
+                is what a channel without publish times has.
             sequence: The sender's number, 0 to 2³²-1.
 
         Raises:
@@ -264,7 +265,8 @@ class LiveRecording:
                     self._capture.writer.flush_older(interval * 3 / 4)
                     self._capture.index.nudge()
                     flushed = time.monotonic()
-        except (HybridlogError, OSError, MemoryError) as error:
+        except BaseException as error:
+            # Whatever it is: those who write and close must hear of it, or wait for ever.
             with self._lock:
                 self._failure = error
                 self._room.notify_all()

@@ -161,6 +161,24 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         assert again.recordings()[0].status == "recovered"
 
 
+def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    recording = store.start("talk", budget_bytes=1 << 20)
+    monkeypatch.setattr("hybridlog_storage.segment_writer.RecordingWriter.append_one", broken)
+    own = channel("/talk")
+
+    def until_refused() -> None:
+        while True:
+            recording.write(own, text(b"x" * 100_000))
+
+    with pytest.raises(ZeroDivisionError):
+        until_refused()
+    with pytest.raises(ZeroDivisionError):
+        recording.close()
+
+
 KILLED = """
 import sys, time
 import hybridlog as hl

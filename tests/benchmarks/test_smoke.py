@@ -1,0 +1,72 @@
+"""The studies as a user runs them, tiny: they end, all is stored, and the answers agree."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.backends.registry import BACKENDS
+from benchmarks.questions.base import QUESTIONS
+from benchmarks.samples import Journal, Sample
+from tests.imports import ROOT
+
+TINY = ["--sizes", "5000", "--rates", "64", "--topics", "3", "--messages", "20"]
+
+
+def run(out: Path, *arguments: str) -> list[Sample]:
+    """Run a study to its end; what it has written down."""
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", *arguments, "--quick", "--out", str(out)],
+        cwd=ROOT,
+        env={**os.environ, "TERM": "dumb"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    for name in ("report.md", "report.html"):
+        assert "quick" in (out / name).read_text("utf-8").lower(), name
+    return list(Journal(out).samples.values())
+
+
+def test_every_backend_stores_what_it_says(tmp_path: Path) -> None:
+    samples = run(tmp_path, "throughput", "--no-ceilings", *TINY)
+    assert {sample.backend for sample in samples} == set(BACKENDS)
+    for sample in samples:
+        values = sample.values
+        assert sample.status == "ok", (sample.backend, sample.reason)
+        assert values["published"] == 60
+        assert values["errors"] == values["lost"] == 0, sample.backend
+        # A slow machine may drop; what is not dropped must be there.
+        assert values["persisted"] + values["dropped"] == 60, sample.backend
+        assert values["persisted"] > 0, sample.backend
+
+
+@pytest.mark.timeout(600)
+def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
+    only = ["--backends", "sqlite_json1,hybridlog", "--seconds", "0.3"]
+    samples = run(tmp_path, "all", *TINY, *only)
+    assert {sample.study for sample in samples} == {
+        "throughput",
+        "ceiling",
+        "persistence",
+        "speed-up",
+        "queries",
+        "reading",
+    }
+    assert {sample.status for sample in samples} == {"ok"}
+    asked = {(s.backend, s.case["question"]) for s in samples if s.study == "queries"}
+    rows = ("sqlite_json1", "hybridlog", "hybridlog_api")
+    assert asked == {(row, question) for row in rows for question in QUESTIONS}
+    answers: dict[str, set[str]] = {}
+    for sample in samples:
+        if sample.study == "queries":
+            answers.setdefault(sample.case["question"], set()).add(str(sample.values["answer"]))
+    assert {question: len(found) for question, found in answers.items()} == dict.fromkeys(
+        QUESTIONS, 1
+    )
