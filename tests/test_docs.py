@@ -521,6 +521,8 @@ def test_every_public_name_is_described(thing: type) -> None:
     text = sections(DOCS / "api.md", 2)[thing.__name__]
     rows = dict(re.findall(r"^\| `(\w+)(\([^`]*\))?`", text, flags=re.MULTILINE))
     members = public(thing)
+    if thing.__name__ == "LiveRecording":
+        members["id"] = None
     if thing is hl.Store:
         members |= dict.fromkeys(("directory", "database", "without_database", "tended"))
     assert set(rows) == set(members), set(rows) ^ set(members)

@@ -272,7 +272,12 @@ def hybridlog_payloads(backend: Any) -> list[tuple[str, int, bytes]]:
     ]
 
 
-PAYLOADS = {"mcap": mcap_payloads, "bagfile": bag_payloads, "hybridlog": hybridlog_payloads}
+PAYLOADS = {
+    "mcap": mcap_payloads,
+    "bagfile": bag_payloads,
+    "hybridlog": hybridlog_payloads,
+    "hybridlog_recorder": hybridlog_payloads,
+}
 
 
 def documents_of(backend: Any) -> dict[str, list[Any]]:
@@ -418,7 +423,7 @@ def test_registry() -> None:
     assert list(BACKENDS) == [
         *("nothing", "mcap", "bagfile", "mongo_json", "mongo_json_indexed"),
         *("postgres_autocommit", "postgres_tuned", "postgres_tuned_indexed"),
-        *("sqlite_udf", "sqlite_json1", "hybridlog"),
+        *("sqlite_udf", "sqlite_json1", "hybridlog", "hybridlog_recorder"),
     ]
     for name, backend in BACKENDS.items():
         assert backend.name == name
