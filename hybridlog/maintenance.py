@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from hybridlog import field_indexes
 from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
 from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry, schema_hash
@@ -190,11 +191,13 @@ def reindex(
         for recording_id in directory.recording_ids():
             if not held.enter_context(directory.writing(recording_id)):
                 raise being_written(recording_id)
+        fields = field_indexes.of_collections(database)
         for collection in database.list_collections():
             if collection != STORE_MARK:
                 database.drop(collection)
         catalog = Catalog(database)
         catalog.prepare()
+        field_indexes.make_again(database, fields)
         for recording_id in directory.recording_ids():
             if directory.segments(recording_id):
                 try:

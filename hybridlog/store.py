@@ -9,7 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from hybridlog import maintenance
+from hybridlog import field_indexes, maintenance
+from hybridlog.field_indexes import FieldIndex
 from hybridlog.query.chunk_lists import ChunkLists
 from hybridlog.query.topics import resolve
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
@@ -413,6 +414,45 @@ class Store:
             found = maintenance.reindex(self.directory, database, progress)
         self.refresh()
         return found
+
+    def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
+        """Let MongoDB find messages by the values of fields without looking at all of them.
+
+        Args:
+            topic: Full name, short name, glob, or `re:` and a regular expression.
+            fields: Of the messages, or `_meta.inserted_at` and its like; the first one
+                should be asked for a value or a range, the others narrow that down.
+
+        Returns:
+            All indexes of the topics.
+
+        Raises:
+            TopicError: there is no such topic or field.
+            DatabaseError: MongoDB cannot make it: two of the fields are arrays.
+        """
+        query = self.topic(topic)
+        database = self.database_for("An index")
+        query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
+        with self.directory.using_index():
+            field_indexes.add(database, query.topics, fields)
+        return field_indexes.of_topics(database, query.topics)
+
+    def remove_index(self, topic: str, *fields: str) -> int:
+        """Drop the index on just these fields; returns from how many topics.
+
+        Raises:
+            TopicError: there is no such topic.
+        """
+        query = self.topic(topic)
+        database = self.database_for("An index")
+        with self.directory.using_index():
+            return field_indexes.remove(database, query.topics, fields)
+
+    def indexes(self, *topics: str) -> list[FieldIndex]:
+        """The indexes on fields, of these topics or of all."""
+        database = self.database_for("Indexes")
+        names = self.topic(*topics).topics if topics else self.topics()
+        return field_indexes.of_topics(database, names)
 
     def verify(
         self,

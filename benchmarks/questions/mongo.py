@@ -168,6 +168,16 @@ class HybridlogAppendixAsker(MongoAsker):
         self._client.close()
 
 
+class HybridlogIndexedAsker(HybridlogAppendixAsker):
+    """Once more with the indexes of the paper, as `hybridlog index` makes them."""
+
+    def start(self, backend: Backend) -> None:
+        super().start(backend)
+        self._store.add_index(GRIPPER, "position")
+        self._store.add_index(VIEWPOINT, "position.x", "_meta.inserted_at")
+        self._store.add_index(ARM, *(f"pose.position.{axis}" for axis in "xyz"))
+
+
 class MongoReading(Reading):
     """By `_meta.inserted_at`, which is what the indexes are on."""
 

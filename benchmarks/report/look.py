@@ -35,6 +35,7 @@ _LOOKS = {
     OURS: Look("hybridlog", "#d55e00", "o"),
     "hybridlog_recorder": Look("hybridlog (recorder)", "#b34700", "d", "--"),
     "hybridlog_api": Look("hybridlog (its own API)", "#d55e00", "H", "--"),
+    "hybridlog_indexed": Look("hybridlog (indexed)", "#b34700", "8", "-."),
     "mongo_json": Look("MongoDB", "#009e73", "s"),
     "mongo_json_indexed": Look("MongoDB (indexed)", "#009e73", "D", "--"),
     "postgres_autocommit": Look("PostgreSQL (autocommit)", "#56b4e9", "v"),

@@ -517,6 +517,28 @@ def export(
 
 
 @app.command()
+def index(
+    topic: Annotated[
+        str | None,
+        typer.Argument(help="A topic.", metavar="TOPIC", autocompletion=complete_topic),
+    ] = None,
+    field: Annotated[
+        list[str] | None,
+        typer.Argument(help="Its fields, the most telling first.", metavar="FIELD"),
+    ] = None,
+    store: StoreOption = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Drop this index.")] = False,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Let MongoDB find messages by a field; without one, list such indexes."""
+    from hybridlog.cli import maintain
+
+    maintain.index(topic, field or [], store, mongo, drop=remove, as_json=as_json, quiet=quiet)
+
+
+@app.command()
 def reindex(
     store: StoreOption = None,
     mongo: MongoOption = None,

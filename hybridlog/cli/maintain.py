@@ -40,6 +40,44 @@ def reindex(store: Path | None, mongo: str | None, *, as_json: bool, quiet: bool
         )
 
 
+def index(
+    topic: str | None,
+    fields: list[str],
+    store: Path | None,
+    mongo: str | None,
+    *,
+    drop: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Make, drop or list indexes on fields."""
+    if drop and not fields:
+        raise UsageError("Which index? Name the topic and the fields after --remove.")
+    with opened(store, mongo, needs_database=True, quiet=quiet) as view:
+        if topic is None:
+            found = view.indexes()
+        elif drop:
+            if not view.remove_index(topic, *fields):
+                known = ", ".join(" ".join(one.fields) for one in view.indexes(topic)) or "none"
+                raise UsageError(
+                    f"{topic} has no index on {' '.join(fields)}. Its indexes: {known}."
+                )
+            found = view.indexes(topic)
+        elif fields:
+            found = view.add_index(topic, *fields)
+        else:
+            found = view.indexes(topic)
+    if as_json:
+        output.print_json([{"topic": one.topic, "fields": list(one.fields)} for one in found])
+    elif found:
+        output.print_table(
+            (("topic", "whole"), ("fields", "left")),
+            [(one.topic, " ".join(one.fields)) for one in found],
+        )
+    elif not quiet:
+        output.say("no index on a field")
+
+
 def verify(
     recordings: list[str] | None,
     store: Path | None,

@@ -450,6 +450,21 @@ class Database:
             options: dict[str, Any] = {"sparse": True} if sparse else {}
             return self._collection(collection).create_index(list(keys), unique=unique, **options)
 
+    def indexes(self, collection: str) -> list[list[tuple[str, int]]]:
+        """The keys of all indexes but the one on `_id`, sorted."""
+        with _mapped(self._address):
+            found = [about["key"].items() for about in self._collection(collection).list_indexes()]
+        keys = [[(str(field), int(order)) for field, order in key] for key in found]
+        return sorted(key for key in keys if [field for field, _ in key] != ["_id"])
+
+    def drop_index(self, collection: str, keys: Sort) -> bool:
+        """Drop the index with these keys; whether there was one."""
+        if list(keys) not in self.indexes(collection):
+            return False
+        with _mapped(self._address):
+            self._collection(collection).drop_index(list(keys))
+        return True
+
     def stats(self, collection: str) -> CollectionStats:
         """Size of a collection."""
         from pymongo.errors import OperationFailure

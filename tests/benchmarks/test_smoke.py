@@ -61,7 +61,7 @@ def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
     }
     assert {sample.status for sample in samples} == {"ok"}
     asked = {(s.backend, s.case["question"]) for s in samples if s.study == "queries"}
-    rows = ("sqlite_json1", "hybridlog", "hybridlog_api")
+    rows = ("sqlite_json1", "hybridlog", "hybridlog_api", "hybridlog_indexed")
     assert asked == {(row, question) for row in rows for question in QUESTIONS}
     answers: dict[str, set[str]] = {}
     for sample in samples:

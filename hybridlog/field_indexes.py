@@ -1,0 +1,90 @@
+"""Indexes on fields, with which MongoDB finds documents without looking at all of them.
+
+They change how long a question takes and never its answer, so the segments know nothing
+of them: MongoDB keeps them, and `reindex` makes again what was there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.database import Database
+
+OWN_FIELDS = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
+"""Fields that every index document has, whatever its topic."""
+
+_OURS = "hybridlog."
+_MOST_FIELDS = 8
+
+
+class FieldIndex(NamedTuple):
+    """An index on some fields of a topic.
+
+    Attributes:
+        topic: Full name.
+        fields: In the order of the index.
+    """
+
+    topic: str
+    fields: tuple[str, ...]
+
+
+def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> None:
+    """Make an index on each topic, unless it is there.
+
+    Raises:
+        UsageError: no field, or too many.
+        DatabaseError: MongoDB cannot make it: two of the fields are arrays.
+    """
+    _check(fields)
+    for topic in topics:
+        database.ensure_collection(collection_of(topic))
+        database.create_index(collection_of(topic), _keys(fields))
+
+
+def remove(database: Database, topics: Iterable[str], fields: Sequence[str]) -> int:
+    """Drop the index on these fields from each topic; returns how many there were."""
+    _check(fields)
+    return sum(database.drop_index(collection_of(topic), _keys(fields)) for topic in topics)
+
+
+def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
+    """The indexes of some topics, in the order of the topics, by fields."""
+    return [
+        FieldIndex(topic, tuple(field for field, _ in keys))
+        for topic in topics
+        for keys in database.indexes(collection_of(topic))
+    ]
+
+
+def of_collections(database: Database) -> Mapping[str, list[list[tuple[str, int]]]]:
+    """The keys of all indexes on topics' collections, to make them again."""
+    names = [name for name in database.list_collections() if not name.startswith(_OURS)]
+    return {name: keys for name in names if (keys := database.indexes(name))}
+
+
+def make_again(
+    database: Database, indexes: Mapping[str, Sequence[Sequence[tuple[str, int]]]]
+) -> None:
+    """Make indexes on collections that were dropped."""
+    for collection, all_keys in indexes.items():
+        database.ensure_collection(collection)
+        for keys in all_keys:
+            database.create_index(collection, keys)
+
+
+def _check(fields: Sequence[str]) -> None:
+    if not fields:
+        raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
+    if len(fields) > _MOST_FIELDS or len(set(fields)) != len(fields):
+        raise UsageError(f"An index takes up to {_MOST_FIELDS} fields, each once.")
+
+
+def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:
+    # Documents have no brackets: an index on an element is one on the array.
+    return [(field.replace("[]", ""), 1) for field in fields]

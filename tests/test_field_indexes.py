@@ -1,0 +1,113 @@
+"""Indexes on fields: found by MongoDB, the same answers, kept by `reindex`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.demo.config import RobotConfig
+from hybridlog.demo.write import write_bag
+from hybridlog_storage.errors import DatabaseError, TopicError, UsageError
+from tests.cli.running import run
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("indexes")
+    config = RobotConfig(image_size=(64, 48), cloud_columns=20, scan_beams=180)
+    write_bag(place / "robot.bag", duration_s=5.0, config=config)
+    with hl.open(place / "store", create=True, require_database=True) as store:
+        store.record(place / "robot.bag")
+    return place / "store"
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[hl.Store]:
+    with hl.open(path, require_database=True) as opened:
+        for one in opened.indexes():
+            opened.remove_index(one.topic, *one.fields)
+        yield opened
+
+
+def stages(plan: dict[str, Any]) -> set[str]:
+    found = {str(plan.get("stage"))}
+    for part in (plan.get("inputStage"), *plan.get("inputStages", ())):
+        found |= stages(part) if part else set()
+    return found
+
+
+def how(store: hl.Store, collection: str, where: dict[str, object]) -> set[str]:
+    """The steps by which MongoDB finds documents."""
+    import pymongo
+
+    assert store.database is not None
+    with pymongo.MongoClient[dict[str, Any]](store.database.address) as client:
+        told = client[store.database.name][collection].find(where).explain()
+    return stages(told["queryPlanner"]["winningPlan"])
+
+
+def test_an_index_is_used_and_changes_no_answer(store: hl.Store) -> None:
+    question = store.topic("imu/data").where("angular_velocity.z > 0.05")
+    before = [(m.log_time_ns, m.raw) for m in question]
+    assert 0 < len(before) < store.topic("imu/data").count()
+    where = {"angular_velocity.z": {"$gt": 0.05}}
+    assert "IXSCAN" not in how(store, "imu__data", where)
+    assert store.add_index("imu/data", "angular_velocity.z") == [
+        ("/imu/data", ("angular_velocity.z",))
+    ]
+    assert "IXSCAN" in how(store, "imu__data", where)
+    assert [(m.log_time_ns, m.raw) for m in question] == before
+    assert question.count() == len(before)
+    # Once more is no error, and makes no second one.
+    assert len(store.add_index("imu/data", "angular_velocity.z")) == 1
+
+
+def test_reindex_makes_indexes_again(store: hl.Store) -> None:
+    store.add_index("imu/data", "orientation.x", "_meta.inserted_at")
+    store.add_index("/odom", "pose.pose.position.x")
+    known = store.indexes()
+    assert len(known) == 2
+    store.reindex()
+    assert store.indexes() == known
+    assert "IXSCAN" in how(store, "odom", {"pose.pose.position.x": {"$gt": 0}})
+    assert store.verify().findings == []
+
+
+def test_what_cannot_be_indexed(store: hl.Store) -> None:
+    with pytest.raises(TopicError, match=r"no field 'angular_velocity.q'.*angular_velocity.z"):
+        store.add_index("imu/data", "angular_velocity.q")
+    with pytest.raises(TopicError, match="no topic 'nothing'"):
+        store.add_index("nothing", "x")
+    for fields in ((), ("orientation.x",) * 2, tuple(f"a{n}" for n in range(9))):
+        with pytest.raises((UsageError, TopicError)):
+            store.add_index("imu/data", *fields)
+    with pytest.raises(DatabaseError):
+        store.add_index("joint_states", "position", "velocity")
+    assert store.indexes() == []
+
+
+def test_an_index_on_elements_of_an_array(store: hl.Store) -> None:
+    store.add_index("joint_states", "position")
+    assert "IXSCAN" in how(store, "joint_states", {"position": {"$gt": 100}})
+
+
+def test_as_a_command(store: hl.Store) -> None:
+    place = store.directory.path
+
+    def said(*arguments: str, code: int = 0) -> str:
+        done = run("index", *arguments, store=place, code=code)
+        return done.out if code == 0 else done.err
+
+    assert said() == "no index on a field\n"
+    assert said("--quiet") == ""
+    assert "angular_velocity.z" in said("imu/data", "angular_velocity.z")
+    assert json.loads(said("--json")) == [{"topic": "/imu/data", "fields": ["angular_velocity.z"]}]
+    assert json.loads(said("/odom", "--json")) == []
+    assert "Its indexes: angular_velocity.z." in said("imu/data", "x", "--remove", code=2)
+    assert "Name the topic" in said("imu/data", "--remove", code=2)
+    assert said("imu/data", "angular_velocity.z", "--remove") == "no index on a field\n"
