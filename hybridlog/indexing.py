@@ -274,6 +274,16 @@ class IndexWriter:
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(self._made)
 
+    def prepare(self, channel: Channel) -> None:
+        """Do now what a channel's first message would have to wait for."""
+        self._indexer.prepare(channel)
+        self._maker.submit(self._prepare, channel).add_done_callback(self._done)
+
+    def _prepare(self, channel: Channel) -> None:
+        # A database that fails here fails again with the first documents, and is told then.
+        with suppress(DatabaseError):
+            self._ensure(collection_of(channel.topic))
+
     def nudge(self) -> None:
         """Send what has been made so far, however little, once a sender is free."""
         self._maker.submit(self._dispatch, wait=False).add_done_callback(self._done)

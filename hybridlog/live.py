@@ -143,11 +143,11 @@ class LiveRecording:
     def expect(self, *channels: Channel) -> None:
         """Prepare for channels before their first message.
 
-        A definition takes some ten milliseconds to understand, which are better spent
-        while nothing comes yet.
+        To understand a definition and to make a collection takes some ten milliseconds
+        each, which are better spent while nothing comes yet.
         """
         for channel in channels:
-            self._capture.indexer.prepare(channel)
+            self._capture.index.prepare(channel)
 
     def write(
         self,

@@ -532,7 +532,7 @@ def index(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Let MongoDB find messages by a field; without one, list such indexes."""
+    """Make questions about a field quick."""
     from hybridlog.cli import maintain
 
     maintain.index(topic, field or [], store, mongo, drop=remove, as_json=as_json, quiet=quiet)
