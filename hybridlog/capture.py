@@ -1,8 +1,8 @@
 """One recording while it is being made: its directory, its segments and its way to the index.
 
 Whatever the messages come from, a log file or a running robot, they go through a
-`Capture`: it starts the recording, takes batches, and either brings it to its end or
-takes back that it was ever there.
+`Capture`: it starts the recording, gives them a writer, and either brings it to its end
+or takes back that it was ever there.
 """
 
 from __future__ import annotations

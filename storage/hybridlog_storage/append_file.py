@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import mmap
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from hybridlog_storage.buffers import buffers
 from hybridlog_storage.durability import sync_file, write_all
 from hybridlog_storage.messages import Buffer
 
@@ -32,7 +32,6 @@ BLOCK = 4096
 _STAGE = 4 << 20
 DIRECT: int = getattr(os, "O_DIRECT", 0)
 """Flag of direct reads and writes, 0 where there are none."""
-_PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
@@ -49,7 +48,7 @@ class AppendFile:
         self.position = position
         """Bytes in the file."""
         self._fd = fd
-        self._stage = mmap.mmap(-1, _STAGE, flags=_PRIVATE) if direct else None
+        self._stage = buffers.take(_STAGE) if direct else None
         self._filled = 0  # bytes in the stage; the first of them belongs at `position - filled`
 
     @classmethod
@@ -94,7 +93,7 @@ class AppendFile:
         if self._stage is None:
             self.position += write_all(self._fd, parts)
             return
-        stage = np.frombuffer(self._stage, np.uint8)
+        stage = self._stage
         for part in parts:
             content = np.frombuffer(part, np.uint8)
             while len(content):

@@ -504,9 +504,9 @@ class RecordingWriter:
         ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
         for index in present:
             channel = channels[index]
-            if channel not in self._known:
-                self._channel(channel, float(batch.length[batch.channel == index].mean()))
-            known = self._known[channel]
+            known = self._known.get(channel) or self._meet(
+                channel, float(batch.length[batch.channel == index].mean())
+            )
             ids[index], cluster[index] = known.channel_id, known.cluster
         own = Batch(
             batch.buffer,
@@ -537,11 +537,9 @@ class RecordingWriter:
         Raises:
             DiskFullError: no space; what was flushed before stays.
         """
-        known = self._channel(channel, len(payload))
+        known = self._known.get(channel) or self._meet(channel, len(payload))
         key = known.cluster
-        builder = self._clusters.get(key)
-        if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
+        builder = self._builder(key)
         if len(builder):
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
@@ -607,26 +605,29 @@ class RecordingWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._disk.shutdown(wait=True, cancel_futures=True)
 
-    def _channel(self, channel: Channel, mean: float) -> _Known:
-        """What is known of a channel; at its first message, from its mean payload bytes."""
-        known = self._known.get(channel)
-        if known is None:
-            if len(self._known) >= _MAX_CHANNELS:
-                raise StoreError(f"more than {_MAX_CHANNELS} channels in one recording")
-            schema_id = 0
-            if channel.schema is not None:
-                schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
-            channel_id = len(self._known) + 1
-            cluster = channel_id if mean >= self.settings.large_payload else _SHARED
-            known = self._known[channel] = _Known(channel_id, schema_id, cluster)
-            self.channels[channel_id] = channel
+    def _meet(self, channel: Channel, mean: float) -> _Known:
+        """Make a new channel known: its ids, and from its mean payload bytes its cluster."""
+        if len(self._known) >= _MAX_CHANNELS:
+            raise StoreError(f"more than {_MAX_CHANNELS} channels in one recording")
+        schema_id = 0
+        if channel.schema is not None:
+            schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
+        channel_id = len(self._known) + 1
+        cluster = channel_id if mean >= self.settings.large_payload else _SHARED
+        known = self._known[channel] = _Known(channel_id, schema_id, cluster)
+        self.channels[channel_id] = channel
         return known
 
-    def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
-        """Lay messages into a cluster's chunk, closing chunks at their bounds."""
+    def _builder(self, key: int) -> ChunkBuilder:
+        """The open chunk of a cluster."""
         builder = self._clusters.get(key)
         if builder is None:
             builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
+        return builder
+
+    def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
+        """Lay messages into a cluster's chunk, closing chunks at their bounds."""
+        builder = self._builder(key)
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
         start, total = 0, len(batch)
         while start < total:
