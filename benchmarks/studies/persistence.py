@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from benchmarks.samples import Sample
-from benchmarks.studies.replays import MADE, Replay, chosen_logs, replays
+from benchmarks.studies.replays import LogSettings, Replay
 from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
 from benchmarks.studies.throughput import Case, short
 
@@ -18,24 +17,15 @@ QUICK_SECONDS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(LogSettings):
     """Which logs, how long, how often.
 
     Attributes:
-        seconds: Most of each log that is published, in its own time.
-        made: Names of the logs that are made.
-        logs: Real logs, files and directories.
-        chosen: With some of the real logs that lie beside the checkout, if there are any.
         repetitions: Of each log with each backend.
-        backends: Names of those that take part; None for all.
     """
 
     seconds: float = 60.0
-    made: Sequence[str] = MADE
-    logs: Sequence[Path] = ()
-    chosen: bool = True
     repetitions: int = 3
-    backends: Sequence[str] | None = None
 
     @classmethod
     def usual(cls, *, quick: bool) -> Settings:
@@ -44,21 +34,7 @@ class Settings:
 
     def header(self) -> dict[str, Any]:
         """What a journal says of these settings."""
-        values = asdict(self)
-        values["made"] = list(self.made)
-        values["logs"] = [str(path) for path in self.logs]
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
-
-    def replays(self, seed: int) -> list[Replay]:
-        """The logs.
-
-        Raises:
-            SourceError: There is no log at a path.
-            ValueError: A name in `made` is not known, or `seconds` is not above 0.
-        """
-        logs = [*(chosen_logs() if self.chosen else ()), *self.logs]
-        return replays(seed, self.seconds, logs, self.made)
+        return {STUDY: self.to_json()}
 
 
 def plan(context: Context, settings: Settings | None = None) -> list[Case]:

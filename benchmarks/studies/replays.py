@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,6 +88,43 @@ def replays(
         names.add(replay.name)
         found.append(replay)
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class LogSettings:
+    """Which logs a study publishes, and to whom.
+
+    Attributes:
+        seconds: Most of each log that is published, in its own time.
+        made: Names of the logs that are made.
+        logs: Real logs, files and directories.
+        chosen: With some of the real logs that lie beside the checkout, if there are any.
+        backends: Names of those that take part; None for all.
+    """
+
+    seconds: float
+    made: Sequence[str] = MADE
+    logs: Sequence[Path] = ()
+    chosen: bool = True
+    backends: Sequence[str] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As values that JSON can hold."""
+        values = asdict(self)
+        values["made"] = list(self.made)
+        values["logs"] = [str(path) for path in self.logs]
+        values["backends"] = None if self.backends is None else list(self.backends)
+        return values
+
+    def replays(self, seed: int) -> list[Replay]:
+        """The logs.
+
+        Raises:
+            SourceError: There is no log at a path.
+            ValueError: A name in `made` is not known, or `seconds` is not above 0.
+        """
+        logs = [*(chosen_logs() if self.chosen else ()), *self.logs]
+        return replays(seed, self.seconds, logs, self.made)
 
 
 def chosen_logs() -> list[Path]:

@@ -7,15 +7,14 @@ stopped goes on where it was.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from benchmarks.samples import Sample
 from benchmarks.studies.ceiling import next_rate, verdict
-from benchmarks.studies.replays import MADE, Replay, chosen_logs, replays
+from benchmarks.studies.replays import MADE, LogSettings, Replay
 from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
 from benchmarks.studies.throughput import short
 
@@ -27,30 +26,21 @@ _TRIALS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(LogSettings):
     """How the speeds are looked for.
 
     Attributes:
-        seconds: Most of each log that is published, in its own time.
-        made: Names of the logs that are made.
-        logs: Real logs, files and directories.
-        chosen: With some of the real logs that lie beside the checkout, if there are any.
         start: Speed of the first trial, times that of the recording.
         lowest: No speed below is tried: what is lost in real time is study 2.
         highest: No speed above is tried.
         halvings: Of the gap between the speeds that was kept and that was not.
-        backends: Names of those that take part; None for all.
     """
 
     seconds: float = 20.0
-    made: Sequence[str] = MADE
-    logs: Sequence[Path] = ()
-    chosen: bool = True
     start: float = 1.0
     lowest: float = 1.0
     highest: float = 256.0
     halvings: int = 2
-    backends: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         """Refuse speeds at which nothing can be published."""
@@ -71,21 +61,7 @@ class Settings:
 
     def header(self) -> dict[str, Any]:
         """What a journal says of these settings."""
-        values = asdict(self)
-        values["made"] = list(self.made)
-        values["logs"] = [str(path) for path in self.logs]
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
-
-    def replays(self, seed: int) -> list[Replay]:
-        """The logs.
-
-        Raises:
-            SourceError: There is no log at a path.
-            ValueError: A name in `made` is not known, or `seconds` is not above 0.
-        """
-        logs = [*(chosen_logs() if self.chosen else ()), *self.logs]
-        return replays(seed, self.seconds, logs, self.made)
+        return {STUDY: self.to_json()}
 
 
 def expected_seconds(context: Context, settings: Settings | None = None) -> float:
