@@ -143,7 +143,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(append_file.os, "pwrite", full)
+        patch.setattr(append_file.os, "pwritev", full)
         patch.setattr("hybridlog_storage.durability.os.writev", full)
 
         def until_refused() -> None:

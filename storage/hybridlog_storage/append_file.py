@@ -5,7 +5,8 @@ costs a processor's time twice, then stalls whoever writes next when the kernel 
 to clean up. Direct writes take neither, but must start and end at whole blocks: so the
 bytes behind the last whole block stay here too, and are written again, with zeros up to
 the next block, together with what follows. A file that nobody closed may therefore end
-in up to a block of zeros.
+in up to a block of zeros. Large content that starts at a block, in memory and in the
+file, is written from where it lies; everything else is staged.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.durability import sync_file, write_all
+from hybridlog_storage.durability import left_over, sync_file, write_all
 from hybridlog_storage.messages import Buffer
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ BLOCK = 4096
 _STAGE = 4 << 20
 DIRECT: int = getattr(os, "O_DIRECT", 0)
 """Flag of direct reads and writes, 0 where there are none."""
+_OWN = 1 << 18  # bytes from which content is not staged; buffers of the pool start at a block
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
@@ -49,7 +51,9 @@ class AppendFile:
         """Bytes in the file."""
         self._fd = fd
         self._stage = buffers.take(_STAGE) if direct else None
-        self._filled = 0  # bytes in the stage; the first of them belongs at `position - filled`
+        self._filled = 0  # bytes in the stage
+        self._begun = 0  # those before are about to be written, with other pieces behind them
+        self._written = 0  # byte of the file up to which whole blocks lie there
 
     @classmethod
     def create(cls, path: Path) -> Self:
@@ -93,18 +97,39 @@ class AppendFile:
         if self._stage is None:
             self.position += write_all(self._fd, parts)
             return
-        stage = self._stage
-        for part in parts:
+        pieces: list[NDArray[np.uint8]] = []
+        for part in filter(len, parts):
             content = np.frombuffer(part, np.uint8)
+            if self.position % BLOCK == 0 and _is_own(content):
+                whole = len(content) - len(content) % BLOCK
+                pieces += [self._stage[self._begun : self._filled], content[:whole]]
+                self._begun = self._filled
+                self.position += whole
+                content = content[whole:]
             while len(content):
                 piece = content[: _STAGE - self._filled]
-                stage[self._filled : self._filled + len(piece)] = piece
+                self._stage[self._filled : self._filled + len(piece)] = piece
                 self._filled += len(piece)
                 self.position += len(piece)
                 content = content[len(piece) :]
                 if self._filled == _STAGE:
-                    self._put(stage)
-        self._put(stage)
+                    self._put(pieces)
+                    pieces = []
+        self._put(pieces)
+
+    def room_before(self, content: Buffer, head: int) -> int:
+        """Bytes to leave free, so that large content need not be copied to be written.
+
+        Args:
+            content: What is about to be appended.
+            head: Bytes that will stand right before it.
+
+        Returns:
+            0 where it makes no difference.
+        """
+        if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
+            return 0
+        return -(self.position + head) % BLOCK
 
     def cut(self, position: int) -> None:
         """Drop everything from a position on; not for direct writes.
@@ -144,21 +169,23 @@ class AppendFile:
             os.close(self._fd)
             self._fd = -1
 
-    def _put(self, stage: NDArray[np.uint8]) -> None:
-        """Write what is staged, and keep the bytes behind the last whole block."""
-        if not self._filled:
-            return
+    def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
+        """Write pieces and what was staged behind them; keep what is behind the last block."""
+        assert self._stage is not None
         whole = self._filled - self._filled % BLOCK
-        end = whole + BLOCK if whole < self._filled else whole
-        stage[self._filled : end] = 0
-        self._write(stage[:end].data, self.position - self._filled)
-        stage[: self._filled - whole] = stage[whole : self._filled].copy()
-        self._filled -= whole
+        rest = self._filled - whole
+        end = whole + BLOCK if rest else whole
+        self._stage[self._filled : end] = 0
+        pieces.append(self._stage[self._begun : end])
+        self._write([piece.data for piece in pieces if len(piece)], self._written)
+        self._written = self.position - rest
+        self._stage[:rest] = self._stage[whole : self._filled].copy()
+        self._filled, self._begun = rest, 0
 
-    def _write(self, data: memoryview, position: int) -> None:
-        while data:
+    def _write(self, pieces: list[memoryview], position: int) -> None:
+        while pieces:
             try:
-                done = os.pwrite(self._fd, data, position)
+                done = os.pwritev(self._fd, pieces, position)
             except OSError as error:
                 if error.errno not in _REFUSED:
                     raise
@@ -166,11 +193,16 @@ class AppendFile:
                 # so nothing else changes.
                 self._give_up_direct(error)
                 continue
-            data = data[done:]
             position += done
+            pieces = left_over(pieces, done)
 
     def _give_up_direct(self, error: OSError) -> None:
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
         if not flags & DIRECT:
             raise error
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+
+
+def _is_own(content: NDArray[np.uint8]) -> bool:
+    """Whether content may be written from where it lies."""
+    return len(content) >= _OWN and content.ctypes.data % BLOCK == 0

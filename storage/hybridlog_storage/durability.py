@@ -43,13 +43,17 @@ def write_all(fd: int, parts: Sequence[Buffer]) -> int:
     views = [memoryview(part).cast("B") for part in parts if len(part)]
     total = sum(len(view) for view in views)
     while views:
-        done = os.writev(fd, views[:512])
-        while views and done >= len(views[0]):
-            done -= len(views[0])
-            views.pop(0)
-        if done:
-            views[0] = views[0][done:]
+        views = left_over(views, os.writev(fd, views[:512]))
     return total
+
+
+def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
+    """What remains of some views when their first bytes have been dealt with."""
+    for index, view in enumerate(views):
+        if done < len(view):
+            return [view[done:], *views[index + 1 :]]
+        done -= len(view)
+    return []
 
 
 def sync_file(fd: int) -> None:

@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Self
 from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Header, Metadata, Schema
 
+from hybridlog_storage.append_file import BLOCK
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
 from hybridlog_storage.mcap_scan import MAGIC, read_summary
 from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
     CHUNK_HEAD,
+    PADDING_OPCODE,
     PROFILE,
     message_indexes,
 )
@@ -115,6 +117,9 @@ class SegmentCheck:
     def _problem(self, opcode: int, at: int, length: int) -> str | None:
         if opcode in _OF_CHUNKS:
             return None  # `chunk` compares those
+        if opcode == PADDING_OPCODE:
+            damaged = length >= BLOCK or any(self._read(at + _HEAD, length))
+            return "the padding before a chunk is damaged" if damaged else None
         try:
             record, _ = read_record(opcode, self._read(at + _HEAD, length))
         except SegmentError as error:

@@ -43,8 +43,11 @@ NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 
 ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: arrival numbers of a chunk's messages."""
+PADDING_OPCODE: Final = 0x91
+"""Record of zeros, so that the content of the chunk behind it starts at a block."""
 
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
+PADDING_HEAD: Final = struct.Struct("<BQ")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
 
@@ -141,6 +144,13 @@ def chunk_head(
             name,
             struct.pack("<Q", compressed_size),
         )
+    )
+
+
+def padding_record(size: int) -> bytes:
+    """A record of zeros, of so many bytes with its head."""
+    return PADDING_HEAD.pack(PADDING_OPCODE, size - PADDING_HEAD.size) + bytes(
+        size - PADDING_HEAD.size
     )
 
 

@@ -47,6 +47,7 @@ from hybridlog_storage.segment_format import (
     FORMAT_VERSION,
     LIBRARY,
     MAGIC,
+    PADDING_HEAD,
     PROFILE,
     RECORDING_METADATA,
     arrival_record,
@@ -56,6 +57,7 @@ from hybridlog_storage.segment_format import (
     json_metadata,
     message_indexes,
     pack_arrivals,
+    padding_record,
     record_bytes,
     schema_record,
 )
@@ -226,7 +228,6 @@ class SegmentFile:
 
     def append_chunk(self, chunk: PackedChunk) -> StoredChunk:
         """Append a chunk with its message indexes and arrival numbers."""
-        offset = self.position
         head = chunk_head(
             first=chunk.first,
             last=chunk.last,
@@ -235,10 +236,12 @@ class SegmentFile:
             compression=chunk.compression,
             compressed_size=len(chunk.data),
         )
+        padding = self._padding(chunk.data, len(head))
+        offset = self.position + len(padding)
         length = len(head) + len(chunk.data)
         arrivals = arrival_record(offset, chunk.arrivals)
         trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
-        self._write([head, chunk.data, *chunk.indexes.values(), arrivals])
+        self._write([padding, head, chunk.data, *chunk.indexes.values(), arrivals])
         self.note_chunk(
             (chunk.first, chunk.last),
             {channel: entries_of(data) for channel, data in chunk.indexes.items()},
@@ -336,6 +339,13 @@ class SegmentFile:
         """Close without sealing; the next opening of the store recovers the file."""
         with suppress(OSError):
             self._file.finish(sync=False)
+
+    def _padding(self, content: Buffer, head: int) -> bytes:
+        """What must stand before a chunk record for its content to start at a block."""
+        if not self._file.room_before(content, head):
+            return b""
+        least = PADDING_HEAD.size
+        return padding_record(least + self._file.room_before(content, least + head))
 
     def _write(self, parts: Sequence[Buffer]) -> None:
         try:

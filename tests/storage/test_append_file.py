@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from hybridlog_storage import append_file
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.buffers import buffers
+from hybridlog_storage.messages import Buffer
 
 Refusal = Callable[[pytest.MonkeyPatch], None]
 
@@ -38,14 +40,24 @@ def at_writing(patch: pytest.MonkeyPatch) -> None:
     """It opens the file, and says no when it is written."""
     import fcntl
 
-    real = os.pwrite
+    real = os.pwritev
 
-    def refuse(fd: int, data: memoryview, position: int) -> int:
+    def refuse(fd: int, pieces: list[memoryview], position: int) -> int:
         if fcntl.fcntl(fd, fcntl.F_GETFL) & append_file.DIRECT:
             raise OSError(errno.EINVAL, "no direct writes here")
-        return real(fd, data, position)
+        return real(fd, pieces, position)
 
-    patch.setattr(append_file.os, "pwrite", refuse)
+    patch.setattr(append_file.os, "pwritev", refuse)
+
+
+def in_steps(patch: pytest.MonkeyPatch) -> None:
+    """It takes one block at a time."""
+    real = os.pwritev
+
+    def short(fd: int, pieces: list[memoryview], position: int) -> int:
+        return real(fd, [pieces[0][:BLOCK]], position)
+
+    patch.setattr(append_file.os, "pwritev", short)
 
 
 def without(patch: pytest.MonkeyPatch) -> None:
@@ -53,7 +65,7 @@ def without(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(append_file, "DIRECT", 0)
 
 
-@pytest.mark.parametrize("refusal", [never, at_opening, at_writing, without])
+@pytest.mark.parametrize("refusal", [never, at_opening, at_writing, in_steps, without])
 @settings(max_examples=25, deadline=None)
 @given(
     parts=st.lists(
@@ -76,7 +88,15 @@ def test_what_is_appended_is_what_is_there(
         refusal(patch)
         file = AppendFile.create(path)
         for number, sizes in enumerate(parts):
-            pieces = [bytes([number + 1]) * size for size in sizes]
+            pieces: list[Buffer] = [bytes([number + 1]) * size for size in sizes]
+            if sizes and sizes[-1] >= 1 << 18:
+                # What is large lies in a buffer that starts at a block, as a chunk's content.
+                pieces[-1] = content = buffers.take(sizes[-1])[: sizes[-1]].data
+                content[:] = os.urandom(sizes[-1])
+                before = sum(sizes[:-1])
+                room = file.room_before(content, before)
+                assert not room or (len(expected) + before + room) % BLOCK == 0
+                pieces.insert(0, bytes(room))
             file.append(pieces)
             expected += b"".join(pieces)
             assert file.position == len(expected)
@@ -114,7 +134,7 @@ def test_a_full_disk_is_the_systems_error(tmp_path: Path, monkeypatch: pytest.Mo
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(append_file.os, "pwrite", full)
+    monkeypatch.setattr(append_file.os, "pwritev", full)
     monkeypatch.setattr("hybridlog_storage.durability.os.writev", full)
     with pytest.raises(OSError, match="full") as caught:
         file.append([b"y" * 5000])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
+from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
@@ -241,3 +243,53 @@ def test_what_lies_in_the_place_of_a_segment(tmp_path: Path) -> None:
         make(path)
         with pytest.raises(SegmentError, match="no ordinary file"):
             SegmentReader(path, number)
+
+
+def test_large_content_that_is_not_compressed_starts_at_a_block(tmp_path: Path) -> None:
+    batches = [[(1, os.urandom(300_000), 10 * n, 10 * n, n)] for n in range(5)]
+    (path,), chunks = write(tmp_path, batches, SegmentSettings(chunk_size=1 << 19))
+    data = path.read_bytes()
+    found = [
+        (message.data, message.log_time)
+        for _, _, message in make_reader(io.BytesIO(data), validate_crcs=True).iter_messages()
+    ]
+    assert found == [(payload, time) for rows in batches for _, payload, time, _, _ in rows]
+    heads = [chunk.length - chunk.compressed_size for chunk in chunks]
+    places = [chunk.offset + head for chunk, head in zip(chunks, heads, strict=True)]
+    if AppendFile.create(tmp_path / "probe").direct:
+        assert [place % BLOCK for place in places] == [0] * 5
+    with SegmentCheck(path) as check:
+        assert list(check.between_chunks()) == []
+    paddings = [
+        found.start()
+        for found in re.finditer(b"\x91", data)
+        if found.start() + 9 + int.from_bytes(data[found.start() + 1 :][:8], "little")
+        in {chunk.offset for chunk in chunks}
+    ]
+    for at in paddings:
+        for place in (at, at + 1, at + 9, at + 20):
+            damaged = bytearray(data)
+            damaged[place] ^= 4
+            path.write_bytes(damaged)
+            with SegmentCheck(path) as check:
+                assert list(check.between_chunks()), place
+
+
+def test_a_segment_that_was_left_open_is_recovered_with_its_padding(tmp_path: Path) -> None:
+    batches = [[(1, os.urandom(300_000), 10 * n, 10 * n, n)] for n in range(4)]
+    (path,), chunks = write(tmp_path, batches, SegmentSettings(chunk_size=1 << 19))
+    opened = path.with_name(path.name + ".open")
+    whole = path.read_bytes()
+    last = chunks[-1]
+    path.unlink()
+    # Killed while the last chunk was being written, in its padding, or in its middle.
+    for cut in (last.offset - 5, last.offset + 2, last.offset + last.length // 2):
+        opened.write_bytes(whole[:cut])
+        recovered = recover_segment(opened)
+        assert recovered.path is not None
+        with recovered.path.open("rb") as file:
+            found = [message.data for _, _, message in make_reader(file).iter_messages()]
+        assert found == [rows[0][1] for rows in batches[:-1]]
+        with SegmentCheck(recovered.path) as check:
+            assert list(check.between_chunks()) == []
+        recovered.path.unlink()
