@@ -97,7 +97,7 @@ class Capture:
         failure = self.index.failure
         if failure is None:
             try:
-                self.catalog.put_losses(self.entry.id, end["losses"])
+                self.catalog.put_losses(self.entry.id, self.entry.end.get("losses", []))
                 for channel in self.writer.channels.values():
                     if channel.schema is not None:
                         self.catalog.put_schema(channel.schema)

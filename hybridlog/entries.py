@@ -9,6 +9,7 @@ import secrets
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
+from hybridlog.losses import joined
 from hybridlog_storage.catalog import (
     ChannelEntry,
     ChannelStats,
@@ -108,6 +109,9 @@ def build_entry(
     ends = [s.end for _, s in sorted(summaries.items()) if s.end is not None]
     entry.status = str(ends[-1].get("status", "complete")) if ends else "recovered"
     entry.end = dict(ends[-1]) if ends else {}
+    lost = [row for _, summary in sorted(summaries.items()) for row in summary.losses]
+    if lost:
+        entry.end["losses"] = joined([*cast(Any, entry.end).get("losses", ()), *lost])
     entries: dict[int, ChannelEntry] = {
         channel_id: channel_entry(channel_id, channel, indexer.reason(channel_id, channel))
         for channel_id, channel in sorted(channels_of(summaries.values()).items())

@@ -84,6 +84,7 @@ class Message:
     __slots__ = (
         "_codec",
         "_documents",
+        "_is_reduced",
         "_row",
         "_view",
         "log_time_ns",
@@ -117,6 +118,7 @@ class Message:
         self.recording = lane.recording.id
         self._view = view
         self._codec = lane.codec
+        self._is_reduced = lane.is_reduced
         self._documents = documents
         self._row = row
 
@@ -125,13 +127,24 @@ class Message:
 
     @property
     def raw(self) -> bytes:
-        """The serialized message, byte for byte as it came."""
-        return bytes(self._view)
+        """The serialized message, byte for byte as it came.
+
+        Raises:
+            PayloadError: it was given up under pressure.
+        """
+        return bytes(self.payload)
 
     @property
     def payload(self) -> memoryview:
         """The same without a copy."""
+        if self.is_reduced:
+            self._codec.decode(self._view)
         return self._view
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the payload was given up under pressure, and only `fields` are there."""
+        return self._is_reduced
 
     @property
     def fields(self) -> dict[str, object]:
@@ -431,10 +444,18 @@ class Query:
         return next(iter(self.limit(1)), None)
 
     def batches(self) -> Iterator[tuple[Batch, Sequence[Lane]]]:
-        """The messages in order, many at once; `batch.channel` indexes the lanes."""
+        """The messages in order, many at once; `batch.channel` indexes the lanes.
+
+        Messages whose payload was given up are not among them; `counters.reduced` counts
+        them.
+        """
         plan = self.plan()
+        whole = np.array([not lane.is_reduced for lane in plan.lanes], np.bool_)
         for piece in self.pieces(plan):
-            yield piece.batch, plan.lanes
+            batch = piece.batch if whole.all() else piece.batch.take(whole[piece.batch.channel])
+            self.counters.reduced += len(piece.batch) - len(batch)
+            if len(batch):
+                yield batch, plan.lanes
 
     def count(self) -> int:
         """Number of messages, without reading a payload."""
@@ -698,6 +719,8 @@ class Query:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
         types: dict[str, str] = {}
         for lane in self.lanes():
+            if lane.is_reduced:
+                continue  # its fields are those of whole messages
             paths = lane.codec.paths()
             if not paths:
                 return None
@@ -804,7 +827,7 @@ class Query:
         raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans[:5])}.")
 
     def _check_clock(self, lane: Lane) -> None:
-        if self._bounds is None:
+        if self._bounds is None or lane.is_reduced:
             return
         topic = lane.channel.topic
         if self._clock == "header" and not any(p.path == STAMP for p in lane.codec.paths()):

@@ -64,7 +64,7 @@ def collect(query: Query) -> TableBuilder:
         _append(builder, block, several=several)
     sweep = Sweep(plan, query.store.segment)
     for piece in sweep.unordered() if query.is_unthinned else query.pieces(plan):
-        for block in _decoded(plan.lanes, piece, query.selected_fields):
+        for block in _decoded(plan.lanes, piece, query):
             _append(builder, block, several=several)
     return builder
 
@@ -79,9 +79,7 @@ def stream(query: Query) -> Iterator[pa.Table]:
     else:
         plan = query.plan()
         _check(plan.lanes)
-        groups = (
-            _decoded(plan.lanes, piece, query.selected_fields) for piece in query.pieces(plan)
-        )
+        groups = (_decoded(plan.lanes, piece, query) for piece in query.pieces(plan))
     yield from _tables(query, groups, several=several)
 
 
@@ -141,14 +139,17 @@ def with_topic(records: Records, topic: str) -> Records:
     return Records({"topic": column, **records.fields}, rows)
 
 
-def _decoded(
-    lanes: Sequence[Lane], piece: Piece, fields: tuple[str, ...] | None
-) -> Iterator[Block]:
+def _decoded(lanes: Sequence[Lane], piece: Piece, query: Query) -> Iterator[Block]:
     ranks = _ranks(lanes)
     for number, rows in rows_by_channel(piece.batch.channel):
         lane = lanes[number]
+        if lane.is_reduced:
+            query.counters.reduced += len(rows)
+            continue
         batch, seq = piece.batch.take(rows), piece.seq[rows]
-        decoded = lane.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        decoded = lane.codec.columns(
+            batch.buffer, batch.offset, batch.length, query.selected_fields
+        )
         good = decoded.rows
         yield Block(
             lane.channel.topic,
@@ -210,6 +211,8 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
     summaries: list[str] = []
     indexed = query.store.database is not None and len(query.topics) == 1
     for lane in query.lanes():
+        if lane.is_reduced:
+            continue  # the index has of it what it has of whole messages
         paths = {p.path: p for p in lane.codec.paths()}
         known = {name: path.type for name, path in paths.items()}
         for name in fields:

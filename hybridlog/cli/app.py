@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from hybridlog.cli.complete import complete_recording, complete_topic
 from hybridlog.cli.exit_codes import as_text
@@ -24,6 +24,26 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
         except BrokenPipeError:
             raise typer.Exit(0) from None
+
+
+class _RecordCommand(TyperCommand):
+    """`record`, with two ways of writing options that the parser does not know."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take `--ros1 URI` for `--ros1 --master URI`, and `--throttle A B` for `A=B`."""
+        written: list[str] = []
+        rest = iter(args)
+        for word in rest:
+            if word.startswith("--ros1="):
+                written += ["--master", word.removeprefix("--ros1=")]
+            elif "://" in word and written[-1:] == ["--ros1"]:
+                written += ["--master", word]
+            elif written[-1:] in (["--throttle"], ["--priority"]) and "=" not in word:
+                following = next(rest, None)
+                written.append(word if following is None else f"{word}={following}")
+            else:
+                written.append(word)
+        return super().parse_args(ctx, written)
 
 
 app = typer.Typer(
@@ -164,16 +184,16 @@ def root(
         raise typer.Exit
 
 
-@app.command()
+@app.command(cls=_RecordCommand)
 def record(
     paths: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.",
             metavar="PATH",
             readable=False,
         ),
-    ],
+    ] = None,
     store: StoreOption = None,
     topics: Annotated[
         list[str] | None,
@@ -209,20 +229,117 @@ def record(
     level: Annotated[
         int, typer.Option(help="zstd level, 1 to 19.", metavar="N", min=1, max=19)
     ] = 1,
+    ros1: Annotated[
+        bool,
+        typer.Option(
+            "--ros1",
+            help="Record a running ROS 1 robot; a master's URI may follow, without it "
+            "ROS_MASTER_URI counts.",
+        ),
+    ] = False,
+    master: Annotated[
+        str | None, typer.Option("--master", help="The ROS 1 master.", metavar="URI")
+    ] = None,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Record a running ROS 2 robot; needs rclpy.")
+    ] = False,
+    qos: Annotated[
+        Path | None,
+        typer.Option(
+            help="ROS 2: YAML file of QoS overrides, as rosbag2 has them.",
+            metavar="FILE",
+            readable=False,
+        ),
+    ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(help="Record what a Foxglove WebSocket server sends.", metavar="URL"),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Play a log as if a robot ran, and record that.", metavar="FILE", readable=False
+        ),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Of --replay.", metavar="N", min=0.01)] = 1.0,
+    duration: Annotated[
+        str | None, typer.Option(help="Live: stop after so long, such as 10m.", metavar="TIME")
+    ] = None,
+    max_messages: Annotated[
+        int | None, typer.Option(help="Live: stop after so many.", metavar="N", min=1)
+    ] = None,
+    max_size: Annotated[
+        str | None,
+        typer.Option(help="Live: stop after so many payload bytes, such as 10GB.", metavar="SIZE"),
+    ] = None,
+    split_size: Annotated[
+        str | None, typer.Option(help="A new segment file after so many bytes.", metavar="SIZE")
+    ] = None,
+    split_duration: Annotated[
+        str | None, typer.Option(help="A new segment file after so long.", metavar="TIME")
+    ] = None,
+    throttle: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Live: at most so many messages a second, such as /camera 5Hz. Repeatable.",
+            metavar="TOPIC RATE",
+        ),
+    ] = None,
+    priority: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Live: low, normal or high; who keeps payloads longest when more comes than "
+            "can be written. Repeatable.",
+            metavar="TOPIC WORD",
+        ),
+    ] = None,
+    budget: Annotated[
+        str, typer.Option(help="Live: payload bytes in memory.", metavar="SIZE")
+    ] = "512MB",
+    reserve: Annotated[
+        str,
+        typer.Option(help="Live: stop when the disk has less than this left.", metavar="SIZE"),
+    ] = "1GB",
+    flush_interval: Annotated[
+        str, typer.Option(help="Live: what a kill can cost at most.", metavar="TIME")
+    ] = "1s",
     mongo: MongoOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Record logs into the store.
+    """Record logs, or a running robot, into the store.
 
     Each path becomes a recording: a ROS 1 bag, a ROS 2 bag (its directory or one file), an
     MCAP file. Content that is in the store already is refused unless --again. What of a
     damaged log can be read is stored, and the rest is told.
+
+    With --ros1, --ros2, --foxglove or --replay, what a robot says is recorded as it comes,
+    until Ctrl-C. What cannot be kept is counted: see `hybridlog losses`.
     """
     from hybridlog.cli import record as command
+    from hybridlog.cli.record_live import LiveChoices
 
     command.run(
-        paths,
+        paths or [],
+        LiveChoices(
+            ros1=ros1 or master is not None,
+            master=master,
+            ros2=ros2,
+            qos=qos,
+            foxglove=foxglove,
+            replay=replay,
+            speed=speed,
+            duration=duration,
+            max_messages=max_messages,
+            max_size=max_size,
+            split_size=split_size,
+            split_duration=split_duration,
+            budget=budget,
+            reserve=reserve,
+            flush_interval=flush_interval,
+            throttle=throttle,
+            priority=priority,
+        ),
         command.Choices(
             store,
             topics,
@@ -271,6 +388,80 @@ def info(
     from hybridlog.cli import look
 
     look.show_info(what, store, mongo, as_json=as_json)
+
+
+@app.command()
+def losses(
+    recording: Annotated[
+        list[str] | None,
+        typer.Argument(help="Recordings.", metavar="RECORDING", autocompletion=complete_recording),
+    ] = None,
+    store: StoreOption = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", "-t", help="Only of these. Repeatable.", metavar="TOPIC"),
+    ] = None,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the loss ledger: what is missing, from when to when, and why."""
+    from hybridlog.cli import losses as command
+
+    command.show(recording or [], topic or [], store, mongo, as_json=as_json)
+
+
+@app.command()
+def top(
+    recording: Annotated[
+        str | None,
+        typer.Argument(
+            help="Which, when several are being recorded.",
+            metavar="RECORDING",
+            autocompletion=complete_recording,
+        ),
+    ] = None,
+    store: StoreOption = None,
+    field: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Least, mean and greatest of a field in the last seconds, such as "
+            "scan:ranges.min. Repeatable.",
+            metavar="TOPIC:FIELD",
+        ),
+    ] = None,
+    last: Annotated[
+        str, typer.Option(help="How many seconds --field looks back.", metavar="TIME")
+    ] = "5s",
+    once: Annotated[bool, typer.Option("--once", help="Show it once and leave.")] = False,
+    mongo: MongoOption = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="A line of JSON a second, for scripts.")
+    ] = False,
+) -> None:
+    """Watch a running recorder."""
+    from hybridlog.cli import top as command
+
+    command.run(recording, field or [], last, store, mongo, once=once, as_json=as_json)
+
+
+@app.command()
+def mark(
+    text: Annotated[str, typer.Argument(help="What happened.", metavar="TEXT")],
+    tag: Annotated[
+        list[str] | None, typer.Option(help="Keep KEY=VALUE with it. Repeatable.", metavar="K=V")
+    ] = None,
+    recording: RecordingOption = None,
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Set a mark while recording, that questions can use.
+
+    A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --event
+    /hybridlog/marks "text = 'gripper slipped'" --before 5s --after 5s`.
+    """
+    from hybridlog.cli import mark as command
+
+    command.run(text, tag or [], recording or [], store, quiet=quiet)
 
 
 @app.command()

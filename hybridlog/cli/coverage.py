@@ -117,3 +117,13 @@ def tell_unreadable(missing: int) -> None:
             f"{unfit(missing)} and {are} not in this answer; --format raw, mcap or bag has what "
             "came."
         )
+
+
+def tell_reduced(reduced: int) -> None:
+    """Say how many messages lack their payload because the recorder had to give it up."""
+    if reduced:
+        have = "has" if reduced == 1 else "have"
+        note(
+            f"{counted(reduced, 'message')} {have} no payload any more, given up under "
+            "pressure: not in this answer; --where and --fields find what was kept of them."
+        )

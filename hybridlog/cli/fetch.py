@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.asking import question
-from hybridlog.cli.coverage import gaps, tell_unreadable
+from hybridlog.cli.coverage import gaps, tell_reduced, tell_unreadable
 from hybridlog.cli.opening import opened
 from hybridlog.cli.placing import check_room, replacing
 from hybridlog.cli.progress import progress_bar
@@ -81,6 +81,7 @@ def run(choices: Choices) -> None:
             query = print_answer(query)
         elif path is None:
             tell_unreadable(write(query, form, sys.stdout.buffer, quiet=True))
+            tell_reduced(query.counters.reduced)
         else:
             _write_file(query, form, path, choices)
         sys.stdout.flush()
@@ -97,6 +98,7 @@ def _write_file(query: Query, form: str, path: Path, choices: Choices) -> None:
         stopped.consequence = f"{path} is not written."
         raise
     tell_unreadable(missing)
+    tell_reduced(query.counters.reduced)
 
 
 def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> int:
@@ -124,7 +126,7 @@ def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> in
             _write_exact(query, form, target, progress)
             return 0
         written = _write_rows(query, form, target, progress)
-        return counters.messages - written
+        return counters.messages - counters.reduced - written
 
 
 def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:

@@ -24,6 +24,8 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
+    from hybridlog.cli.record_live import LiveChoices
+    from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
@@ -50,13 +52,48 @@ class Choices:
     quiet: bool
 
 
-def run(paths: list[Path], choices: Choices) -> None:
+def run(paths: list[Path], live: LiveChoices, choices: Choices) -> None:
+    """Record logs, or a running robot."""
+    from hybridlog.cli import record_live
+
+    record_live.refuse_with_logs(live, paths)
+    if live.any_source:
+        _refuse_for_live(choices)
+        record_live.run(live, lambda: _live_options(live, choices), choices)
+    else:
+        _run_logs(paths, choices)
+
+
+def _refuse_for_live(choices: Choices) -> None:
+    """What makes sense for logs only.
+
+    Raises:
+        UsageError: It was given.
+    """
+    if choices.between is not None or choices.again:
+        raise UsageError("--between and --again are for logs, not for a running robot.")
+
+
+def _live_options(live: LiveChoices, choices: Choices) -> RecorderOptions:
+    from hybridlog.cli.record_live import recorder_options
+
+    return recorder_options(
+        live,
+        name=choices.name,
+        tags=tags_of(choices.tag or []),
+        topics=choices.topics or (),
+        exclude=choices.exclude or (),
+        settings=_settings(choices),
+    )
+
+
+def _run_logs(paths: list[Path], choices: Choices) -> None:
     """Record each path; what goes wrong with one does not keep the others out."""
     if choices.name is not None and len(paths) > 1:
         raise UsageError("--name names one recording; several paths were given.")
     # Everything that can be wrong with the options is wrong before a store is made.
     settings = _settings(choices)
-    tags = _tags(choices.tag or [])
+    tags = tags_of(choices.tag or [])
     _matcher(choices)
     _check_new_store(paths, choices)
     done = _Results(paths, choices)
@@ -193,7 +230,12 @@ def _settings(choices: Choices) -> SegmentSettings:
     )
 
 
-def _tags(pairs: list[str]) -> dict[str, str]:
+def tags_of(pairs: list[str]) -> dict[str, str]:
+    """KEY=VALUE pairs.
+
+    Raises:
+        UsageError: One of them is none.
+    """
     tags = {}
     for pair in pairs:
         key, sign, value = pair.partition("=")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.cli import output
-from hybridlog.cli.coverage import tell_unreadable
+from hybridlog.cli.coverage import tell_reduced, tell_unreadable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -53,7 +53,8 @@ def print_answer(query: Query) -> Query:
             "gives them all."
         )
         asked.counters.messages = SCREEN_ROWS
-    tell_unreadable(asked.counters.messages - shown)
+    tell_unreadable(asked.counters.messages - asked.counters.reduced - shown)
+    tell_reduced(asked.counters.reduced)
     return asked
 
 

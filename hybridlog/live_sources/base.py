@@ -9,8 +9,9 @@ it is given without waiting for a disk or a database.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol, Self
+
+from hybridlog.losses import Cause
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -18,29 +19,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
 
 
-class Cause(StrEnum):
-    """Why messages are missing; one word a row of the loss ledger."""
-
-    TRANSPORT = "transport"
-    """They were sent and never reached the recorder: a gap in the sender's numbers."""
-
-    CONNECTION = "connection"
-    """A connection broke in the middle of a message."""
-
-    UNREADABLE = "unreadable"
-    """They came, and cannot be kept: a type that nobody can say, a broken record."""
-
-    THROTTLE = "throttle"
-    """The user wants fewer of them."""
-
-    DEGRADE = "degrade"
-    """The memory budget was spent: the payload was given up, the fields were kept."""
-
-    QUEUE = "queue"
-    """The memory budget was spent, and there was nothing smaller to keep."""
-
-    DISK = "disk"
-    """No space."""
+__all__ = ["Cause", "LiveSource", "Sink"]
 
 
 class Sink(Protocol):
@@ -66,7 +45,7 @@ class Sink(Protocol):
         sent: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Take a message.
+        """Take a message. Those of one channel come from one thread at a time.
 
         Args:
             channel: Topic, encoding and definition: the same object for all messages of

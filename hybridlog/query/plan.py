@@ -21,6 +21,7 @@ from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
+from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segment_writer import StoredChunk
 
@@ -46,6 +47,7 @@ class Counters:
         bytes_read: Bytes read from segments.
         chunks_read: Chunks read and decompressed.
         documents_read: Index documents that came from MongoDB.
+        reduced: Messages left out because only their fields were kept.
         elapsed_s: Wall time, seconds.
     """
 
@@ -54,6 +56,7 @@ class Counters:
     bytes_read: int = 0
     chunks_read: int = 0
     documents_read: int = 0
+    reduced: int = 0
     elapsed_s: float = 0.0
 
 
@@ -78,6 +81,11 @@ class Lane:
     channel_id: int
     channel: Channel
     codec: Codec
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether it carries what is left of messages whose payload was given up."""
+        return self.channel.message_encoding == REDUCED
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import numpy as np
 from hybridlog.schema.column import Records
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -174,6 +175,15 @@ def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
         from hybridlog.schema.json_codec import JsonCodec
 
         return JsonCodec(array_limit)
+    if encoding == REDUCED:
+        from hybridlog.schema.reduced_codec import ReducedCodec
+
+        return ReducedCodec()
+    return _defined(encoding, schema, array_limit)
+
+
+def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+    """The codec of messages that a definition is needed for."""
     if encoding not in {"ros1", "cdr", "protobuf"}:
         named = f"encoding {encoding!r}" if encoding else "a message without an encoding"
         return OpaqueCodec(f"{named} is stored and fetched, not indexed")

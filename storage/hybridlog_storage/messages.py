@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 Buffer = bytes | bytearray | memoryview
 """Contiguous bytes. A memoryview has itemsize 1."""
 
+REDUCED = "hybridlog.reduced"
+"""Message encoding of a channel that carries what is left of messages without payload."""
+
 
 @dataclass(frozen=True, slots=True)
 class Schema:

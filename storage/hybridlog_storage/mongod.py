@@ -20,15 +20,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import hashlib
 import importlib.util
 import json
 import math
 import os
-import secrets
 import shutil
 import socket
-import stat
 import struct
 import subprocess
 import sys
@@ -47,6 +44,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.socket_directory import is_our_socket, new_socket, socket_base
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -58,8 +56,6 @@ SILENCE_LIMIT_S = 30.0
 """Seconds in which mongod, while it starts, has to answer or at least to log something."""
 START_LIMIT_S = 600.0
 """Seconds after which a start is given up even if mongod still logs (a long recovery)."""
-MAX_SOCKET_PATH = 100
-"""Bytes; the kernel takes 107, other systems 103."""
 _HELLO_LIMIT_S = 1.0
 _SLOW_OPERATION_MS = 5000
 _RECORD_LIMIT = 64 << 10
@@ -245,6 +241,12 @@ class EmbeddedMongod:
                 raise self._no_answer(patience)
             time.sleep(0.01)
 
+    def _new_socket(self) -> Path:
+        try:
+            return new_socket(self._directory, "mongod.sock")
+        except StoreError as error:
+            raise DatabaseError(f"mongod cannot be reached: {error}") from error
+
     def _launch(self, keeper: int) -> int | None:
         """Start a keeper and with it mongod.
 
@@ -263,7 +265,7 @@ class EmbeddedMongod:
                 return None
             program = find_mongod()
             self._remove_stale()
-            path = _make_socket_directory(self._directory) / "mongod.sock"
+            path = self._new_socket()
             before = self.log.stat().st_size if self.log.exists() else 0
             try:
                 self._spawn(program, path, keeper, alive)
@@ -283,7 +285,7 @@ class EmbeddedMongod:
         record = self._read_record()
         # A record came with the store, wherever that is from; it names a directory to
         # remove only where such directories are made.
-        if record and Path(record.socket).parent.parent == _socket_base():
+        if record and Path(record.socket).parent.parent == socket_base():
             with contextlib.suppress(OSError):
                 Path(record.socket).unlink()
                 Path(record.socket).parent.rmdir()
@@ -355,7 +357,7 @@ class EmbeddedMongod:
             return None
         if not (isinstance(record.socket, str) and isinstance(record.mongod, int)):
             return None
-        return record if _is_our_socket(record.socket) else None
+        return record if is_our_socket(record.socket) else None
 
     def _end_orphan(self) -> None:
         record = self._read_record()
@@ -486,77 +488,6 @@ def _directory_error(directory: Path, error: OSError) -> HybridlogError:
         f"embedded MongoDB needs a directory that it can write, even to read; copy the store, or "
         f"use a server with --mongo URI."
     )
-
-
-def _socket_base() -> Path:
-    """The directory of this user's sockets.
-
-    Not the store's directory, whose path may be too long for a socket, and not
-    XDG_RUNTIME_DIR, which is removed when its user logs out, while a recording may go on.
-    HYBRIDLOG_RUNTIME_DIR overrides `/tmp`.
-    """
-    base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
-    return base / f"hybridlog-{os.geteuid()}"
-
-
-def _make_socket_directory(directory: Path) -> Path:
-    """Make a new private directory for the socket of the store's mongod.
-
-    New for every mongod, so that the end of one can never remove the socket of the next.
-
-    Raises:
-        DatabaseError: The path is too long, or the directory is not private to this user.
-    """
-    own = _socket_base()
-    # The store's part is for whoever looks around in /tmp.
-    part = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
-    result = own / f"{part}-{secrets.token_hex(4)}"
-    if len(os.fsencode(result / "mongod.sock")) > MAX_SOCKET_PATH:
-        raise DatabaseError(
-            f"{own.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
-            f"one."
-        )
-    for path in (own, result):
-        try:
-            path.mkdir(mode=0o700)
-        except FileExistsError:
-            pass
-        except OSError as error:
-            raise DatabaseError(
-                f"{path} cannot be made for mongod's socket: {error.strerror}. Set "
-                f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
-            ) from error
-        if not _is_private(path):
-            raise DatabaseError(
-                f"{path} has to be a directory of this user that nobody else can open, and is "
-                f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
-            )
-    return result
-
-
-def _is_private(directory: Path) -> bool:
-    """Whether this is a real directory, ours, and closed to everybody else."""
-    try:
-        about = directory.lstat()
-    except OSError:
-        return False
-    return (
-        stat.S_ISDIR(about.st_mode)
-        and about.st_uid == os.geteuid()
-        and not stat.S_IMODE(about.st_mode) & 0o077
-    )
-
-
-def _is_our_socket(path: str) -> bool:
-    """Whether a path from a record leads to a socket of ours in a private directory."""
-    place = Path(path)
-    if not place.is_absolute() or not _is_private(place.parent):
-        return False
-    try:
-        about = place.lstat()
-    except (OSError, ValueError):
-        return False
-    return stat.S_ISSOCK(about.st_mode) and about.st_uid == os.geteuid()
 
 
 def _uri(path: str) -> str:

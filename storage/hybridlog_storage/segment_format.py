@@ -39,6 +39,7 @@ FORMAT_VERSION: Final = 1
 
 RECORDING_METADATA: Final = "hybridlog.recording"
 END_METADATA: Final = "hybridlog.end"
+LOSSES_METADATA: Final = "hybridlog.losses"
 NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 
 ARRIVAL_OPCODE: Final = 0x90

@@ -9,17 +9,17 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Metadata
+from mcap.records import ChunkIndex, Metadata, MetadataIndex
 
 from hybridlog_storage.append_file import BLOCK, DIRECT
 from hybridlog_storage.buffers import buffers
@@ -37,6 +37,7 @@ from hybridlog_storage.segment_format import (
     CHUNK_HEAD,
     END_METADATA,
     FORMAT_VERSION,
+    LOSSES_METADATA,
     RECORDING_METADATA,
     arrivals_of,
     channel_of,
@@ -82,6 +83,7 @@ class SegmentSummary:
         channels: By channel id.
         chunks: In file order.
         counts: Messages by channel id.
+        losses: Rows of the loss ledger that were written with its messages.
     """
 
     recording: dict[str, object]
@@ -89,6 +91,7 @@ class SegmentSummary:
     channels: dict[int, Channel]
     chunks: list[ChunkPlace]
     counts: dict[int, int]
+    losses: list[dict[str, Any]]
 
 
 class SegmentReader:
@@ -181,7 +184,20 @@ class SegmentReader:
             {i: channel_of(record, summary.schemas) for i, record in summary.channels.items()},
             [_place(index) for index in summary.chunk_indexes],
             dict(summary.statistics.channel_message_counts),
+            self._losses(summary.metadata_indexes),
         )
+
+    def _losses(self, indexes: Iterable[MetadataIndex]) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        for index in indexes:
+            if index.name == LOSSES_METADATA:
+                found = json_of(self._metadata(index.offset, index.length)).get("rows")
+                if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
+                    raise SegmentError(
+                        f"{self.path}: the loss ledger at byte {index.offset} is damaged."
+                    )
+                rows.extend(found)
+        return rows
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """Read, decompress and check one chunk.

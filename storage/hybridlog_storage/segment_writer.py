@@ -83,6 +83,7 @@ class SegmentSettings:
         compression: Codec of chunks that can be compressed.
         level: zstd level.
         segment_size: Bytes of file at which the next segment starts.
+        segment_span_s: Seconds after which the next segment starts; None for no such bound.
         sync: When to force data to the disk: at every chunk, when a segment is sealed,
             or never (the operating system decides).
     """
@@ -93,6 +94,7 @@ class SegmentSettings:
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 1
     segment_size: int = 4 << 30
+    segment_span_s: float | None = None
     sync: Literal["chunk", "seal", "never"] = "seal"
 
     def __post_init__(self) -> None:
@@ -100,6 +102,8 @@ class SegmentSettings:
             raise UsageError("the chunk size must lie between 1 KiB and 256 MiB")
         if not 1 <= self.level <= 19:
             raise UsageError("the zstd level must lie between 1 and 19")
+        if self.segment_span_s is not None and not self.segment_span_s > 0:
+            raise UsageError("a segment must last longer than no time")
 
 
 @dataclass(frozen=True, slots=True)
@@ -496,6 +500,7 @@ class RecordingWriter:
         self._stored_seq = 0
         self._segment: SegmentFile | None = None
         self._number = 0
+        self._opened = 0.0
         self._closed: list[Path] = []
         self._synced = 0
         self._syncing: Future[None] | None = None
@@ -709,7 +714,9 @@ class RecordingWriter:
         self.totals.chunks += 1
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
-        if segment.position >= self.settings.segment_size:
+        span = self.settings.segment_span_s
+        is_old = span is not None and time.monotonic() - self._opened >= span
+        if is_old or segment.position >= self.settings.segment_size:
             self._seal()
 
     def _sync_behind(self, segment: SegmentFile) -> None:
@@ -731,6 +738,7 @@ class RecordingWriter:
                 self._directory, self._number, self._recording, self._stored_seq
             )
             self._number += 1
+            self._opened = time.monotonic()
         return self._segment
 
     def _seal(self) -> None:

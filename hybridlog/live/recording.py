@@ -15,14 +15,16 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
 from hybridlog.capture import Capture
+from hybridlog.losses import Ledger
 from hybridlog.recorder import RecordReport
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ class LiveOptions:
 
     Attributes:
         tags: Kept with the recording.
+        source: What its messages come from, as the catalog shows it.
         budget_bytes: Payload bytes that may be in memory, not written yet.
         flush_interval_s: Seconds after which a message is in the segment at the latest:
             what a `kill -9` can cost.
@@ -53,6 +56,7 @@ class LiveOptions:
     """
 
     tags: Mapping[str, str] = field(default_factory=dict)
+    source: Mapping[str, Any] = field(default_factory=dict)
     budget_bytes: int = 512 << 20
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
@@ -74,6 +78,9 @@ class _Message(NamedTuple):
 
 class LiveRecording:
     """A recording that messages are written to as they come.
+
+    What whoever writes could not take, or had to give up, is noted in `ledger`; its rows
+    are written into the segments with the messages.
 
     Get one from `Store.start`. As a context manager it is closed at the end of the
     block, after an error too: what was received is worth keeping.
@@ -109,6 +116,8 @@ class LiveRecording:
         self._calm = 0.0
         self._failure: BaseException | None = None
         self._report: RecordReport | None = None
+        self.ledger = Ledger()
+        """What is missing from this recording."""
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -117,7 +126,7 @@ class LiveRecording:
                 database,
                 name=name,
                 tags=options.tags,
-                source={"path": "", "kind": "live", "profile": "", "bytes": 0},
+                source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
                 behind=self._behind,
             )
@@ -157,7 +166,8 @@ class LiveRecording:
         log_time: int | None = None,
         publish_time: int | None = None,
         sequence: int = 0,
-    ) -> None:
+        wait: bool = True,
+    ) -> bool:
         """Take a message; waits while the memory budget is spent. Thread safe.
 
         Args:
@@ -167,6 +177,10 @@ class LiveRecording:
             publish_time: When it was sent, ns since the epoch; None for the log time, which
                 is what a channel without publish times has.
             sequence: The sender's number, 0 to 2³²-1.
+            wait: False to refuse the message instead of waiting.
+
+        Returns:
+            Whether it was taken.
 
         Raises:
             UsageError: A number is out of its range, or the recording was closed.
@@ -179,6 +193,8 @@ class LiveRecording:
         with self._lock:
             while self._unwritten and self._unwritten + len(payload) > self._options.budget_bytes:
                 self._check()
+                if not wait:
+                    return False
                 self._wake.set()
                 self._room.wait()
             self._room.notify()  # there may be room for another
@@ -193,6 +209,33 @@ class LiveRecording:
             enough = self._inbox_bytes >= _ENOUGH
         if enough:
             self._wake.set()
+        return True
+
+    @property
+    def filled(self) -> float:
+        """How much of the memory budget is spent, 0 to 1."""
+        return self._unwritten / self._options.budget_bytes
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """Messages that were laid into chunks, and the bytes of their payloads."""
+        totals = self._capture.writer.totals
+        return totals.messages, totals.payload_bytes
+
+    @property
+    def lag(self) -> int:
+        """Messages that are not in the index yet."""
+        return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)
+
+    @property
+    def index_failure(self) -> HybridlogError | None:
+        """Why the index does not go on, None while it does."""
+        return self._capture.index.failure
+
+    @property
+    def failed(self) -> bool:
+        """Whether nothing more can be taken; `close` says why."""
+        return self._failure is not None
 
     def close(self) -> RecordReport:
         """Write, index and seal everything; tells how the recording went.
@@ -260,9 +303,11 @@ class LiveRecording:
                 ended = self._ended
                 self._take()
                 if ended:
+                    self._write_losses(everything=True)
                     return
                 if time.monotonic() - flushed >= interval / 4:
                     self._capture.writer.flush_older(interval * 3 / 4)
+                    self._write_losses()
                     self._capture.index.nudge()
                     flushed = time.monotonic()
         except BaseException as error:
@@ -270,6 +315,11 @@ class LiveRecording:
             with self._lock:
                 self._failure = error
                 self._room.notify_all()
+
+    def _write_losses(self, *, everything: bool = False) -> None:
+        rows = self.ledger.take(everything=everything)
+        if rows:
+            self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
     def _take(self) -> None:
         """Lay what has come into chunks."""

@@ -1,0 +1,143 @@
+"""What a recorder is doing, as a table that updates in place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Self
+
+from hybridlog.cli import output
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from rich.console import Group
+    from rich.text import Text
+
+    from hybridlog.live.recorder import RecorderState
+    from hybridlog.live.statistics import TopicState
+    from hybridlog.recorder import RecordReport
+
+_SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
+
+
+class LiveTable:
+    """The table; a context manager that takes it away at the end.
+
+    Args:
+        error: On standard error; else on standard output.
+    """
+
+    def __init__(self, *, error: bool = True) -> None:
+        from rich.live import Live
+
+        self._live = Live(
+            console=output.console(error=error), auto_refresh=False, transient=True, screen=False
+        )
+
+    def __enter__(self) -> Self:
+        """Take the screen."""
+        self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Give it back."""
+        self._live.stop()
+
+    def note(self, text: str) -> None:
+        """A line above the table."""
+        from rich.text import Text
+
+        self._live.console.print(Text(f"hybridlog: {output.printable(text)}"))
+
+    def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
+        """Draw it anew, with lines below."""
+        rows = max(self._live.console.height - 6 - len(below), 3)
+        self._live.update(drawn(state, rows=rows, below=below), refresh=True)
+
+
+def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Group:
+    """A state as a table of at most so many topics, and lines below."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("topic", no_wrap=True, overflow="ellipsis", ratio=1)
+    for heading in ("Hz", "usual", "MB/s", "jitter ms", "messages", "lost"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    # Those that matter most when not all fit: with losses, then the largest.
+    topics = sorted(state.topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))
+    shown = {t.topic for t in topics[:rows]}
+    for topic in state.topics:
+        if topic.topic in shown:
+            table.add_row(*_cells(topic))
+    lines: list[Table | Text] = [table]
+    if len(topics) > rows:
+        lines.append(Text(f"… and {output.counted(len(topics) - rows, 'more topic')}"))
+    lines.append(Text(summary(state), style="bold"))
+    if state.index_failure:
+        lines.append(Text(f"index: {output.printable(state.index_failure)}", style="yellow"))
+    lines.extend(Text(output.printable(line)) for line in below)
+    return Group(*lines)
+
+
+def summary(state: RecorderState) -> str:
+    """One line for the whole recorder."""
+    rate = sum(topic.bytes_per_s for topic in state.topics)
+    hz = sum(topic.hz for topic in state.topics)
+    parts = [
+        f"{state.elapsed_s:.0f} s",
+        f"{hz:.0f} messages/s",
+        f"{output.size(rate)}/s",
+        f"{output.size(state.stored_bytes)} stored",
+        f"memory {100 * state.filled:.0f} %",
+        f"index {state.lag} behind" if state.lag else "index up to date",
+        f"{output.size(state.free_bytes)} free",
+    ]
+    lost = sum(state.lost.values())
+    if lost:
+        causes = ", ".join(f"{cause} {count}" for cause, count in sorted(state.lost.items()))
+        parts.append(f"lost {lost} ({causes})")
+    return " · ".join(parts)
+
+
+def _cells(topic: TopicState) -> list[Text | str]:
+    from rich.text import Text
+
+    slow = topic.expected_hz is not None and topic.hz < _SLOW * topic.expected_hz
+    return [
+        Text(output.printable(topic.topic)),
+        Text(f"{topic.hz:.1f}", style="yellow" if slow else ""),
+        Text("" if topic.expected_hz is None else f"{topic.expected_hz:.1f}", style="dim"),
+        f"{topic.bytes_per_s / 1e6:.2f}",
+        "" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}",
+        str(topic.messages),
+        Text(str(topic.lost) if topic.lost else "", style="red"),
+    ]
+
+
+def closing_rows(report: RecordReport, state: RecorderState) -> list[tuple[str, str]]:
+    """What stands in the table at the end."""
+    entry = report.entry
+    rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
+    rows = [
+        ("source", f"{entry.source['path']} ({entry.source['kind']})"),
+        ("topics", str(len({c.topic for c in entry.channels}))),
+        ("messages", f"{entry.messages} of {state.messages} received"),
+        ("bytes in", output.size(state.stored_bytes)),
+        ("bytes stored", output.size(entry.stored_bytes)),
+        ("messages indexed", str(report.indexed)),
+        ("time", f"{report.elapsed_s:.1f} s ({rate:,.0f} messages/s)"),
+    ]
+    if not state.lost:
+        rows.append(("lost", "nothing"))
+    for cause, count in sorted(state.lost.items()):
+        topics = sorted({r["topic"] for r in entry.end.get("losses", []) if r["cause"] == cause})
+        named = ", ".join(topics[:3]) + (" …" if len(topics) > 3 else "")
+        rows.append((f"lost: {cause}", f"{count} ({named})"))
+    return rows

@@ -1,0 +1,225 @@
+"""The door of a running recorder: other processes ask it, mark, trigger, stop.
+
+A unix socket that only its owner can open. A visitor sends one JSON object on a line and
+gets one back. Where it is stands in a small file in the recording's directory, for as
+long as the recorder runs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.socket_directory import is_our_socket, new_socket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hybridlog_storage.directory import StoreDirectory
+
+Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""What a request gets; raises `HybridlogError` to refuse."""
+
+SIGN = "recorder.json"
+"""Name of the file that says where the door is."""
+
+_LONGEST = 1 << 20  # bytes of a request; answers may be longer
+_LONGEST_ANSWER = 1 << 26
+_PATIENCE_S = 5.0
+_VISITORS = 8
+
+
+class Door:
+    """Answers visitors, until it is closed.
+
+    Args:
+        recording: The recording's directory.
+        requests: What can be asked for, by word.
+
+    Raises:
+        StoreError: The socket cannot be made.
+    """
+
+    def __init__(self, recording: Path, requests: Mapping[str, Answer]) -> None:
+        self._requests = requests
+        self._sign = recording / SIGN
+        self._path = new_socket(recording, "door.sock")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._socket.bind(str(self._path))
+            self._socket.listen(_VISITORS)
+            content = json.dumps({"socket": str(self._path), "pid": os.getpid()})
+            self._sign.write_text(content + "\n", encoding="utf-8")
+        except OSError as error:
+            self.close()
+            raise StoreError(
+                f"The recorder's socket {self._path} cannot be made: {error.strerror}."
+            ) from error
+        self._places = threading.BoundedSemaphore(_VISITORS)
+        self._thread = threading.Thread(target=self._serve, name="hybridlog-door", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let nobody in any more."""
+        # Closing alone does not wake who waits in `accept`.
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        for path in (self._sign, self._path):
+            with suppress(OSError):
+                path.unlink()
+        with suppress(OSError):
+            self._path.parent.rmdir()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                visitor, _ = self._socket.accept()
+            except OSError:
+                return  # closed
+            if self._places.acquire(timeout=_PATIENCE_S):
+                threading.Thread(target=self._welcome, args=(visitor,), daemon=True).start()
+            else:
+                visitor.close()
+
+    def _welcome(self, visitor: socket.socket) -> None:
+        """Answer one visitor; one that says nothing, or never ends, is let go."""
+        try:
+            with visitor, suppress(OSError):
+                visitor.settimeout(_PATIENCE_S)
+                line = _line(visitor, _LONGEST)
+                visitor.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+        finally:
+            self._places.release()
+
+    def _answer(self, line: bytes) -> Mapping[str, Any]:
+        try:
+            request = json.loads(line)
+            answer = self._requests[request["ask"]]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            known = ", ".join(sorted(self._requests))
+            return {"error": f"no such request; there are: {known}", "exit_code": 2}
+        try:
+            return answer(request)
+        except HybridlogError as error:
+            return {"error": str(error), "exit_code": error.exit_code}
+
+
+def running(directory: StoreDirectory) -> list[str]:
+    """Recordings of a store whose recorder has a door, the latest last."""
+    found: list[tuple[float, str]] = []
+    for recording_id in directory.recording_ids():
+        recording = directory.recording(recording_id)
+        # A recorder that was killed has left its sign behind.
+        with suppress(OSError, StoreError):
+            since = (recording / SIGN).stat().st_mtime
+            _connect(recording).close()
+            found.append((since, recording_id))
+    return [recording_id for _, recording_id in sorted(found)]
+
+
+def visit(recording: Path, ask: str, **content: Any) -> dict[str, Any]:
+    """Ask a running recorder.
+
+    Args:
+        recording: The recording's directory.
+        ask: The word of the request.
+        content: What belongs to it.
+
+    Raises:
+        StoreError: Nobody answers.
+        UsageError: The recorder refuses.
+    """
+    gone = _gone(recording)
+    try:
+        with _connect(recording) as connection:
+            connection.sendall(json.dumps({"ask": ask, **content}).encode() + b"\n")
+            answer = json.loads(_line(connection, _LONGEST_ANSWER))
+    except (OSError, ValueError) as error:
+        raise StoreError(gone) from error
+    if not isinstance(answer, dict):
+        raise StoreError(gone)
+    if "error" in answer:
+        raise UsageError(str(answer["error"]))
+    return answer
+
+
+def _gone(recording: Path) -> str:
+    return f"No recorder answers for {recording.name!r}; it has ended, or was killed."
+
+
+def _connect(recording: Path) -> socket.socket:
+    """A connection to a recorder's door.
+
+    Raises:
+        StoreError: There is none, or it is not one of this user's.
+        OSError: Nobody answers.
+    """
+    try:
+        path = json.loads((recording / SIGN).read_text(encoding="utf-8"))["socket"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StoreError(_gone(recording)) from error
+    if not isinstance(path, str) or not is_our_socket(path):
+        raise StoreError(_gone(recording))
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        connection.settimeout(_PATIENCE_S)
+        connection.connect(path)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def states(recording: Path, every_s: float) -> Iterator[dict[str, Any]]:
+    """What a recorder says of itself, again and again; ends when it has ended."""
+    while True:
+        started = time.monotonic()
+        try:
+            yield visit(recording, "state")
+        except StoreError:
+            return
+        time.sleep(max(every_s - (time.monotonic() - started), 0))
+
+
+def _line(connection: socket.socket, longest: int) -> bytes:
+    parts: list[bytes] = []
+    size = 0
+    while True:
+        part = connection.recv(1 << 16)
+        parts.append(part)
+        size += len(part)
+        if not part or part.endswith(b"\n"):
+            return b"".join(parts)
+        if size > longest:
+            raise OSError("too long")
+
+
+def choose(directory: StoreDirectory, named: Sequence[str]) -> list[Path]:
+    """Directories of the running recordings that are meant: those named, or the only one.
+
+    Raises:
+        UsageError: There is none, or there are several and none was named.
+    """
+    there = running(directory)
+    if named:
+        unknown = [name for name in named if name not in there]
+        if unknown:
+            what = ", ".join(there) or "nothing"
+            raise UsageError(f"{unknown[0]!r} is not being recorded now; what is: {what}.")
+        return [directory.recording(name) for name in named]
+    if not there:
+        raise UsageError(
+            "Nothing is being recorded into this store now; start with `hybridlog record`."
+        )
+    if len(there) > 1:
+        raise UsageError(f"Several recordings are being made: name one of {', '.join(there)}.")
+    return [directory.recording(there[0])]

@@ -1,0 +1,520 @@
+"""The recorder of a running robot: what sources hand over becomes a recording.
+
+`Recorder` is the sink of its sources. It counts every message before anything can happen
+to it, so that at the end, for each topic, what was received is what was stored, and what
+the ledger says.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.live.door import Door
+from hybridlog.live.policy import EVERY, SMALL, Keep, Priority, Rule, Throttle, first_fit, step
+from hybridlog.live.recording import LiveOptions, LiveRecording
+from hybridlog.live.statistics import Tally, TopicRates, TopicState
+from hybridlog.losses import Cause
+from hybridlog.schema.reduced_codec import reduce, reduced_channel
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
+
+if TYPE_CHECKING:
+    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.query.topics import TopicMatcher
+    from hybridlog.recorder import RecordReport
+    from hybridlog.store import Store
+
+MARKS = "/hybridlog/marks"
+"""Topic of the marks that are set while recording."""
+
+_LOOK_S = 1.0
+_JUMP_S = 0.5
+_MOST_SAID = 1000
+_SEQUENCES = 1 << 32
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderOptions:
+    """What to record of a robot, and how.
+
+    Attributes:
+        name: Name of the recording.
+        tags: Kept with it.
+        matcher: Which topics; None for all.
+        throttles: Topics that are thinned out, Hz; the first that fits counts.
+        priorities: Who keeps payloads longest under pressure; the first that fits counts.
+        duration_s: Stop after so long.
+        max_messages: Stop when so many are stored.
+        max_bytes: Stop when payloads of so many bytes are stored.
+        reserve_bytes: Stop when the disk has less than this left.
+        budget_bytes: Payload bytes that may be in memory.
+        flush_interval_s: What a `kill -9` can cost, seconds.
+        settings: How segments are cut and packed.
+    """
+
+    name: str = "live"
+    tags: Mapping[str, str] = field(default_factory=dict)
+    matcher: TopicMatcher | None = None
+    throttles: Sequence[Rule] = ()
+    priorities: Sequence[Rule] = ()
+    duration_s: float | None = None
+    max_messages: int | None = None
+    max_bytes: int | None = None
+    reserve_bytes: int = 1 << 30
+    budget_bytes: int = 512 << 20
+    flush_interval_s: float = 1.0
+    settings: SegmentSettings = field(default_factory=SegmentSettings)
+
+    def __post_init__(self) -> None:
+        """Refuse bounds that would stop before the start."""
+        for name in ("duration_s", "max_messages", "max_bytes"):
+            bound = getattr(self, name)
+            if bound is not None and not bound > 0:
+                raise UsageError(f"{name.removesuffix('_s').replace('_', ' ')} must be above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderState:
+    """A recorder at one look.
+
+    Attributes:
+        recording: Id of its recording.
+        elapsed_s: Since it was started.
+        topics: Each topic that has publishers or has said something, by name.
+        messages: Received so far.
+        stored: Messages in chunks, or on their way to the disk.
+        lost: Messages lost so far, by cause, as far as they can be counted.
+        filled: Share of the memory budget that is spent, 0 to 1.
+        lag: Messages that are not in the index yet.
+        index_failure: Why the index does not go on; empty while it does.
+        free_bytes: What the disk has left.
+        stored_bytes: Payload bytes stored so far.
+    """
+
+    recording: str
+    elapsed_s: float
+    topics: Sequence[TopicState]
+    messages: int
+    stored: int
+    lost: Mapping[str, int]
+    filled: float
+    lag: int
+    index_failure: str
+    free_bytes: int
+    stored_bytes: int
+
+
+@dataclass(slots=True)
+class _Lane:
+    """What the recorder knows of one channel."""
+
+    channel: Channel
+    tally: Tally
+    throttle: Throttle | None
+    priority: Priority
+    reduced: Channel | None = None
+    thinned: int = 0
+    keep: Keep = Keep.ALL
+
+
+class Recorder:
+    """Records what sources hand over, until it is told to stop or has reached a bound.
+
+    Args:
+        store: Where to.
+        sources: Started with `start`, stopped with `stop`.
+        options: What and how.
+        say: Called with what the user should know, a line each; from any thread.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        sources: Sequence[LiveSource],
+        options: RecorderOptions,
+        say: Callable[[str], None],
+    ) -> None:
+        self._sources = sources
+        self._options = options
+        self._tell = say
+        self._store_path = store.directory.path
+        self._lanes: dict[Channel, _Lane] = {}
+        self._topics: dict[str, TopicRates] = {}
+        self._present: dict[str, int] = {}
+        self._lock = threading.Lock()
+        self._said: set[str] = set()
+        self._unended = len(sources)
+        self._over = threading.Event()
+        self._reason = ""
+        self._left = options.max_messages
+        self._closed = False
+        self._refused: tuple[Cause, str] | None = None
+        self._marks = Channel(
+            MARKS, "json", Schema("hybridlog.Mark", "jsonschema", _MARK_SCHEMA), {}
+        )
+        self._started = time.monotonic()
+        self._offset = time.time() - self._started
+        self._looked = self._started
+        self.recording: LiveRecording = store.start(
+            options.name,
+            LiveOptions(
+                tags=options.tags,
+                source={
+                    "kind": ", ".join(source.kind for source in sources),
+                    "path": ", ".join(source.address for source in sources),
+                },
+                budget_bytes=options.budget_bytes,
+                flush_interval_s=options.flush_interval_s,
+                settings=options.settings,
+            ),
+        )
+        """What is being made."""
+        self._state: RecorderState | None = None
+        try:
+            self._door = Door(
+                store.directory.recording(self.recording.id),
+                {"state": self._ask_state, "mark": self._ask_mark, "stop": self._ask_stop},
+            )
+        except BaseException:
+            self.recording.abort()
+            raise
+
+    # For whoever runs it.
+
+    def start(self) -> None:
+        """Begin to listen.
+
+        Raises:
+            SourceError: A source can never work; nothing is kept.
+            MissingDependencyError: What a source needs is not installed; nothing is kept.
+        """
+        try:
+            for source in self._sources:
+                source.start(self)
+        except BaseException:
+            for source in self._sources:
+                source.stop()
+            self._door.close()
+            self.recording.abort()
+            raise
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the end, at most so long; returns whether it has come."""
+        return self._over.wait(seconds)
+
+    @property
+    def reason(self) -> str:
+        """Why it came to its end by itself; empty while it has not."""
+        return self._reason
+
+    def stop(self) -> RecordReport:
+        """Stop listening; flush, index and seal everything.
+
+        Raises:
+            DiskFullError: No space; what was flushed before stays.
+        """
+        for source in self._sources:
+            source.stop()
+        self._over.set()
+        self._door.close()
+        return self.recording.close()
+
+    def look(self) -> RecorderState:
+        """How it is doing. Also sees to the bounds; call it about once a second."""
+        now = time.monotonic()
+        elapsed = max(now - self._looked, 1e-3)
+        self._looked = now
+        self._see_clock(now)
+        lost_by_topic: dict[str, int] = {}
+        lost: dict[str, int] = {}
+        for (topic, cause), count in self.recording.ledger.totals().items():
+            lost_by_topic[topic] = lost_by_topic.get(topic, 0) + count
+            lost[cause.value] = lost.get(cause.value, 0) + count
+        with self._lock:
+            rates = sorted(self._topics.items())
+        wall = time.time_ns()
+        topics = [
+            rate.look(elapsed, wall, lost_by_topic.get(topic, 0))
+            for topic, rate in rates
+            if rate.tallies or topic in self._present
+        ]
+        stored, stored_bytes = self.recording.stored
+        failure = self.recording.index_failure
+        state = RecorderState(
+            self.recording.id,
+            now - self._started,
+            topics,
+            sum(topic.messages for topic in topics),
+            stored,
+            lost,
+            self.recording.filled,
+            self.recording.lag,
+            "" if failure is None else str(failure),
+            shutil.disk_usage(self._store_path).free,
+            stored_bytes,
+        )
+        self._see_bounds(state)
+        self._state = state
+        return state
+
+    def mark(self, text: str, tags: Mapping[str, str]) -> None:
+        """Set a mark: a message on `MARKS` that questions and triggers can use."""
+        now = time.time_ns()
+        self.recording.write(
+            self._marks,
+            json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False).encode(),
+            log_time=now,
+        )
+
+    def silent(self) -> list[str]:
+        """Topics that had publishers and never said anything."""
+        with self._lock:
+            return sorted(
+                topic
+                for topic, rate in self._topics.items()
+                if not any(tally.messages for tally in rate.tallies)
+            )
+
+    # The sink.
+
+    def wants(self, topic: str, type_name: str) -> bool:
+        """See `Sink.wants`."""
+        if self._options.matcher is None:
+            return True
+        with self._lock:
+            return self._options.matcher(topic)
+
+    def take(
+        self,
+        channel: Channel,
+        payload: bytes,
+        *,
+        received: int,
+        sent: int | None = None,
+        sequence: int | None = None,
+    ) -> None:
+        """See `Sink.take`."""
+        lane = self._lanes.get(channel) or self._meet(channel)
+        size = len(payload)
+        through = lane.throttle is None or lane.throttle.lets_through(received)
+        if through and not self._claim():
+            return  # what comes after the end is not part of the recording
+        lane.tally.add(size, received)
+        if not through:
+            self._lose(lane, Cause.THROTTLE, "", received)
+            return
+        if self._refused is not None:
+            self._lose(lane, *self._refused, received)
+            return
+        kept = channel
+        if size > SMALL:
+            keep = step(lane.priority, self.recording.filled)
+            if keep is not Keep.ALL and not self._keeps(lane, keep):
+                payload, kept = self._reduced(lane, payload, received)
+        try:
+            taken = self.recording.write(
+                kept,
+                payload,
+                log_time=received,
+                publish_time=sent,
+                sequence=0 if sequence is None else sequence % _SEQUENCES,
+                wait=False,
+            )
+        except HybridlogError as error:
+            cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
+            self._refuse(cause, str(error))
+            self._lose(lane, cause, str(error), received)
+            return
+        if not taken:
+            self._lose(lane, Cause.QUEUE, "the memory budget was spent", received)
+
+    def lost(
+        self,
+        topic: str,
+        cause: Cause,
+        count: int | None,
+        *,
+        first: int,
+        last: int,
+        detail: str = "",
+    ) -> None:
+        """See `Sink.lost`."""
+        self.recording.ledger.note(topic, cause, count, first=first, last=last, detail=detail)
+
+    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
+        """See `Sink.topic_came`."""
+        with self._lock:
+            self._present[topic] = publishers
+            self._topics.setdefault(topic, TopicRates(topic, type_name))
+
+    def topic_gone(self, topic: str) -> None:
+        """See `Sink.topic_gone`."""
+        with self._lock:
+            self._present.pop(topic, None)
+
+    def say(self, text: str) -> None:
+        """See `Sink.say`."""
+        with self._lock:
+            # A peer that always finds new words must not fill the memory.
+            if text in self._said or len(self._said) >= _MOST_SAID:
+                return
+            self._said.add(text)
+        self._tell(text)
+
+    def ended(self, reason: str = "") -> None:
+        """See `Sink.ended`."""
+        if reason:
+            self.say(reason)
+        with self._lock:
+            self._unended -= 1
+            last = self._unended <= 0
+        if last:
+            self._end(reason or "all has been played")
+
+    # Visitors.
+
+    def _ask_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        state = self._state
+        return {} if state is None else summary_of(state)
+
+    def _ask_mark(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        text, tags = request.get("text"), request.get("tags")
+        if not isinstance(text, str) or not isinstance(tags, dict):
+            raise UsageError("a mark is a text, and tags that are texts")
+        if not all(isinstance(word, str) for pair in tags.items() for word in pair):
+            raise UsageError("tags of a mark are texts")
+        self.mark(text, tags)
+        return {"recording": self.recording.id}
+
+    def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        self._end("it was told to stop")
+        return {"recording": self.recording.id}
+
+    # How.
+
+    def _meet(self, channel: Channel) -> _Lane:
+        """A message of a channel that is new."""
+        with self._lock:
+            lane = self._lanes.get(channel)
+            if lane is None:
+                topic = channel.topic
+                type_name = channel.schema.name if channel.schema is not None else ""
+                rates = self._topics.setdefault(topic, TopicRates(topic, type_name))
+                rates.type = rates.type or type_name
+                hz = first_fit(self._options.throttles, topic)
+                priority = first_fit(self._options.priorities, topic)
+                lane = _Lane(
+                    channel,
+                    Tally(),
+                    None if hz is None else Throttle(hz),
+                    Priority.NORMAL if priority is None else Priority(int(priority)),
+                )
+                rates.tallies.append(lane.tally)
+                self._lanes[channel] = lane
+        return lane
+
+    def _claim(self) -> bool:
+        """Whether another message belongs to the recording; counts it, where that matters."""
+        if self._left is None or self._refused is not None:
+            return not self._closed
+        with self._lock:
+            self._left -= 1
+            left = self._left
+        if left <= 0:
+            self._end("as many messages as wanted")
+        return left >= 0
+
+    def _keeps(self, lane: _Lane, keep: Keep) -> bool:
+        """Whether this one of a thinned topic keeps its payload."""
+        if lane.keep is not keep:
+            lane.keep = keep
+            what = "one payload in five" if keep is Keep.EVERY_NTH else "fields only"
+            self.say(
+                f"{lane.channel.topic}: more comes than can be written; {what} while that "
+                "lasts (see the loss ledger)"
+            )
+        if keep is Keep.FIELDS:
+            return False
+        lane.thinned += 1
+        return lane.thinned % EVERY == 1
+
+    def _reduced(self, lane: _Lane, payload: bytes, received: int) -> tuple[bytes, Channel]:
+        """What is kept of a message whose payload is given up."""
+        if lane.reduced is None:
+            lane.reduced = reduced_channel(lane.channel)
+        self._lose(lane, Cause.DEGRADE, "payload given up, fields kept", received)
+        return reduce(lane.channel, payload), lane.reduced
+
+
+    def _lose(self, lane: _Lane, cause: Cause, detail: str, received: int) -> None:
+        self.recording.ledger.note(
+            lane.channel.topic, cause, 1, first=received, last=received, detail=detail
+        )
+
+    def _refuse(self, cause: Cause, reason: str) -> None:
+        """Nothing more can be stored; what still comes is counted."""
+        self._refused = cause, reason
+        self._end(reason)
+
+    def _end(self, reason: str) -> None:
+        with self._lock:
+            self._reason = self._reason or reason
+            self._closed = self._left is None and self._refused is None
+        self._over.set()
+
+    def _see_bounds(self, state: RecorderState) -> None:
+        options = self._options
+        if options.duration_s is not None and state.elapsed_s >= options.duration_s:
+            self._end("the duration is over")
+        elif options.max_bytes is not None and state.stored_bytes >= options.max_bytes:
+            self._end("as many bytes as wanted")
+        elif state.free_bytes < options.reserve_bytes:
+            left = f"{state.free_bytes / 1e9:.1f} GB"
+            self._refuse(
+                Cause.DISK,
+                f"The disk has only {left} left: free some, or lower --reserve.",
+            )
+        elif self.recording.failed:
+            self._end("the recording failed")
+
+    def _see_clock(self, now: float) -> None:
+        """Tell when the machine's clock was set: log times then jump, too."""
+        jump = time.time() - now - self._offset
+        if abs(jump) >= _JUMP_S:
+            self._offset += jump
+            self._tell(
+                f"the clock of this machine was set {'forward' if jump > 0 else 'back'} by "
+                f"{abs(jump):.1f} s; log times jump with it"
+            )
+
+
+_MARK_SCHEMA = (
+    b'{"type":"object","properties":{"text":{"type":"string"},'
+    b'"tags":{"type":"object","additionalProperties":{"type":"string"}}}}'
+)
+
+
+def summary_of(state: RecorderState) -> dict[str, Any]:
+    """A state as JSON, for scripts and for other processes."""
+    return {
+        **{k: v for k, v in asdict(state).items() if k != "topics"},
+        "lost": dict(state.lost),
+        "topics": [asdict(topic) for topic in state.topics],
+    }
+
+
+def state_of(summary: Mapping[str, Any]) -> RecorderState:
+    """The state that `summary_of` has made JSON of.
+
+    Raises:
+        TypeError: It is none.
+    """
+    topics = [TopicState(**topic) for topic in summary["topics"]]
+    return RecorderState(**{**summary, "topics": topics})

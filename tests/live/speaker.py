@@ -1,0 +1,55 @@
+"""A source that says what a test wants."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from hybridlog.live_sources.base import LiveSource, Sink
+from hybridlog_storage.messages import Channel, Schema
+
+TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
+SCAN = Schema("test_msgs/Scan", "ros1msg", b"uint32 id\nfloat32 near\nuint8[] data\n")
+
+
+def text_channel(topic: str = "/chatter") -> Channel:
+    return Channel(topic, "ros1", TEXT, {}, has_publish_time=False)
+
+
+def scan_channel(topic: str = "/scan") -> Channel:
+    return Channel(topic, "ros1", SCAN, {}, has_publish_time=False)
+
+
+def text(content: str) -> bytes:
+    data = content.encode()
+    return len(data).to_bytes(4, "little") + data
+
+
+def scan(number: int, size: int) -> bytes:
+    import struct
+
+    return struct.pack("<IfI", number, number / 2, size) + bytes([number % 256]) * size
+
+
+class Speaker(LiveSource):
+    """Hands its sink over to the test when it is started."""
+
+    kind = "test"
+    address = "a test"
+
+    def __init__(self, speak: Callable[[Sink], None] | None = None) -> None:
+        self.sink: Sink | None = None
+        self.stopped = 0
+        self._speak = speak
+
+    def start(self, sink: Sink) -> None:
+        self.sink = sink
+        if self._speak is not None:
+            self._speak(sink)
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+    def say(self, channel: Channel, payload: bytes, received: int | None = None) -> None:
+        assert self.sink is not None
+        self.sink.take(channel, payload, received=time.time_ns() if received is None else received)

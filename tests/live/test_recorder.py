@@ -1,0 +1,429 @@
+"""The recorder: what was received is what is stored, and what the ledger says."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+import hybridlog as hl
+from hybridlog.live import recorder as recorder_module
+from hybridlog.live.door import SIGN, choose, running, visit
+from hybridlog.live.policy import priority_rule, throttle_rule
+from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
+from hybridlog.live.recording import LiveRecording
+from hybridlog.losses import Cause
+from hybridlog.query.topics import matcher
+from hybridlog_storage import append_file
+from hybridlog_storage.errors import (
+    DiskFullError,
+    PayloadError,
+    SourceError,
+    StoreError,
+    UsageError,
+)
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
+from tests.test_faults import wait_for
+
+SECOND = 1_000_000_000
+FREE = RecorderOptions(reserve_bytes=0)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        yield opened
+
+
+class Running:
+    """A recorder with one speaker."""
+
+    def __init__(self, store: hl.Store, options: RecorderOptions = FREE) -> None:
+        self.speaker = Speaker()
+        self.said: list[str] = []
+        self.recorder = Recorder(store, [self.speaker], options, self.said.append)
+        self.recorder.start()
+
+    def rows(self) -> Counter[tuple[str, str]]:
+        """What the ledger of the ended recording says, by topic and cause."""
+        report = self.recorder.stop()
+        found: Counter[tuple[str, str]] = Counter()
+        for row in report.entry.end["losses"]:
+            found[row["topic"], row["cause"]] += row["count"]
+        return found
+
+
+def in_segments(store: hl.Store, recording: str) -> Counter[tuple[str, str]]:
+    """Messages by topic and encoding, as the official reader finds them."""
+    found: Counter[tuple[str, str]] = Counter()
+    for path in sorted(store.directory.recording(recording).glob("*.mcap")):
+        with path.open("rb") as stream:
+            for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
+                found[channel.topic, channel.message_encoding] += 1
+    return found
+
+
+def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
+    options = RecorderOptions(reserve_bytes=0, throttles=[throttle_rule("/scan", "5Hz")])
+    robot = Running(store, options)
+    chatter, scans = text_channel(), scan_channel()
+    for number in range(100):
+        robot.speaker.say(chatter, text(str(number)), SECOND + number * SECOND // 20)
+        robot.speaker.say(scans, scan(number, 10), SECOND + number * SECOND // 20)
+    robot.recorder.lost("/chatter", Cause.TRANSPORT, 7, first=SECOND, last=2 * SECOND)
+    robot.recorder.lost("/tf", Cause.UNREADABLE, 3, first=SECOND, last=SECOND, detail="no type")
+    state = robot.recorder.look()
+    assert {t.topic: t.messages for t in state.topics} == {"/chatter": 100, "/scan": 100}
+    rows = robot.rows()
+    kept = in_segments(store, robot.recorder.recording.id)
+    assert rows["/scan", "throttle"] == 100 - kept["/scan", "ros1"]
+    assert 23 <= kept["/scan", "ros1"] <= 28
+    assert kept["/chatter", "ros1"] == 100
+    assert rows["/chatter", "transport"] == 7
+    assert rows["/tf", "unreadable"] == 3
+    assert robot.speaker.stopped == 1
+    # The index is disposable, and so is the catalog's ledger.
+    before = [r.end for r in store.recordings()]
+    store.reindex()
+    assert [r.end for r in store.recordings()] == before
+    assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(100)]
+
+
+def test_payloads_step_down_and_fields_stay(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filled = [0.0]
+    monkeypatch.setattr(LiveRecording, "filled", property(lambda _: filled[0]))
+    options = RecorderOptions(
+        reserve_bytes=0, priorities=[priority_rule("/lidar", "high"), priority_rule("/cam", "low")]
+    )
+    robot = Running(store, options)
+    channels = {name: scan_channel(name) for name in ("/cam", "/scan", "/lidar")}
+    small = text_channel("/small")
+    number = 0
+    for filled[0] in (0.0, 0.6, 0.8, 0.9, 0.99, 0.0):
+        for _ in range(10):
+            number += 1
+            for channel in channels.values():
+                robot.speaker.say(channel, scan(number, 9000), number * SECOND)
+            robot.speaker.say(small, text("x"), number * SECOND)
+    rows = robot.rows()
+    kept = in_segments(store, robot.recorder.recording.id)
+    # Six steps of ten messages: whole, one in five, or fields only.
+    assert kept["/cam", "ros1"] == 10 + 2 + 0 + 0 + 0 + 10
+    assert kept["/scan", "ros1"] == 10 + 10 + 2 + 0 + 0 + 10
+    assert kept["/lidar", "ros1"] == 10 + 10 + 10 + 2 + 0 + 10
+    assert kept["/small", "ros1"] == 60
+    for topic in channels:
+        reduced = kept[topic, "hybridlog.reduced"]
+        assert kept[topic, "ros1"] + reduced == 60
+        assert rows[topic, "degrade"] == reduced
+    assert any("/cam" in line and "one payload in five" in line for line in robot.said)
+    # Fields of all messages are in the index, whole or not, and stay there.
+    documents = list(store.topic("/cam").documents())
+    assert [d["id"] for d in documents] == list(range(1, 61))
+    assert {d["data"]["n"] for d in documents} == {9000}
+    assert store.topic("/cam").where("near > 5 and near <= 10").count() == 10
+    store.reindex()
+    assert list(store.topic("/cam").documents()) == documents
+    store.verify()
+
+
+def test_a_reduced_message_says_what_it_was(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(LiveRecording, "filled", 0.99)
+    robot = Running(store)
+    channel, payload = scan_channel(), scan(5, 9000)
+    robot.speaker.say(channel, payload, SECOND)
+    robot.speaker.say(channel, payload[:5000], 2 * SECOND)  # does not fit its definition
+    monkeypatch.setattr(LiveRecording, "filled", 0.0)
+    robot.speaker.say(channel, payload, 3 * SECOND)
+    robot.rows()
+    query = store.topic("/scan")
+    first, second, third = query
+    assert first.is_reduced
+    assert not third.is_reduced
+    assert first.fields["near"] == 2.5
+    assert second.fields == {}
+    with pytest.raises(PayloadError, match=hashlib.sha256(payload).hexdigest()):
+        first.decode()
+    with pytest.raises(PayloadError, match="9012 bytes"):
+        _ = first.raw
+    assert third.raw == payload
+    # Answers that are made of payloads have the others, and say how many they lack.
+    batches = [batch for batch, _ in query.batches()]
+    assert sum(map(len, batches)) == 1
+    assert query.counters.reduced == 2
+    frame = store.topic("/scan").to_pandas()
+    assert frame["id"].tolist() == [5]
+    # Single fields come from the index, which has them all.
+    assert store.topic("/scan").fields("near").to_pandas()["near"].dropna().tolist() == [2.5, 2.5]
+
+
+def test_when_the_budget_is_spent_the_rest_is_counted(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocked = threading.Event()
+    lay_down = LiveRecording._lay_down
+
+    def slow(self: LiveRecording, group: object) -> int:
+        blocked.wait()
+        return lay_down(self, group)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    robot = Running(store, RecorderOptions(reserve_bytes=0, budget_bytes=1 << 20))
+    channel = text_channel()
+    for number in range(1000):
+        robot.speaker.say(channel, text("x" * 4000), SECOND + number)
+    blocked.set()
+    rows = robot.rows()
+    kept = in_segments(store, robot.recorder.recording.id)
+    assert 200 < kept["/chatter", "ros1"] < 300
+    assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
+
+
+def test_a_full_disk_ends_it_and_what_comes_is_counted(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Running(store)
+    channel = scan_channel()
+    robot.speaker.say(channel, scan(1, 3_000_000))
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(append_file.os, "pwritev", full)
+        patch.setattr("hybridlog_storage.durability.os.writev", full)
+        for number in range(200):
+            robot.speaker.say(channel, scan(number, 3_000_000))
+            if robot.recorder.wait(0.01):
+                break
+        assert "no space" in robot.recorder.reason.lower()
+        robot.speaker.say(channel, scan(1, 100))
+        state = robot.recorder.look()
+        assert state.lost["disk"] >= 2
+        with pytest.raises(DiskFullError):
+            robot.recorder.stop()
+
+
+def test_it_stops_before_the_disk_is_full(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=1 << 62))
+    robot.speaker.say(text_channel(), text("a"))
+    robot.recorder.look()
+    assert robot.recorder.wait(0)
+    assert "--reserve" in robot.recorder.reason
+    robot.speaker.say(text_channel(), text("b"))
+    assert robot.rows() == {("/chatter", "disk"): 1}
+
+
+def test_as_many_messages_as_wanted_and_not_one_more(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=0, max_messages=5))
+    channel = text_channel()
+    for number in range(20):
+        robot.speaker.say(channel, text(str(number)))
+    assert robot.recorder.wait(0)
+    assert robot.rows() == {}
+    assert [m.decode().data for m in store.topic("/chatter")] == list("01234")
+
+
+def test_bounds_of_time_and_size(store: hl.Store) -> None:
+    for options in (
+        RecorderOptions(reserve_bytes=0, duration_s=0.05),
+        RecorderOptions(reserve_bytes=0, max_bytes=1000),
+    ):
+        robot = Running(store, options)
+        robot.speaker.say(text_channel(), text("x" * 5000))
+
+        def over(robot: Running = robot) -> bool:
+            robot.recorder.look()
+            return robot.recorder.wait(0)
+
+        wait_for(over)
+        assert robot.recorder.stop().entry.messages == 1
+    with pytest.raises(UsageError, match="duration must be above 0"):
+        RecorderOptions(duration_s=0)
+
+
+def test_segments_are_split_by_time(store: hl.Store) -> None:
+    options = RecorderOptions(
+        reserve_bytes=0, flush_interval_s=0.05, settings=SegmentSettings(segment_span_s=0.1)
+    )
+    robot = Running(store, options)
+    until = time.monotonic() + 1.0
+    sent = 0
+    while time.monotonic() < until:
+        robot.speaker.say(text_channel(), text(str(sent)))
+        sent += 1
+        time.sleep(0.01)
+    report = robot.recorder.stop()
+    assert 3 <= report.entry.segments <= 12
+    assert store.topic("/chatter").count() == sent
+
+
+def test_topics_are_chosen_before_they_are_subscribed_to(store: hl.Store) -> None:
+    robot = Running(
+        store, RecorderOptions(reserve_bytes=0, matcher=matcher(["/camera/**"], ["*depth*"]))
+    )
+    sink = robot.recorder
+    assert sink.wants("/camera/image", "x")
+    assert not sink.wants("/camera/depth_raw", "x")
+    assert not sink.wants("/scan", "x")
+    sink.topic_came("/camera/image", "sensor_msgs/Image", 1)
+    assert robot.recorder.silent() == ["/camera/image"]
+    robot.recorder.stop()
+
+
+def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
+    robot = Running(store)
+    for number in range(5000):
+        robot.recorder.say("the same")
+        robot.recorder.say(f"another {number}")
+    assert robot.said.count("the same") == 1
+    assert len(robot.said) == 1000
+    robot.recorder.stop()
+
+
+def test_a_clock_that_is_set_is_told(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Running(store)
+    real = time.time
+    robot.recorder.look()
+    assert robot.said == []
+    monkeypatch.setattr(recorder_module.time, "time", lambda: real() - 3600)
+    robot.recorder.look()
+    robot.recorder.look()
+    assert len(robot.said) == 1
+    assert "back by 3600.0 s" in robot.said[0]
+    # A log time from before is stored as it is.
+    now = time.time_ns()
+    robot.speaker.say(text_channel(), text("late"), now)
+    robot.speaker.say(text_channel("/other"), text("early"), now - 3600 * SECOND)
+    robot.recorder.stop()
+    assert store.all_topics().count() == 2
+
+
+def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
+    def fail(_: object) -> None:
+        raise SourceError("no such robot")
+
+    speaker = Speaker(fail)
+    recorder = Recorder(store, [speaker], FREE, print)
+    with pytest.raises(SourceError, match="no such robot"):
+        recorder.start()
+    assert speaker.stopped == 1
+    store.refresh()
+    assert store.recordings() == []
+    assert running(store.directory) == []
+
+
+def test_sources_that_end_end_it(store: hl.Store) -> None:
+    robot = Running(store)
+    robot.recorder.ended()
+    assert robot.recorder.wait(0)
+    robot.recorder.stop()
+
+
+def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
+    robot = Running(store)
+    chatter = text_channel()
+    now = time.time_ns()
+    for number in range(10):
+        robot.speaker.say(chatter, text(str(number)), now + (number - 5) * SECOND)
+    robot.recorder.mark("gripper slipped", {"trial": "7"})
+    robot.recorder.stop()
+    marks = store.topic(MARKS).where("tags.trial = '7'")
+    assert [m.fields["text"] for m in marks] == ["gripper slipped"]
+    around = store.topic("/chatter").around(marks, "2s", "1500ms")
+    assert {m.decode().data for m in around} <= {"3", "4", "5", "6", "7"}
+    assert around.count() >= 3
+
+
+def test_visitors(store: hl.Store) -> None:
+    one, other = Running(store), Running(store)
+    here = store.directory.recording(one.recorder.recording.id)
+    assert set(running(store.directory)) == {
+        one.recorder.recording.id,
+        other.recorder.recording.id,
+    }
+    with pytest.raises(UsageError, match="Several recordings"):
+        choose(store.directory, [])
+    with pytest.raises(UsageError, match="not being recorded now"):
+        choose(store.directory, ["nothing"])
+    one.speaker.say(text_channel(), text("a"))
+    one.recorder.look()
+    state = visit(here, "state")
+    assert state["topics"][0]["messages"] == 1
+    assert recorder_module.summary_of(recorder_module.state_of(state)) == state
+    visit(here, "mark", text="here", tags={})
+    for bad in ({"text": 1, "tags": {}}, {"text": "a", "tags": {"a": 1}}, {"text": "a"}):
+        with pytest.raises(UsageError, match="tags"):
+            visit(here, "mark", **bad)
+    with pytest.raises(UsageError, match="mark, state, stop"):
+        visit(here, "dance")
+    # Who says nothing, or nonsense, or does not stop, is let go, and keeps nobody out.
+    path = json.loads((here / SIGN).read_text())["socket"]
+    assert Path(path).stat().st_uid == os.geteuid()
+    assert not Path(path).parent.stat().st_mode & 0o077
+    with socket.socket(socket.AF_UNIX) as silent, socket.socket(socket.AF_UNIX) as wild:
+        silent.connect(path)
+        wild.connect(path)
+        wild.sendall(b"[" * 100_000 + b"\n")
+        assert b"no such request" in wild.recv(1000)
+        assert visit(here, "state")
+    visit(here, "stop")
+    assert one.recorder.wait(1)
+    one.recorder.stop()
+    with pytest.raises(StoreError, match="No recorder answers"):
+        visit(here, "state")
+    assert not Path(path).parent.exists()
+    assert running(store.directory) == [other.recorder.recording.id]
+    other.recorder.stop()
+
+
+KILLED = """
+import os, signal, sys, time
+import hybridlog as hl
+from hybridlog.losses import Cause
+from hybridlog.live.recorder import Recorder, RecorderOptions
+from tests.live.speaker import Speaker, text, text_channel
+with hl.open(sys.argv[1], create=True, require_database=True) as store:
+    speaker = Speaker()
+    options = RecorderOptions(reserve_bytes=0, flush_interval_s=0.2)
+    recorder = Recorder(store, [speaker], options, print)
+    recorder.start()
+    channel = text_channel()
+    for number in range(60):
+        now = time.time_ns()
+        speaker.say(channel, text(str(number)), now)
+        recorder.lost("/scan", Cause.TRANSPORT, 1, first=now, last=now)
+        time.sleep(0.02)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    with hl.open(path) as store:
+        (recording,) = store.recordings()
+        assert recording.status == "recovered"
+        # 0.2 s are ten messages and ten rows; the machine may be slow.
+        assert recording.messages >= 40
+        assert sum(row["count"] for row in recording.end["losses"]) >= 40
+        assert running(store.directory) == []
