@@ -18,6 +18,7 @@ from pymongo import MongoClient
 from pymongo.collection import Collection
 from pymongo.errors import ConnectionFailure
 
+from hybridlog.query import evaluate
 from hybridlog.query.filters import check_filter
 from hybridlog.query.where import compile_filter, parse
 from hybridlog_storage.errors import WhereError
@@ -482,6 +483,10 @@ def test_a_server_answers_as_the_language_says(
             found = {document["_id"] for document in collection.find(query, {"_id": 1})}
             expected = {n for n, document in enumerate(docs) if holds(question, document)}
             assert found == expected, (where, [docs[n] for n in found ^ expected])  # type: ignore[index]
+        # Triggers ask the same of a message that is in no database yet.
+        parsed = parse(where)
+        in_memory = {n for n, document in enumerate(docs) if evaluate.holds(parsed, document)}
+        assert in_memory == expected, (where, [docs[n] for n in in_memory ^ expected])
 
 
 def test_the_deepest_predicate_is_taken(collection: Collection[Document]) -> None:
