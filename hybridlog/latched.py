@@ -12,19 +12,19 @@ import numpy as np
 if TYPE_CHECKING:
     from hybridlog.query.plan import Lane
     from hybridlog.reader import Query
-    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.messages import Batch, Channel
 
 _TRANSIENT_LOCAL = re.compile(r"durability:\s*(?:1|transient_local)\b")
 _DEEPEST = 1000
 
 
-def depth_of(lane: Lane) -> int:
+def depth_of(channel: Channel) -> int:
     """How many of a channel's last messages a late subscriber gets; 0 without latching.
 
     A ROS 1 connection latches one message. A ROS 2 channel mixes the publishers of its
     topic, and the depth of each says nothing of their number: all are kept, within reason.
     """
-    metadata = lane.channel.metadata
+    metadata = channel.metadata
     if metadata.get("latching") in {"1", "true"}:
         return 1
     if _TRANSIENT_LOCAL.search(metadata.get("offered_qos_profiles", "")):
@@ -43,7 +43,7 @@ def in_force(query: Query) -> Iterator[tuple[Batch, Sequence[Lane]]]:
             {
                 lane.channel.topic
                 for lane in query.lanes()
-                if lane.recording.id == recording.id and depth_of(lane)
+                if lane.recording.id == recording.id and depth_of(lane.channel)
             }
         )
         if not topics:
@@ -57,7 +57,7 @@ def in_force(query: Query) -> Iterator[tuple[Batch, Sequence[Lane]]]:
 def _last(before: Query, begin: int) -> Iterator[tuple[Batch, Sequence[Lane]]]:
     """The last messages of each latching channel, oldest first."""
     plan = before.plan()
-    room = [depth_of(lane) for lane in plan.lanes]
+    room = [depth_of(lane.channel) for lane in plan.lanes]
     kept: list[Batch] = []
     for piece in before.pieces(plan):
         rows = []

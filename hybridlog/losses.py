@@ -58,8 +58,6 @@ class Ledger:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[tuple[str, Cause, str], _Open] = {}
-        self._totals: dict[tuple[str, Cause], int] = {}
-        self._uncounted: set[tuple[str, Cause]] = set()
 
     def note(
         self,
@@ -88,21 +86,6 @@ class Ledger:
             else:
                 row.first, row.last = min(row.first, first), max(row.last, last)
                 row.count = _sum(row.count, count)
-            if count is None:
-                self._uncounted.add((topic, cause))
-            else:
-                self._totals[topic, cause] = self._totals.get((topic, cause), 0) + count
-
-    def totals(self) -> dict[tuple[str, Cause], int]:
-        """Messages that were lost so far, by topic and cause; those that can be counted."""
-        with self._lock:
-            return dict(self._totals)
-
-    @property
-    def uncounted(self) -> frozenset[tuple[str, Cause]]:
-        """Topics and causes that have lost nobody knows how many besides."""
-        with self._lock:
-            return frozenset(self._uncounted)
 
     def take(self, *, everything: bool = False) -> list[dict[str, Any]]:
         """The rows since the last time; they are the caller's now.

@@ -303,6 +303,29 @@ def record(
     flush_interval: Annotated[
         str, typer.Option(help="Live: what a kill can cost at most.", metavar="TIME")
     ] = "1s",
+    ring: Annotated[
+        str | None,
+        typer.Option(
+            help="Live: keep only the last TIME, in memory, and write it out when something "
+            "happens: --trigger, SIGUSR1, or `hybridlog trigger`.",
+            metavar="TIME",
+        ),
+    ] = None,
+    trigger: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="With --ring: when a message fits, such as '/diagnostics: status[*].level >= 2'. "
+            "Repeatable.",
+            metavar="TOPIC: PREDICATE",
+        ),
+    ] = None,
+    before: Annotated[
+        str | None,
+        typer.Option(help="With --ring: time before the trigger; else all.", metavar="TIME"),
+    ] = None,
+    after: Annotated[
+        str | None, typer.Option(help="With --ring: time after the trigger.", metavar="TIME")
+    ] = None,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -339,6 +362,10 @@ def record(
             flush_interval=flush_interval,
             throttle=throttle,
             priority=priority,
+            ring=ring,
+            trigger=trigger,
+            before=before,
+            after=after,
         ),
         command.Choices(
             store,
@@ -462,6 +489,19 @@ def mark(
     from hybridlog.cli import mark as command
 
     command.run(text, tag or [], recording or [], store, quiet=quiet)
+
+
+@app.command()
+def trigger(
+    name: Annotated[str, typer.Argument(help="Why, in a word.", metavar="NAME")],
+    recording: RecordingOption = None,
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Let a recorder with a ring write a snapshot now."""
+    from hybridlog.cli import mark as command
+
+    command.fire(name, recording or [], store, quiet=quiet)
 
 
 @app.command()

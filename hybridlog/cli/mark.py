@@ -1,4 +1,4 @@
-"""`hybridlog mark`."""
+"""`hybridlog mark` and `trigger`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,22 @@ def run(
     from hybridlog.cli.record import tags_of
     from hybridlog.live.door import choose, visit
     from hybridlog.store import store_path
-    from hybridlog_storage.directory import StoreDirectory
 
     pairs = tags_of(tags)
-    directory = StoreDirectory(store_path(store))
-    for recording in choose(directory, recordings):
-        answer = visit(recording, "mark", text=text, tags=pairs)
+    path = store_path(store)
+    for name in choose(path, recordings):
+        answer = visit(path, name, "mark", text=text, tags=pairs)
         if not quiet:
             output.note(f"Marked in {answer['recording']}.")
+
+
+def fire(name: str, recorders: Sequence[str], store: Path | None, *, quiet: bool) -> None:
+    """Let the recorders that are meant write a snapshot."""
+    from hybridlog.live.door import choose, visit
+    from hybridlog.store import store_path
+
+    path = store_path(store)
+    for recorder in choose(path, recorders):
+        answer = visit(path, recorder, "trigger", reason=name)
+        if not quiet:
+            output.note(f"{answer['recording']} writes a snapshot.")

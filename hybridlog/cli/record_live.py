@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.cli.record import Choices
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
+    from hybridlog.live.snapshots import SnapshotOptions
     from hybridlog.live_sources.base import LiveSource
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.segment_writer import SegmentSettings
@@ -52,6 +53,10 @@ class LiveChoices:
     budget: str = "512MB"
     reserve: str = "1GB"
     flush_interval: str = "1s"
+    ring: str | None = None
+    trigger: list[str] | None = None
+    before: str | None = None
+    after: str | None = None
     throttle: list[str] | None = None
     priority: list[str] | None = None
 
@@ -74,14 +79,14 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
         choices.store, choices.mongo, create=True, needs_database=True, quiet=quiet
     ) as store:
         recorder = Recorder(store, sources, chosen, shown.say)
-        with _until_told() as told_to_stop:
+        with _until_told() as told_to_stop, _fired_by_signal(recorder, chosen):
             recorder.start()
             with shown.table():
                 _watch(recorder, told_to_stop, shown)
             if not quiet:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
-            report = recorder.stop()
-        shown.close(report, recorder, chosen)
+            reports = recorder.stop()
+        shown.close(reports, recorder, chosen)
 
 
 def recorder_options(
@@ -122,6 +127,22 @@ def recorder_options(
         budget_bytes=output.parse_size(live.budget),
         flush_interval_s=_seconds(live.flush_interval),
         settings=settings,
+        snapshots=_snapshots(live),
+    )
+
+
+def _snapshots(live: LiveChoices) -> SnapshotOptions | None:
+    from hybridlog.live.snapshots import SnapshotOptions, Trigger
+
+    if live.ring is None:
+        if live.trigger or live.before is not None or live.after is not None:
+            raise UsageError("--trigger, --before and --after are for --ring.")
+        return None
+    return SnapshotOptions(
+        _seconds(live.ring),
+        None if live.before is None else _seconds(live.before),
+        0.0 if live.after is None else _seconds(live.after),
+        tuple(Trigger.of(text) for text in live.trigger or ()),
     )
 
 
@@ -200,6 +221,24 @@ def _until_told() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def _fired_by_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[None]:
+    """SIGUSR1 writes a snapshot."""
+    if options.snapshots is None or not hasattr(signal, "SIGUSR1"):
+        yield
+        return
+
+    def fire(number: int, _frame: FrameType | None) -> None:
+        # Not in the handler: what it interrupts may hold the locks that are needed.
+        threading.Thread(target=recorder.fire, args=("SIGUSR1",), daemon=True).start()
+
+    before = signal.signal(signal.SIGUSR1, fire)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
 def _number(name: str) -> signal.Signals:
     return signal.Signals[name]
 
@@ -234,45 +273,76 @@ class _Shown:
 
             print(json.dumps({"state": summary_of(state)}), flush=True)  # noqa: T201
 
-    def close(self, report: RecordReport, recorder: Recorder, options: RecorderOptions) -> None:
+    def close(
+        self, reports: Sequence[RecordReport], recorder: Recorder, options: RecorderOptions
+    ) -> None:
         """How it went; leaves with the code of what went wrong."""
-        entry, reason, state = report.entry, recorder.reason, recorder.look()
+        state, reason = recorder.look(), recorder.reason
         if self._as_json:
-            print(json.dumps({"report": _report(report, state, reason)}), flush=True)  # noqa: T201
+            summary = _summary(reports, state, reason)
+            print(json.dumps({"report": summary}), flush=True)  # noqa: T201
         elif not self._quiet:
-            rows = closing_rows(report, state)
-            if reason:
-                rows.append(("ended", reason))
-            output.print_table([("recording", "left"), (entry.id, "left")], rows)
+            _print(reports, state, reason)
         if not self._quiet:
             for topic in recorder.silent():
                 output.note(f"{topic}: has a publisher, and never said anything")
             for pattern in options.matcher.unused() if options.matcher is not None else ():
                 output.note(f"no topic fits {pattern!r}")
-        if report.failure is not None:
-            output.note(
-                f"hybridlog: {report.failure} {output.stored(report.missed)} but not in the "
-                "index; the next command that opens the store catches up."
-            )
-            raise typer.Exit(DatabaseError.exit_code)
+        for report in reports:
+            if report.failure is not None:
+                output.note(
+                    f"hybridlog: {report.failure} {output.stored(report.missed)} but not in the "
+                    "index; the next command that opens the store catches up."
+                )
+                raise typer.Exit(DatabaseError.exit_code)
         if state.lost.get("disk"):
             raise typer.Exit(DiskFullError.exit_code)
 
 
-def _report(report: RecordReport, state: RecorderState, reason: str) -> dict[str, Any]:
-    entry = report.entry
+def _print(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> None:
+    if state.snapshots is None:
+        rows = closing_rows(reports[0], state)
+        if reason:
+            rows.append(("ended", reason))
+        output.print_table([("recording", "left"), (reports[0].entry.id, "left")], rows)
+        return
+    if not reports:
+        output.note("Nothing was triggered, so nothing is kept.")
+        return
+    output.print_table(
+        [("snapshot", "left"), ("because of", "left"), ("messages", "right"), ("stored", "right")],
+        [
+            (
+                report.entry.id,
+                report.entry.tags.get("trigger", ""),
+                str(report.entry.messages),
+                output.size(report.entry.stored_bytes),
+            )
+            for report in reports
+        ],
+    )
+
+
+def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
+    recordings = [
+        {
+            "recording": report.entry.id,
+            "status": report.entry.status,
+            "tags": report.entry.tags,
+            "messages": report.entry.messages,
+            "messages_indexed": report.indexed,
+            "losses": report.entry.end.get("losses", []),
+            "bytes_stored": report.entry.stored_bytes,
+            "seconds": round(report.elapsed_s, 3),
+        }
+        for report in reports
+    ]
     return {
-        "recording": entry.id,
-        "status": entry.status,
         "ended": reason,
-        "messages": entry.messages,
+        "recordings": recordings,
         "messages_received": state.messages,
-        "messages_indexed": report.indexed,
-        "lost": dict(state.lost),
-        "losses": entry.end.get("losses", []),
         "bytes": state.stored_bytes,
-        "bytes_stored": entry.stored_bytes,
-        "seconds": round(report.elapsed_s, 3),
+        "lost": dict(state.lost),
         "topics": {
             topic.topic: {"received": topic.messages, "lost": topic.lost} for topic in state.topics
         },

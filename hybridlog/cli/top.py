@@ -46,12 +46,11 @@ def run(
     from hybridlog.live.door import choose, states
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
-    from hybridlog_storage.directory import StoreDirectory
 
     asked = [_field(text) for text in fields]
     span = parse_duration(last)
-    directory = StoreDirectory(store_path(store))
-    (path,) = choose(directory, [] if recording is None else [recording])
+    path = store_path(store)
+    (name,) = choose(path, [] if recording is None else [recording])
     on_screen = not as_json and sys.stdout.isatty() and not once
     with ExitStack() as held:
         database = None
@@ -59,10 +58,10 @@ def run(
             opened_store = held.enter_context(opened(store, mongo, needs_database=True))
             database = opened_store.database_for("top --field")
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
-        for raw in states(path, _EVERY_S):
+        for raw in states(path, name, _EVERY_S):
             if not raw:
                 continue  # it has only just started
-            values = [] if database is None else _values(database, path.name, raw, asked, span)
+            values = [] if database is None else _values(database, name, raw, asked, span)
             if as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
@@ -72,7 +71,7 @@ def run(
             if once or not (as_json or on_screen):
                 return
     if not as_json:
-        output.note(f"{path.name} has ended.")
+        output.note(f"{name} has ended.")
 
 
 def _field(text: str) -> _Field:

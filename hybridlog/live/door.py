@@ -1,8 +1,8 @@
 """The door of a running recorder: other processes ask it, mark, trigger, stop.
 
 A unix socket that only its owner can open. A visitor sends one JSON object on a line and
-gets one back. Where it is stands in a small file in the recording's directory, for as
-long as the recorder runs.
+gets one back. Where it is stands in a small file in the store's directory `recorders`,
+for as long as the recorder runs.
 """
 
 from __future__ import annotations
@@ -23,13 +23,11 @@ from hybridlog_storage.socket_directory import is_our_socket, new_socket
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from hybridlog_storage.directory import StoreDirectory
-
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """What a request gets; raises `HybridlogError` to refuse."""
 
-SIGN = "recorder.json"
-"""Name of the file that says where the door is."""
+_SIGNS = "recorders"
+_SUFFIX = ".json"
 
 _LONGEST = 1 << 20  # bytes of a request; answers may be longer
 _LONGEST_ANSWER = 1 << 26
@@ -41,21 +39,24 @@ class Door:
     """Answers visitors, until it is closed.
 
     Args:
-        recording: The recording's directory.
+        store: The store's directory.
+        name: Of the recorder: that of its recording.
         requests: What can be asked for, by word.
 
     Raises:
         StoreError: The socket cannot be made.
     """
 
-    def __init__(self, recording: Path, requests: Mapping[str, Answer]) -> None:
+    def __init__(self, store: Path, name: str, requests: Mapping[str, Answer]) -> None:
+        self.name = name
         self._requests = requests
-        self._sign = recording / SIGN
-        self._path = new_socket(recording, "door.sock")
+        self._sign = _sign(store, name)
+        self._path = new_socket(store, "door.sock")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.bind(str(self._path))
             self._socket.listen(_VISITORS)
+            self._sign.parent.mkdir(exist_ok=True)
             content = json.dumps({"socket": str(self._path), "pid": os.getpid()})
             self._sign.write_text(content + "\n", encoding="utf-8")
         except OSError as error:
@@ -113,24 +114,28 @@ class Door:
             return {"error": str(error), "exit_code": error.exit_code}
 
 
-def running(directory: StoreDirectory) -> list[str]:
-    """Recordings of a store whose recorder has a door, the latest last."""
+def running(store: Path) -> list[str]:
+    """Names of the recorders that run on a store, the latest last.
+
+    Args:
+        store: The store's directory.
+    """
     found: list[tuple[float, str]] = []
-    for recording_id in directory.recording_ids():
-        recording = directory.recording(recording_id)
+    for sign in (store / _SIGNS).glob(f"*{_SUFFIX}"):
         # A recorder that was killed has left its sign behind.
         with suppress(OSError, StoreError):
-            since = (recording / SIGN).stat().st_mtime
-            _connect(recording).close()
-            found.append((since, recording_id))
-    return [recording_id for _, recording_id in sorted(found)]
+            since = sign.stat().st_mtime
+            _connect(store, sign.stem).close()
+            found.append((since, sign.stem))
+    return [name for _, name in sorted(found)]
 
 
-def visit(recording: Path, ask: str, **content: Any) -> dict[str, Any]:
+def visit(store: Path, name: str, ask: str, **content: Any) -> dict[str, Any]:
     """Ask a running recorder.
 
     Args:
-        recording: The recording's directory.
+        store: The store's directory.
+        name: The recorder's name.
         ask: The word of the request.
         content: What belongs to it.
 
@@ -138,25 +143,28 @@ def visit(recording: Path, ask: str, **content: Any) -> dict[str, Any]:
         StoreError: Nobody answers.
         UsageError: The recorder refuses.
     """
-    gone = _gone(recording)
     try:
-        with _connect(recording) as connection:
+        with _connect(store, name) as connection:
             connection.sendall(json.dumps({"ask": ask, **content}).encode() + b"\n")
             answer = json.loads(_line(connection, _LONGEST_ANSWER))
     except (OSError, ValueError) as error:
-        raise StoreError(gone) from error
+        raise StoreError(_gone(name)) from error
     if not isinstance(answer, dict):
-        raise StoreError(gone)
+        raise StoreError(_gone(name))
     if "error" in answer:
         raise UsageError(str(answer["error"]))
     return answer
 
 
-def _gone(recording: Path) -> str:
-    return f"No recorder answers for {recording.name!r}; it has ended, or was killed."
+def _sign(store: Path, name: str) -> Path:
+    return store / _SIGNS / f"{name}{_SUFFIX}"
 
 
-def _connect(recording: Path) -> socket.socket:
+def _gone(name: str) -> str:
+    return f"No recorder answers for {name!r}; it has ended, or was killed."
+
+
+def _connect(store: Path, name: str) -> socket.socket:
     """A connection to a recorder's door.
 
     Raises:
@@ -164,11 +172,11 @@ def _connect(recording: Path) -> socket.socket:
         OSError: Nobody answers.
     """
     try:
-        path = json.loads((recording / SIGN).read_text(encoding="utf-8"))["socket"]
+        path = json.loads(_sign(store, name).read_text(encoding="utf-8"))["socket"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(_gone(recording)) from error
+        raise StoreError(_gone(name)) from error
     if not isinstance(path, str) or not is_our_socket(path):
-        raise StoreError(_gone(recording))
+        raise StoreError(_gone(name))
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         connection.settimeout(_PATIENCE_S)
@@ -179,12 +187,12 @@ def _connect(recording: Path) -> socket.socket:
     return connection
 
 
-def states(recording: Path, every_s: float) -> Iterator[dict[str, Any]]:
+def states(store: Path, name: str, every_s: float) -> Iterator[dict[str, Any]]:
     """What a recorder says of itself, again and again; ends when it has ended."""
     while True:
         started = time.monotonic()
         try:
-            yield visit(recording, "state")
+            yield visit(store, name, "state")
         except StoreError:
             return
         time.sleep(max(every_s - (time.monotonic() - started), 0))
@@ -203,23 +211,27 @@ def _line(connection: socket.socket, longest: int) -> bytes:
             raise OSError("too long")
 
 
-def choose(directory: StoreDirectory, named: Sequence[str]) -> list[Path]:
-    """Directories of the running recordings that are meant: those named, or the only one.
+def choose(store: Path, named: Sequence[str]) -> list[str]:
+    """The running recorders that are meant: those named, or the only one.
+
+    Args:
+        store: The store's directory.
+        named: As the user has named them.
 
     Raises:
         UsageError: There is none, or there are several and none was named.
     """
-    there = running(directory)
+    there = running(store)
     if named:
         unknown = [name for name in named if name not in there]
         if unknown:
             what = ", ".join(there) or "nothing"
             raise UsageError(f"{unknown[0]!r} is not being recorded now; what is: {what}.")
-        return [directory.recording(name) for name in named]
+        return list(named)
     if not there:
         raise UsageError(
             "Nothing is being recorded into this store now; start with `hybridlog record`."
         )
     if len(there) > 1:
         raise UsageError(f"Several recordings are being made: name one of {', '.join(there)}.")
-    return [directory.recording(there[0])]
+    return there

@@ -8,6 +8,7 @@ the ledger says.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import threading
 import time
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.live.door import Door
 from hybridlog.live.policy import EVERY, SMALL, Keep, Priority, Rule, Throttle, first_fit, step
 from hybridlog.live.recording import LiveOptions, LiveRecording
+from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
@@ -57,6 +59,7 @@ class RecorderOptions:
         budget_bytes: Payload bytes that may be in memory.
         flush_interval_s: What a `kill -9` can cost, seconds.
         settings: How segments are cut and packed.
+        snapshots: Keep only what lies around triggers; None to keep everything.
     """
 
     name: str = "live"
@@ -71,6 +74,7 @@ class RecorderOptions:
     budget_bytes: int = 512 << 20
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
+    snapshots: SnapshotOptions | None = None
 
     def __post_init__(self) -> None:
         """Refuse bounds that would stop before the start."""
@@ -85,7 +89,7 @@ class RecorderState:
     """A recorder at one look.
 
     Attributes:
-        recording: Id of its recording.
+        name: Of the recorder: the id of its recording.
         elapsed_s: Since it was started.
         topics: Each topic that has publishers or has said something, by name.
         messages: Received so far.
@@ -96,9 +100,10 @@ class RecorderState:
         index_failure: Why the index does not go on; empty while it does.
         free_bytes: What the disk has left.
         stored_bytes: Payload bytes stored so far.
+        snapshots: Snapshots so far; None when everything is kept.
     """
 
-    recording: str
+    name: str
     elapsed_s: float
     topics: Sequence[TopicState]
     messages: int
@@ -109,6 +114,7 @@ class RecorderState:
     index_failure: str
     free_bytes: int
     stored_bytes: int
+    snapshots: int | None = None
 
 
 @dataclass(slots=True)
@@ -162,29 +168,51 @@ class Recorder:
         self._started = time.monotonic()
         self._offset = time.time() - self._started
         self._looked = self._started
-        self.recording: LiveRecording = store.start(
+        self._lost: dict[tuple[str, Cause], int] = {}
+        self._state: RecorderState | None = None
+        self._target: LiveRecording | Snapshots
+        if options.snapshots is None:
+            self._target = self._begin(store, {})
+            self.name = self._target.id
+        else:
+            self.name = f"{options.name}-ring-{os.getpid()}"
+            self._target = Snapshots(
+                options.snapshots,
+                options.budget_bytes,
+                lambda reason: self._begin(store, {"trigger": reason}),
+                self._tell,
+            )
+        try:
+            self._door = Door(
+                store.directory.path,
+                self.name,
+                {
+                    "state": self._ask_state,
+                    "mark": self._ask_mark,
+                    "trigger": self._ask_trigger,
+                    "stop": self._ask_stop,
+                },
+            )
+        except BaseException:
+            self._target.abort()
+            raise
+
+    def _begin(self, store: Store, tags: Mapping[str, str]) -> LiveRecording:
+        """Start a recording."""
+        options = self._options
+        return store.start(
             options.name,
             LiveOptions(
-                tags=options.tags,
+                tags={**options.tags, **tags},
                 source={
-                    "kind": ", ".join(source.kind for source in sources),
-                    "path": ", ".join(source.address for source in sources),
+                    "kind": ", ".join(source.kind for source in self._sources),
+                    "path": ", ".join(source.address for source in self._sources),
                 },
                 budget_bytes=options.budget_bytes,
                 flush_interval_s=options.flush_interval_s,
                 settings=options.settings,
             ),
         )
-        """What is being made."""
-        self._state: RecorderState | None = None
-        try:
-            self._door = Door(
-                store.directory.recording(self.recording.id),
-                {"state": self._ask_state, "mark": self._ask_mark, "stop": self._ask_stop},
-            )
-        except BaseException:
-            self.recording.abort()
-            raise
 
     # For whoever runs it.
 
@@ -202,7 +230,7 @@ class Recorder:
             for source in self._sources:
                 source.stop()
             self._door.close()
-            self.recording.abort()
+            self._target.abort()
             raise
 
     def wait(self, seconds: float) -> bool:
@@ -214,8 +242,8 @@ class Recorder:
         """Why it came to its end by itself; empty while it has not."""
         return self._reason
 
-    def stop(self) -> RecordReport:
-        """Stop listening; flush, index and seal everything.
+    def stop(self) -> list[RecordReport]:
+        """Stop listening; flush, index and seal everything. How each recording went.
 
         Raises:
             DiskFullError: No space; what was flushed before stays.
@@ -224,7 +252,9 @@ class Recorder:
             source.stop()
         self._over.set()
         self._door.close()
-        return self.recording.close()
+        if isinstance(self._target, Snapshots):
+            return self._target.close()
+        return [self._target.close()]
 
     def look(self) -> RecorderState:
         """How it is doing. Also sees to the bounds; call it about once a second."""
@@ -234,7 +264,11 @@ class Recorder:
         self._see_clock(now)
         lost_by_topic: dict[str, int] = {}
         lost: dict[str, int] = {}
-        for (topic, cause), count in self.recording.ledger.totals().items():
+        if isinstance(self._target, Snapshots):
+            self._target.look()
+        with self._lock:
+            totals = dict(self._lost)
+        for (topic, cause), count in totals.items():
             lost_by_topic[topic] = lost_by_topic.get(topic, 0) + count
             lost[cause.value] = lost.get(cause.value, 0) + count
         with self._lock:
@@ -245,20 +279,21 @@ class Recorder:
             for topic, rate in rates
             if rate.tallies or topic in self._present
         ]
-        stored, stored_bytes = self.recording.stored
-        failure = self.recording.index_failure
+        stored, stored_bytes = self._target.stored
+        failure = self._target.index_failure
         state = RecorderState(
-            self.recording.id,
+            self.name,
             now - self._started,
             topics,
             sum(topic.messages for topic in topics),
             stored,
             lost,
-            self.recording.filled,
-            self.recording.lag,
+            self._target.filled,
+            self._target.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._store_path).free,
             stored_bytes,
+            self._target.count if isinstance(self._target, Snapshots) else None,
         )
         self._see_bounds(state)
         self._state = state
@@ -267,11 +302,21 @@ class Recorder:
     def mark(self, text: str, tags: Mapping[str, str]) -> None:
         """Set a mark: a message on `MARKS` that questions and triggers can use."""
         now = time.time_ns()
-        self.recording.write(
+        self._target.write(
             self._marks,
             json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False).encode(),
             log_time=now,
         )
+
+    def fire(self, reason: str) -> None:
+        """Write a snapshot.
+
+        Raises:
+            UsageError: Everything is kept already.
+        """
+        if not isinstance(self._target, Snapshots):
+            raise UsageError("this recorder keeps everything: triggers are for --ring")
+        self._target.fire(reason)
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never said anything."""
@@ -315,11 +360,11 @@ class Recorder:
             return
         kept = channel
         if size > SMALL:
-            keep = step(lane.priority, self.recording.filled)
+            keep = step(lane.priority, self._target.filled)
             if keep is not Keep.ALL and not self._keeps(lane, keep):
                 payload, kept = self._reduced(lane, payload, received)
         try:
-            taken = self.recording.write(
+            taken = self._target.write(
                 kept,
                 payload,
                 log_time=received,
@@ -346,7 +391,7 @@ class Recorder:
         detail: str = "",
     ) -> None:
         """See `Sink.lost`."""
-        self.recording.ledger.note(topic, cause, count, first=first, last=last, detail=detail)
+        self._note(topic, cause, count, first=first, last=last, detail=detail)
 
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
         """See `Sink.topic_came`."""
@@ -391,11 +436,18 @@ class Recorder:
         if not all(isinstance(word, str) for pair in tags.items() for word in pair):
             raise UsageError("tags of a mark are texts")
         self.mark(text, tags)
-        return {"recording": self.recording.id}
+        return {"recording": self.name}
+
+    def _ask_trigger(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        reason = request.get("reason")
+        if not isinstance(reason, str) or not reason:
+            raise UsageError("a trigger has a reason")
+        self.fire(reason)
+        return {"recording": self.name}
 
     def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         self._end("it was told to stop")
-        return {"recording": self.recording.id}
+        return {"recording": self.name}
 
     # How.
 
@@ -452,11 +504,15 @@ class Recorder:
         self._lose(lane, Cause.DEGRADE, "payload given up, fields kept", received)
         return reduce(lane.channel, payload), lane.reduced
 
-
     def _lose(self, lane: _Lane, cause: Cause, detail: str, received: int) -> None:
-        self.recording.ledger.note(
-            lane.channel.topic, cause, 1, first=received, last=received, detail=detail
-        )
+        self._note(lane.channel.topic, cause, 1, first=received, last=received, detail=detail)
+
+    def _note(
+        self, topic: str, cause: Cause, count: int | None, *, first: int, last: int, detail: str
+    ) -> None:
+        with self._lock:
+            self._lost[topic, cause] = self._lost.get((topic, cause), 0) + (count or 0)
+        self._target.ledger.note(topic, cause, count, first=first, last=last, detail=detail)
 
     def _refuse(self, cause: Cause, reason: str) -> None:
         """Nothing more can be stored; what still comes is counted."""
@@ -481,7 +537,7 @@ class Recorder:
                 Cause.DISK,
                 f"The disk has only {left} left: free some, or lower --reserve.",
             )
-        elif self.recording.failed:
+        elif self._target.failed:
             self._end("the recording failed")
 
     def _see_clock(self, now: float) -> None:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
-from hybridlog.live.door import SIGN, choose, running, visit
+from hybridlog.live.door import choose, running, visit
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
 from hybridlog.live.recording import LiveRecording
@@ -60,7 +60,7 @@ class Running:
 
     def rows(self) -> Counter[tuple[str, str]]:
         """What the ledger of the ended recording says, by topic and cause."""
-        report = self.recorder.stop()
+        (report,) = self.recorder.stop()
         found: Counter[tuple[str, str]] = Counter()
         for row in report.entry.end["losses"]:
             found[row["topic"], row["cause"]] += row["count"]
@@ -89,7 +89,7 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     state = robot.recorder.look()
     assert {t.topic: t.messages for t in state.topics} == {"/chatter": 100, "/scan": 100}
     rows = robot.rows()
-    kept = in_segments(store, robot.recorder.recording.id)
+    kept = in_segments(store, robot.recorder.name)
     assert rows["/scan", "throttle"] == 100 - kept["/scan", "ros1"]
     assert 23 <= kept["/scan", "ros1"] <= 28
     assert kept["/chatter", "ros1"] == 100
@@ -122,7 +122,7 @@ def test_payloads_step_down_and_fields_stay(
                 robot.speaker.say(channel, scan(number, 9000), number * SECOND)
             robot.speaker.say(small, text("x"), number * SECOND)
     rows = robot.rows()
-    kept = in_segments(store, robot.recorder.recording.id)
+    kept = in_segments(store, robot.recorder.name)
     # Six steps of ten messages: whole, one in five, or fields only.
     assert kept["/cam", "ros1"] == 10 + 2 + 0 + 0 + 0 + 10
     assert kept["/scan", "ros1"] == 10 + 10 + 2 + 0 + 0 + 10
@@ -192,7 +192,7 @@ def test_when_the_budget_is_spent_the_rest_is_counted(
         robot.speaker.say(channel, text("x" * 4000), SECOND + number)
     blocked.set()
     rows = robot.rows()
-    kept = in_segments(store, robot.recorder.recording.id)
+    kept = in_segments(store, robot.recorder.name)
     assert 200 < kept["/chatter", "ros1"] < 300
     assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
 
@@ -255,7 +255,7 @@ def test_bounds_of_time_and_size(store: hl.Store) -> None:
             return robot.recorder.wait(0)
 
         wait_for(over)
-        assert robot.recorder.stop().entry.messages == 1
+        assert robot.recorder.stop()[0].entry.messages == 1
     with pytest.raises(UsageError, match="duration must be above 0"):
         RecorderOptions(duration_s=0)
 
@@ -271,7 +271,7 @@ def test_segments_are_split_by_time(store: hl.Store) -> None:
         robot.speaker.say(text_channel(), text(str(sent)))
         sent += 1
         time.sleep(0.01)
-    report = robot.recorder.stop()
+    (report,) = robot.recorder.stop()
     assert 3 <= report.entry.segments <= 12
     assert store.topic("/chatter").count() == sent
 
@@ -328,7 +328,7 @@ def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     assert speaker.stopped == 1
     store.refresh()
     assert store.recordings() == []
-    assert running(store.directory) == []
+    assert running(store.directory.path) == []
 
 
 def test_sources_that_end_end_it(store: hl.Store) -> None:
@@ -355,28 +355,29 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
 
 def test_visitors(store: hl.Store) -> None:
     one, other = Running(store), Running(store)
-    here = store.directory.recording(one.recorder.recording.id)
-    assert set(running(store.directory)) == {
-        one.recorder.recording.id,
-        other.recorder.recording.id,
+    here = store.directory.path
+    name = one.recorder.name
+    assert set(running(here)) == {
+        one.recorder.name,
+        other.recorder.name,
     }
     with pytest.raises(UsageError, match="Several recordings"):
-        choose(store.directory, [])
+        choose(here, [])
     with pytest.raises(UsageError, match="not being recorded now"):
-        choose(store.directory, ["nothing"])
+        choose(here, ["nothing"])
     one.speaker.say(text_channel(), text("a"))
     one.recorder.look()
-    state = visit(here, "state")
+    state = visit(here, name, "state")
     assert state["topics"][0]["messages"] == 1
     assert recorder_module.summary_of(recorder_module.state_of(state)) == state
-    visit(here, "mark", text="here", tags={})
+    visit(here, name, "mark", text="here", tags={})
     for bad in ({"text": 1, "tags": {}}, {"text": "a", "tags": {"a": 1}}, {"text": "a"}):
         with pytest.raises(UsageError, match="tags"):
-            visit(here, "mark", **bad)
-    with pytest.raises(UsageError, match="mark, state, stop"):
-        visit(here, "dance")
+            visit(here, name, "mark", **bad)
+    with pytest.raises(UsageError, match="mark, state, stop, trigger"):
+        visit(here, name, "dance")
     # Who says nothing, or nonsense, or does not stop, is let go, and keeps nobody out.
-    path = json.loads((here / SIGN).read_text())["socket"]
+    path = json.loads((here / "recorders" / f"{name}.json").read_text())["socket"]
     assert Path(path).stat().st_uid == os.geteuid()
     assert not Path(path).parent.stat().st_mode & 0o077
     with socket.socket(socket.AF_UNIX) as silent, socket.socket(socket.AF_UNIX) as wild:
@@ -384,14 +385,14 @@ def test_visitors(store: hl.Store) -> None:
         wild.connect(path)
         wild.sendall(b"[" * 100_000 + b"\n")
         assert b"no such request" in wild.recv(1000)
-        assert visit(here, "state")
-    visit(here, "stop")
+        assert visit(here, name, "state")
+    visit(here, name, "stop")
     assert one.recorder.wait(1)
     one.recorder.stop()
     with pytest.raises(StoreError, match="No recorder answers"):
-        visit(here, "state")
+        visit(here, name, "state")
     assert not Path(path).parent.exists()
-    assert running(store.directory) == [other.recorder.recording.id]
+    assert running(here) == [other.recorder.name]
     other.recorder.stop()
 
 
@@ -426,4 +427,4 @@ def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> N
         # 0.2 s are ten messages and ten rows; the machine may be slow.
         assert recording.messages >= 40
         assert sum(row["count"] for row in recording.end["losses"]) >= 40
-        assert running(store.directory) == []
+        assert running(path) == []

@@ -1,0 +1,325 @@
+"""Snapshot mode: the last minute in memory, written out when something happens.
+
+`Snapshots` stands where a recording stands otherwise. A trigger starts a recording with
+what the ring holds; what comes in the time after it follows, and then the recording is
+closed, while the ring goes on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.live.ring import Held, Ring
+from hybridlog.losses import Cause, Ledger
+from hybridlog.query.evaluate import holds
+from hybridlog.query.topics import TopicMatcher, matcher
+from hybridlog.query.where import Expression, parse
+from hybridlog.schema.codec import codec_for
+from hybridlog_storage.errors import HybridlogError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.live.recording import LiveRecording
+    from hybridlog.recorder import RecordReport
+    from hybridlog_storage.messages import Channel
+
+_MOST_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
+_HALF = 0.5  # of a recording's budget, left for what comes while the ring is written
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """When to write a snapshot.
+
+    Attributes:
+        text: As the user wrote it.
+        fits: Which topics.
+        predicate: What must hold for a message; None for any message.
+    """
+
+    text: str
+    fits: TopicMatcher
+    predicate: Expression | None
+
+    @classmethod
+    def of(cls, text: str) -> Trigger:
+        """`/diagnostics: status[*].level >= 2`, or a topic alone.
+
+        Raises:
+            UsageError: No topic.
+            TopicError: The pattern is malformed.
+            WhereError: The predicate is.
+        """
+        topic, _, predicate = text.partition(": ")
+        topic = topic.strip().removesuffix(":")
+        if not topic:
+            raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
+        return cls(text, matcher([topic]), parse(predicate) if predicate.strip() else None)
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotOptions:
+    """What a snapshot holds.
+
+    Attributes:
+        ring_s: How long the ring remembers.
+        before_s: Seconds before the trigger; None for all that the ring holds.
+        after_s: Seconds after it.
+        triggers: When; others come by signal, or from another process.
+    """
+
+    ring_s: float
+    before_s: float | None = None
+    after_s: float = 0.0
+    triggers: tuple[Trigger, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what the ring cannot hold."""
+        if not 0 < self.ring_s <= 86_400:
+            raise UsageError("the ring must last between 0 and a day")
+        if self.before_s is not None and not 0 <= self.before_s <= self.ring_s:
+            raise UsageError("--before cannot be longer than --ring")
+        if not 0 <= self.after_s <= 86_400:
+            raise UsageError("--after must last between 0 and a day")
+
+
+class Snapshots:
+    """Takes messages as a recording does, and keeps those around triggers.
+
+    Args:
+        options: What a snapshot holds.
+        budget_bytes: Payload bytes that the ring may hold.
+        start: Starts a recording, by the reason for it.
+        say: Called with what the user should know.
+    """
+
+    def __init__(
+        self,
+        options: SnapshotOptions,
+        budget_bytes: int,
+        start: Callable[[str], LiveRecording],
+        say: Callable[[str], None],
+    ) -> None:
+        self._options = options
+        self._ring = Ring(round(options.ring_s * 1e9), budget_bytes)
+        self._start = start
+        self._say = say
+        self._ledger = Ledger()
+        self._lost: deque[dict[str, Any]] = deque(maxlen=_MOST_ROWS)
+        self._lock = threading.Lock()
+        self._active: LiveRecording | None = None
+        self._until = 0
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-snapshot")
+        self._dumping: Future[None] | None = None
+        self._reports: list[RecordReport] = []
+        self._stored = (0, 0)
+        self._failure: HybridlogError | None = None
+        self._watched: dict[Channel, tuple[Trigger, ...]] = {}
+        self._told_short = False
+
+    id = ""
+    """There is no one recording."""
+
+    def write(
+        self,
+        channel: Channel,
+        payload: bytes,
+        *,
+        log_time: int,
+        publish_time: int | None = None,
+        sequence: int = 0,
+        wait: bool = True,
+    ) -> bool:
+        """Take a message; see `LiveRecording.write`."""
+        held = Held(channel, payload, log_time, publish_time, sequence)
+        triggers = self._watched.get(channel)
+        if triggers is None:
+            fitting = (t for t in self._options.triggers if t.fits(channel.topic))
+            triggers = self._watched[channel] = tuple(fitting)
+        with self._lock:
+            self._ring.add(held)
+            active = self._active
+            if active is not None and log_time >= self._until:
+                self._end(active)
+                active = None
+            if active is None:
+                taken = True
+            else:
+                taken = active.write(
+                    channel,
+                    payload,
+                    log_time=log_time,
+                    publish_time=publish_time,
+                    sequence=sequence,
+                    wait=wait,
+                )
+        for trigger in triggers:
+            if self._happened(trigger, held):
+                self.fire(trigger.text, log_time)
+        return taken
+
+    def fire(self, reason: str, at: int | None = None) -> None:
+        """Write a snapshot, or go on with the one that is being written.
+
+        Args:
+            reason: A part of the recording's name, and its tag `trigger`.
+            at: When it happened, ns since the epoch; None for now.
+        """
+        now = time.time_ns() if at is None else at
+        until = now + round(self._options.after_s * 1e9)
+        with self._lock:
+            self._until = max(self._until, until)
+            if self._active is not None or (self._dumping and not self._dumping.done()):
+                return
+            self._dumping = self._worker.submit(self._write_out, reason, now)
+
+    def look(self) -> None:
+        """End a snapshot whose time is over although nothing comes any more."""
+        with self._lock:
+            if self._active is not None and time.time_ns() >= self._until:
+                self._end(self._active)
+            self._lost.extend(self._ledger.take(everything=True))
+            short = self._ring.is_short and not self._told_short
+            self._told_short |= short
+            held = self._ring.held_s
+        if short:
+            self._say(
+                f"the ring holds {held:.0f} s of {self._options.ring_s:.0f}: more does not fit "
+                "into the memory budget (--budget)"
+            )
+
+    def close(self) -> list[RecordReport]:
+        """Close the snapshot that is being written; reports of all.
+
+        Raises:
+            DiskFullError: A snapshot could not be written.
+        """
+        if self._dumping is not None:
+            self._dumping.result()
+        with self._lock:
+            if self._active is not None:
+                self._end(self._active)
+        self._worker.shutdown(wait=True)
+        if self._failure is not None:
+            raise self._failure
+        return self._reports
+
+    def abort(self) -> None:
+        """Let go of everything; snapshots that are complete stay."""
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            active, self._active = self._active, None
+        if active is not None:
+            active.abort()
+
+    @property
+    def ledger(self) -> Ledger:
+        """Of the snapshot that is being written; else of the ring."""
+        active = self._active
+        return self._ledger if active is None else active.ledger
+
+    @property
+    def filled(self) -> float:
+        """How much of its memory budget the snapshot has spent, 0 to 1."""
+        active = self._active
+        return 0.0 if active is None else active.filled
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """Messages and payload bytes in all snapshots."""
+        active = self._active
+        messages, size = (0, 0) if active is None else active.stored
+        return self._stored[0] + messages, self._stored[1] + size
+
+    @property
+    def lag(self) -> int:
+        """Messages of the snapshot that are not in the index yet."""
+        active = self._active
+        return 0 if active is None else active.lag
+
+    @property
+    def index_failure(self) -> HybridlogError | None:
+        """Why the index does not go on, None while it does."""
+        active = self._active
+        return None if active is None else active.index_failure
+
+    @property
+    def failed(self) -> bool:
+        """Whether nothing more can be taken; `close` says why."""
+        active = self._active
+        return self._failure is not None or (active is not None and active.failed)
+
+    @property
+    def count(self) -> int:
+        """Snapshots so far, the one that is being written included."""
+        return len(self._reports) + (self._active is not None)
+
+    @staticmethod
+    def _happened(trigger: Trigger, held: Held) -> bool:
+        if trigger.predicate is None:
+            return True
+        return holds(trigger.predicate, codec_for(held.channel).fields(held.payload))
+
+    def _write_out(self, reason: str, at: int) -> None:
+        """Start a recording with what the ring holds; runs on the worker."""
+        before = self._options.before_s
+        begin = 0 if before is None else at - round(before * 1e9)
+        try:
+            recording = self._start(reason)
+        except HybridlogError as error:
+            self._failure = error
+            self._say(f"no snapshot of {reason!r} could be started: {error}")
+            return
+        with self._lock:
+            # From here on, what comes goes into the ring and into the recording.
+            kept = self._ring.since(begin)
+            lost = [*self._lost, *self._ledger.take(everything=True)]
+            self._lost.clear()
+            self._active = recording
+        for row in lost:
+            if row["to"] >= begin:
+                recording.ledger.note(
+                    row["topic"],
+                    Cause(row["cause"]),
+                    row["count"],
+                    first=row["from"],
+                    last=row["to"],
+                    detail=row["reason"],
+                )
+        self._say(f"snapshot {recording.id} because of {reason!r}")
+        try:
+            for held in kept:
+                while recording.filled > _HALF and not recording.failed:
+                    time.sleep(0.001)
+                recording.write(
+                    held.channel,
+                    held.payload,
+                    log_time=held.log_time,
+                    publish_time=held.publish_time,
+                    sequence=held.sequence,
+                )
+        except HybridlogError as error:
+            self._failure = error
+            self._say(f"snapshot {recording.id} is not complete: {error}")
+
+    def _end(self, recording: LiveRecording) -> None:
+        """Let the worker close a snapshot. Holds the lock."""
+        self._active = None
+        self._dumping = None
+        self._worker.submit(self._close, recording)
+
+    def _close(self, recording: LiveRecording) -> None:
+        stored = recording.stored
+        try:
+            report = recording.close()
+        except HybridlogError as error:
+            self._failure = error
+            self._say(f"snapshot {recording.id} is not complete: {error}")
+            return
+        self._reports.append(report)
+        self._stored = (self._stored[0] + stored[0], self._stored[1] + stored[1])

@@ -1,0 +1,174 @@
+"""Snapshot mode: what lies around a trigger is kept, and nothing else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.ring import Held, Ring
+from hybridlog.live.snapshots import SnapshotOptions, Trigger
+from hybridlog.losses import Cause
+from hybridlog_storage.errors import TopicError, UsageError, WhereError
+from hybridlog_storage.messages import Channel
+from tests.live.speaker import TEXT, Speaker, scan, scan_channel, text, text_channel
+from tests.test_faults import wait_for
+
+SECOND = 1_000_000_000
+T = 1_700_000_000 * SECOND
+LATCHED = Channel("/map", "ros1", TEXT, {"latching": "1"}, has_publish_time=False)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(0, 400)), max_size=60),
+    st.integers(0, 60),
+)
+def test_a_ring_is_the_end_of_what_came(steps: list[tuple[int, int]], back: int) -> None:
+    ring = Ring(20 * SECOND, 2000)
+    came: list[Held] = []
+    now = T
+    channel = text_channel()
+    for step, size in steps:
+        now += step * SECOND
+        came.append(Held(channel, bytes(size), now, None, len(came)))
+        ring.add(came[-1])
+        assert ring.payload_bytes <= 2000
+    kept = ring.since(now - back * SECOND)
+    # It is the end of what came, without gaps, ...
+    whole = [held for held in came if held.log_time >= now - min(back, 20) * SECOND]
+    assert kept == whole[len(whole) - len(kept) :]
+    # ... and all of it, unless memory did not suffice.
+    if len(kept) < len(whole):
+        assert ring.is_short
+        missing = whole[len(whole) - len(kept) - 1]
+        assert sum(len(held.payload) for held in kept) + len(missing.payload) > 0
+    if not ring.is_short:
+        assert kept == whole
+
+
+def test_latched_messages_stay_and_stand_in_front() -> None:
+    ring = Ring(10 * SECOND, 1 << 20)
+    ring.add(Held(LATCHED, b"old", T - 100 * SECOND, None, 0))
+    ring.add(Held(LATCHED, b"map", T, None, 0))
+    for second in range(60):
+        ring.add(Held(text_channel(), b"x", T + second * SECOND, None, 0))
+    front, *rest = ring.since(T + 55 * SECOND)
+    assert (front.payload, front.log_time, front.publish_time) == (b"map", T + 55 * SECOND, T)
+    assert len(rest) == 5
+    assert not ring.is_short
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        yield opened
+
+
+class Robot:
+    def __init__(self, store: hl.Store, snapshots: SnapshotOptions, budget: int = 1 << 20) -> None:
+        self.speaker = Speaker()
+        self.said: list[str] = []
+        options = RecorderOptions(
+            name="snap", reserve_bytes=0, budget_bytes=budget, snapshots=snapshots
+        )
+        self.recorder = Recorder(store, [self.speaker], options, self.said.append)
+        self.recorder.start()
+
+    def until(self, count: int) -> None:
+        """Wait until so many snapshots are begun."""
+        wait_for(lambda: self.recorder.look().snapshots == count)
+
+
+def test_before_and_after_a_trigger(store: hl.Store) -> None:
+    trigger = Trigger.of("/scan: near >= 10 and near < 10.5")
+    robot = Robot(store, SnapshotOptions(60, 5, 3, (trigger,)))
+    start = time.time_ns()
+    scans, chatter = scan_channel(), text_channel()
+    robot.speaker.say(LATCHED, text("map"), start - 1000 * SECOND)
+    robot.recorder.lost(
+        "/scan", Cause.TRANSPORT, 4, first=start + 18 * SECOND, last=start + 18 * SECOND
+    )
+    robot.recorder.look()
+    robot.recorder.lost("/scan", Cause.TRANSPORT, 9, first=start, last=start)
+    for second in range(60):
+        # `near` is half the number: the trigger is at 20 s.
+        robot.speaker.say(scans, scan(second, 10), start + second * SECOND)
+        robot.speaker.say(chatter, text(str(second)), start + second * SECOND + 1)
+        if second == 20:
+            robot.until(1)
+    (report,) = robot.recorder.stop()
+    assert report.entry.tags["trigger"] == trigger.text
+    assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(15, 23)]
+    assert [m.fields["id"] for m in store.topic("/scan")] == list(range(15, 23))
+    (latched,) = store.topic("/map")
+    assert latched.decode().data == "map"
+    assert latched.log_time_ns == start + 15 * SECOND
+    # Of what was lost, only what lies in the snapshot.
+    assert sum(row["count"] for row in report.entry.end["losses"]) == 4
+
+
+def test_a_trigger_while_a_snapshot_is_written_prolongs_it(store: hl.Store) -> None:
+    robot = Robot(store, SnapshotOptions(60, 1, 5))
+    channel = text_channel()
+    now = time.time_ns()
+    robot.speaker.say(channel, text("0"), now)
+    robot.recorder.fire("first")
+    robot.until(1)
+    robot.recorder.fire("second")
+    robot.speaker.say(channel, text("1"), now + 2 * SECOND)
+    robot.speaker.say(channel, text("2"), now + 100 * SECOND)  # long after the end of both
+    wait_for(lambda: not robot.recorder._target.filled and robot.recorder.look().snapshots == 1)
+    robot.recorder.fire("third")
+    robot.until(2)
+    reports = robot.recorder.stop()
+    assert [report.entry.tags["trigger"] for report in reports] == ["first", "third"]
+    assert reports[0].entry.messages == 2
+
+
+def test_without_a_trigger_nothing_is_kept(store: hl.Store) -> None:
+    robot = Robot(store, SnapshotOptions(60))
+    for number in range(10):
+        robot.speaker.say(text_channel(), text(str(number)))
+    assert robot.recorder.stop() == []
+    store.refresh()
+    assert store.recordings() == []
+
+
+def test_a_ring_that_does_not_fit_says_so(store: hl.Store) -> None:
+    robot = Robot(store, SnapshotOptions(60))
+    now = time.time_ns()
+    for number in range(30):
+        robot.speaker.say(scan_channel(), scan(number, 100_000), now + number * SECOND)
+    robot.recorder.look()
+    robot.recorder.look()
+    assert [line for line in robot.said if "does not fit into the memory" in line] == robot.said
+    assert len(robot.said) == 1
+    robot.recorder.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [("", UsageError), (": x > 1", UsageError), ("re:(: x", TopicError), ("/a: x >", WhereError)],
+)
+def test_a_trigger_that_is_none(text: str, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Trigger.of(text)
+
+
+def test_times_that_make_no_sense() -> None:
+    for options in ({"ring_s": 0}, {"ring_s": 5, "before_s": 6}, {"ring_s": 5, "after_s": -1}):
+        with pytest.raises(UsageError):
+            SnapshotOptions(**options)
+
+
+def test_everything_is_kept_already(store: hl.Store) -> None:
+    recorder = Recorder(store, [Speaker()], RecorderOptions(reserve_bytes=0), print)
+    with pytest.raises(UsageError, match="--ring"):
+        recorder.fire("now")
+    recorder.stop()
