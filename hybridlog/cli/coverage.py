@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli.output import counted, note, unfit
+from hybridlog.losses import Cause
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
@@ -42,6 +43,13 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
 
 def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     """How much of a recording is there: `complete`, or how much is missing."""
+    wished = sum(loss["count"] or 0 for loss in losses if loss["cause"] == Cause.THROTTLE)
+    losses = [loss for loss in losses if loss["cause"] != Cause.THROTTLE]
+    thinned = f"; {counted(wished, 'message')} thinned out by wish" if wished else ""
+    return _completeness(entry, losses) + thinned
+
+
+def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     if not losses:
         return "being recorded" if entry.status == "open" else "complete"
     lost = sum(loss["count"] or 0 for loss in losses)
@@ -62,7 +70,10 @@ def line_of(loss: dict[str, Any]) -> str:
     place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
     file = f" {loss['file']}{place}:" if loss.get("file") else ""
     topic = f" on {loss['topic']}" if loss.get("topic") else ""
-    return f"{count}{topic} lost, {loss['cause']}:{file} {loss['reason']}"
+    if loss["cause"] == Cause.THROTTLE:
+        return f"{count}{topic} thinned out by wish"
+    said = f"{file} {loss['reason']}".rstrip()
+    return f"{count}{topic} lost, {loss['cause']}{':' if said else ''}{said}"
 
 
 def gaps(
@@ -88,7 +99,10 @@ def gaps(
             # None is an unknown number, and any topic.
             if loss["count"] != 0 and loss.get("topic") in {None, *topics}
         ]
-        if losses:
+        wished = [loss for loss in losses if loss["cause"] == Cause.THROTTLE]
+        for loss in wished:
+            yield f"{entry.id}: {line_of(loss)} while it was recorded."
+        if len(losses) > len(wished):
             yield (
                 f"{entry.id} is not complete, so this answer may not be: "
                 f"{describe(entry, losses)}; `hybridlog info {entry.id}` says where."

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Self
 
 from hybridlog.cli import output
+from hybridlog.losses import Cause
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -68,7 +69,7 @@ def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Grou
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("topic", no_wrap=True, overflow="ellipsis", ratio=1)
-    for heading in ("Hz", "usual", "MB/s", "jitter ms", "messages", "lost"):
+    for heading in ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost"):
         table.add_column(heading, justify="right", no_wrap=True)
     # Those that matter most when not all fit: with losses, then the largest.
     topics = sorted(state.topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))
@@ -99,10 +100,11 @@ def summary(state: RecorderState) -> str:
         f"index {state.lag} behind" if state.lag else "index up to date",
         f"{output.size(state.free_bytes)} free",
     ]
-    lost = sum(state.lost.values())
+    causes = {cause: count for cause, count in state.lost.items() if cause != Cause.THROTTLE}
+    lost = sum(causes.values())
     if lost:
-        causes = ", ".join(f"{cause} {count}" for cause, count in sorted(state.lost.items()))
-        parts.append(f"lost {lost} ({causes})")
+        named = ", ".join(f"{cause} {count}" for cause, count in sorted(causes.items()))
+        parts.append(f"lost {lost} ({named})")
     return " · ".join(parts)
 
 
@@ -117,6 +119,7 @@ def _cells(topic: TopicState) -> list[Text | str]:
         f"{topic.bytes_per_s / 1e6:.2f}",
         "" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}",
         str(topic.messages),
+        Text(str(topic.thinned) if topic.thinned else "", style="dim"),
         Text(str(topic.lost) if topic.lost else "", style="red"),
     ]
 
@@ -134,10 +137,11 @@ def closing_rows(report: RecordReport, state: RecorderState) -> list[tuple[str, 
         ("messages indexed", str(report.indexed)),
         ("time", f"{report.elapsed_s:.1f} s ({rate:,.0f} messages/s)"),
     ]
-    if not state.lost:
+    if not state.lost.keys() - {Cause.THROTTLE.value}:
         rows.append(("lost", "nothing"))
     for cause, count in sorted(state.lost.items()):
         topics = sorted({r["topic"] for r in entry.end.get("losses", []) if r["cause"] == cause})
         named = ", ".join(topics[:3]) + (" …" if len(topics) > 3 else "")
-        rows.append((f"lost: {cause}", f"{count} ({named})"))
+        what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
+        rows.append((what, f"{count} ({named})"))
     return rows

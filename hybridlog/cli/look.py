@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -247,7 +248,7 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     rows = [
         ("name", entry.name),
         ("status", _STATUS.get(entry.status, entry.status)),
-        ("source", f"{source['path']} ({source['kind']}, {output.size(source['bytes'])})"),
+        ("source", _source(source)),
         ("start", format_time(span[0]) if span else "-"),
         ("last", format_time(span[1]) if span else "-"),
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
@@ -312,3 +313,9 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[
         # Segments do not say it of themselves.
         cells.insert(4, output.size(stats.payload_bytes) if indexed else "?")
     return cells
+
+
+def _source(source: Mapping[str, Any]) -> str:
+    """Where a recording came from; a robot has no size."""
+    size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
+    return f"{source['path']} ({source['kind']}{size})"

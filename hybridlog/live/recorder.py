@@ -262,20 +262,26 @@ class Recorder:
         elapsed = max(now - self._looked, 1e-3)
         self._looked = now
         self._see_clock(now)
-        lost_by_topic: dict[str, int] = {}
+        missing: dict[tuple[str, bool], int] = {}
         lost: dict[str, int] = {}
         if isinstance(self._target, Snapshots):
             self._target.look()
         with self._lock:
             totals = dict(self._lost)
         for (topic, cause), count in totals.items():
-            lost_by_topic[topic] = lost_by_topic.get(topic, 0) + count
+            key = topic, cause is Cause.THROTTLE
+            missing[key] = missing.get(key, 0) + count
             lost[cause.value] = lost.get(cause.value, 0) + count
         with self._lock:
             rates = sorted(self._topics.items())
         wall = time.time_ns()
         topics = [
-            rate.look(elapsed, wall, lost_by_topic.get(topic, 0))
+            rate.look(
+                elapsed,
+                wall,
+                thinned=missing.get((topic, True), 0),
+                lost=missing.get((topic, False), 0),
+            )
             for topic, rate in rates
             if rate.tallies or topic in self._present
         ]

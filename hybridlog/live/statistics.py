@@ -61,7 +61,8 @@ class TopicState:
         bytes_per_s: Payload bytes a second since the look before.
         jitter_ms: Standard deviation of the time between messages, None for too few.
         silent_s: Seconds since the last message, None before the first.
-        lost: Messages lost so far, as far as they can be counted.
+        thinned: Messages left out because the user wants fewer.
+        lost: Messages lost so far otherwise, as far as they can be counted.
     """
 
     topic: str
@@ -73,6 +74,7 @@ class TopicState:
     bytes_per_s: float
     jitter_ms: float | None
     silent_s: float | None
+    thinned: int
     lost: int
 
 
@@ -93,12 +95,13 @@ class TopicRates:
     _bytes: int = 0
     _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
-    def look(self, elapsed_s: float, now: int, lost: int) -> TopicState:
+    def look(self, elapsed_s: float, now: int, *, thinned: int, lost: int) -> TopicState:
         """The topic now.
 
         Args:
             elapsed_s: Since the last look.
             now: ns since the epoch.
+            thinned: Messages left out by wish so far.
             lost: Messages lost so far.
         """
         messages = sum(tally.messages for tally in self.tallies)
@@ -119,6 +122,7 @@ class TopicRates:
             rate,
             self._jitter(),
             max(now - last, 0) / _NS if last else None,
+            thinned,
             lost,
         )
 
