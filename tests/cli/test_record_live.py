@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -76,9 +77,9 @@ def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
     assert "lost" in done.out
     assert "nothing" in done.out
     expected = read(logs / "small.bag")
-    run("export", "small", "--format", "mcap", "-o", tmp_path / "out.mcap", store=store)
+    run("export", tmp_path / "out.mcap", store=store)
     found = read(tmp_path / "out.mcap")
-    assert sorted((m.topic, m.payload) for m in found) == sorted(
+    assert Counter((m.topic, m.payload) for m in found) == Counter(
         (m.topic, m.payload) for m in expected
     )
     assert "complete" in run("info", "small", store=store).out
@@ -177,7 +178,7 @@ def test_a_ring_keeps_what_lies_around_a_trigger(logs: Path, tmp_path: Path) -> 
     assert [r["tags"]["trigger"] for r in report["recordings"]] == ["bump", "SIGUSR1"]
     for entry in run("ls", "--json", store=store).json:
         assert 0 < entry["messages"] < report["messages_received"]
-        assert entry["duration_ns"] < 4_000_000_000
+        assert entry["last_ns"] - entry["start_ns"] < 4_000_000_000
 
 
 def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
