@@ -40,6 +40,7 @@ class Capture:
             then not compressed, and the index waits, falls behind, and reads back later
             from the segments what is no longer in memory. None when whoever appends may
             wait for compression and for the index.
+        renew: With `behind`: another connection to the index when one has failed.
         check: Called with the catalog before anything is made, while nobody else can
             start a recording; raises to refuse.
 
@@ -59,6 +60,7 @@ class Capture:
         source: Mapping[str, Any],
         settings: SegmentSettings,
         behind: Callable[[], bool] | None = None,
+        renew: Callable[[], Database] | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = Catalog(database)
@@ -72,8 +74,11 @@ class Capture:
             self._held = self._held.pop_all()
         self.indexer = ChunkIndexer(self.entry.id, self.entry.key)
         recording = directory.recording(self.entry.id)
-        lag = None if behind is None else Lag(recording, behind)
+        lag = None
+        if behind is not None and renew is not None:
+            lag = Lag(recording, behind, renew)
         self.index = IndexWriter(self.indexer, database, lag=lag)
+        self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
             recording_metadata(self.entry),
@@ -96,6 +101,7 @@ class Capture:
         self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries)
         failure = self.index.failure
         if failure is None:
+            self.catalog = Catalog(self.index.database)
             try:
                 self.catalog.put_losses(self.entry.id, self.entry.end.get("losses", []))
                 for channel in self.writer.channels.values():

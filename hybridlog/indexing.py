@@ -37,6 +37,7 @@ ARRAY_LIMIT = 32
 STAMP = "header.stamp"
 _SENDERS = 2
 _LAG_PAUSE_S = 0.002
+_RETRY_S = 2.0  # after the database has failed
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
 
@@ -68,7 +69,7 @@ class ChunkIndexer:
     """
 
     def __init__(self, recording: str, key: int, *, array_limit: int = ARRAY_LIMIT) -> None:
-        self._recording = recording
+        self.recording = recording
         self._key = key
         self._array_limit = array_limit
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
@@ -99,7 +100,7 @@ class ChunkIndexer:
             documents.append(Documents(collection_of(channel.topic), tables))
             stats[channel_id] = _stats(batch, channel, stamps, unreadable)
         entry = ChunkEntry(
-            self._recording,
+            self.recording,
             chunk.segment,
             chunk.offset,
             chunk.length,
@@ -124,7 +125,7 @@ class ChunkIndexer:
             if part is None:
                 codec = codec_for(channel, array_limit=self._array_limit)
                 stamped = any(path.path == STAMP and path.type == "time" for path in codec.paths())
-                origin = Origin(self._recording, self._key, channel.topic, channel.has_publish_time)
+                origin = Origin(self.recording, self._key, channel.topic, channel.has_publish_time)
                 part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped
             return part
 
@@ -152,9 +153,14 @@ class Lag:
     Args:
         recording: The recording's directory.
         behind: Says whether the recorder has more than it can write.
+        renew: Another connection to the index, after one has failed; starts the embedded
+            MongoDB again if that has ended. Raises `DatabaseError`.
     """
 
-    def __init__(self, recording: Path, behind: Callable[[], bool]) -> None:
+    def __init__(
+        self, recording: Path, behind: Callable[[], bool], renew: Callable[[], Database]
+    ) -> None:
+        self.renew = renew
         self._recording = recording
         self._behind = behind
         self._reader: SegmentReader | None = None
@@ -217,8 +223,9 @@ class IndexWriter:
 
     One thread makes documents, others send them; what is made while they are busy goes
     in one parcel, so that a chunk of one image costs no round trip of its own. A database
-    that fails stops the index, never the recording: what was not indexed is counted, and
-    is made up for from the segments.
+    that fails stops the index, never the recording: what was not indexed is made up for
+    from the segments, with a lag as soon as the database answers again, else when the
+    store is opened next.
 
     Args:
         indexer: Makes the documents.
@@ -254,22 +261,23 @@ class IndexWriter:
         self._idle = threading.BoundedSemaphore(_SENDERS)
         self._parcel = _Parcel()
         self._crash: BaseException | None = None
+        self._channels: Mapping[int, Channel] = {}
+        self._retry_at = 0.0
+        self._renewed: list[Database] = []
+
+    @property
+    def database(self) -> Database:
+        """Where documents go now."""
+        return self._database
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Index a chunk that is in its segment; waits while the backlog is full."""
         if self._crash is not None:
             raise self._crash
+        self._channels = channels
         if not self._room.acquire(blocking=self._lag is None):
-            place = ChunkPlace(
-                chunk.offset,
-                chunk.length,
-                chunk.trailer,
-                int(chunk.batch.log_time.min()),
-                int(chunk.batch.log_time.max()),
-                (),
-            )
-            self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
-            self._maker.submit(self._remember, channels).add_done_callback(self._done)
+            self._forget(chunk)
+            self._maker.submit(self._remember).add_done_callback(self._done)
             return
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(self._made)
@@ -286,44 +294,104 @@ class IndexWriter:
 
     def nudge(self) -> None:
         """Send what has been made so far, however little, once a sender is free."""
-        self._maker.submit(self._dispatch, wait=False).add_done_callback(self._done)
+        self._maker.submit(self._tend).add_done_callback(self._done)
 
     def close(self) -> None:
         """Wait for all chunks; an error of our own (no database's) is raised here."""
         if self._crash is None:
+            self._maker.submit(self._last_try).add_done_callback(self._done)
+            # What that has asked for stands behind it in the queue, before this.
+            self._maker.submit(_nothing).result()
             self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
-        self._maker.shutdown(wait=True)
-        self._senders.shutdown(wait=True)
-        if self._lag is not None:
-            self._lag.close()
+        self._end()
+        self.missed += sum(chunk.messages for chunk in self._forgotten)
         if self._crash is not None:
             raise self._crash
 
     def abandon(self) -> None:
         """Stop without indexing what still waits."""
-        self._maker.shutdown(wait=True, cancel_futures=True)
-        self._senders.shutdown(wait=True, cancel_futures=True)
+        self._end(cancel=True)
+
+    def release(self) -> None:
+        """Close the connections that it has made itself; `database` may be one of them."""
+        for database in self._renewed:
+            database.close()
+        self._renewed.clear()
+
+    def _end(self, *, cancel: bool = False) -> None:
+        self._maker.shutdown(wait=True, cancel_futures=cancel)
+        self._senders.shutdown(wait=True, cancel_futures=cancel)
         if self._lag is not None:
             self._lag.close()
 
-    def _remember(self, channels: Mapping[int, Channel]) -> None:
+    def _forget(self, chunk: StoredChunk) -> None:
+        """Keep only where a chunk lies."""
+        place = ChunkPlace(
+            chunk.offset,
+            chunk.length,
+            chunk.trailer,
+            int(chunk.batch.log_time.min()),
+            int(chunk.batch.log_time.max()),
+            (),
+        )
+        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
+
+    def _tend(self) -> None:
+        if self.failure is not None and time.monotonic() >= self._retry_at:
+            self._retry()
+        self._dispatch(wait=False)
+
+    def _last_try(self) -> None:
+        if self.failure is not None:
+            self._retry()
+
+    def _retry(self) -> None:
+        """Go on after the database has failed, if it can be had again."""
+        if self._lag is None:
+            return
+        try:
+            database = self._lag.renew()
+            self._renewed.append(database)
+            catalog = Catalog(database)
+            there = {(c.segment, c.offset) for c in catalog.chunks(self._indexer.recording)}
+        except DatabaseError as error:
+            self.failure = error
+            self._retry_at = time.monotonic() + _RETRY_S
+            return
+        with self._lock:
+            self._database, self._catalog = database, catalog
+            self._collections.clear()
+            # A server that was killed has lost what it had not yet in its journal.
+            entries, self.entries = self.entries, []
+            for entry in entries:
+                if (entry.segment, entry.offset) in there:
+                    self.entries.append(entry)
+                else:
+                    self.indexed -= self._put_back(entry)
+            self.failure = None
+            waiting = len(self._forgotten)
+        for _ in range(waiting):
+            self._maker.submit(self._remember).add_done_callback(self._done)
+
+    def _remember(self) -> None:
         """Make documents of the first forgotten chunk, while the next one is read."""
         assert self._lag is not None
+        if self.failure is not None or not self._forgotten:
+            return  # as many as there are then are asked for when it goes on
         place = self._forgotten.popleft()
-        if self.failure is not None:
-            with self._lock:
-                self.missed += place.messages
-            return
         self._lag.wait()
         chunk = self._lag.read(place)
         if self._forgotten:
             self._lag.read_ahead(self._forgotten[0])
-        self._make(chunk, channels)
+        self._make(chunk, self._channels)
 
     def _make(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         if self.failure is not None:
-            with self._lock:
-                self.missed += len(chunk.batch)
+            if self._lag is not None:
+                self._forget(chunk)
+            else:
+                with self._lock:
+                    self.missed += len(chunk.batch)
             return
         if self._lag is not None:
             self._lag.wait()
@@ -341,8 +409,9 @@ class IndexWriter:
             future.add_done_callback(self._sent)
 
     def _send(self, parcel: _Parcel) -> None:
+        failure = self.failure
         try:
-            if self.failure is None:
+            if failure is None:
                 for collection, tables in parcel.documents.items():
                     self._ensure(collection)
                     lengths = np.concatenate(
@@ -352,14 +421,27 @@ class IndexWriter:
                     self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
                 self._catalog.put_chunks(parcel.entries)
         except DatabaseError as error:
-            with self._lock:
-                self.failure = self.failure or error
+            failure = error
         with self._lock:
-            if self.failure is None:
+            if failure is None:
                 self.indexed += parcel.messages
                 self.entries.extend(parcel.entries)
-            else:
+                return
+            self.failure = failure
+            self._retry_at = time.monotonic() + _RETRY_S
+            if self._lag is None:
                 self.missed += parcel.messages
+                return
+            # To insert a document twice is to insert it once, so all of it comes again.
+            for entry in parcel.entries:
+                self._put_back(entry)
+
+    def _put_back(self, entry: ChunkEntry) -> int:
+        """A chunk is to be indexed again; returns its messages."""
+        place = ChunkPlace(entry.offset, entry.length, entry.trailer, entry.first, entry.last, ())
+        count = sum(stats.messages for stats in entry.stats.values())
+        self._forgotten.append(_Forgotten(entry.segment, place, count))
+        return count
 
     def _ensure(self, collection: str) -> None:
         with self._lock:
@@ -383,6 +465,10 @@ class IndexWriter:
         error = future.exception()
         if error is not None and self._crash is None:
             self._crash = error
+
+
+def _nothing() -> None:
+    """Something to wait for."""
 
 
 def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:

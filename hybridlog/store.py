@@ -137,23 +137,32 @@ class Store:
         Raises:
             DatabaseError: it does not answer, or holds the index of another store.
         """
+        self._uri = uri
+        self.database = self._another_database()
+        self._claim(self.database)
+        catalog = Catalog(self.database)
+        catalog.prepare()
+        self._catalog = catalog
+
+    def _another_database(self) -> Database:
+        """A connection; the embedded MongoDB is started if it is not there (any more).
+
+        Raises:
+            DatabaseError: it does not answer.
+        """
         from hybridlog_storage.database import Database
 
-        self._uri = uri
+        uri = self._uri
         if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
 
-            self._mongod = EmbeddedMongod(self.directory.mongod)
+            self._mongod = self._mongod or EmbeddedMongod(self.directory.mongod)
             try:
                 uri = self._mongod.start()
             except StoreError as error:
                 # A store that cannot be written has no embedded MongoDB; its segments do.
                 raise DatabaseError(str(error)) from error
-        self.database = Database.connect(uri)
-        self._claim(self.database)
-        catalog = Catalog(self.database)
-        catalog.prepare()
-        self._catalog = catalog
+        return Database.connect(uri)
 
     def disconnect(self) -> None:
         """Leave the database; what remains is reading by time."""
@@ -386,6 +395,7 @@ class Store:
             self.database_for("Starting a recording"),
             name,
             options or LiveOptions(**choices),
+            renew=self._another_database,
             on_close=self._after,
         )
 
@@ -393,6 +403,13 @@ class Store:
         """A recording has ended."""
         if report.failure is not None:
             self._catch_up(report)
+        elif self.database is not None and not self.database.ping():
+            # It has ended meanwhile, and the recording has found another connection.
+            self.disconnect()
+            try:
+                self.connect(self._uri)
+            except DatabaseError as error:
+                self.without_database = error
         self.refresh()
 
     def _catch_up(self, report: RecordReport) -> None:

@@ -90,6 +90,7 @@ class LiveRecording:
         database: The index.
         name: Name of the recording.
         options: How.
+        renew: Gives another connection to the index when one has failed.
         on_close: Called with the report when the recording has come to its end.
     """
 
@@ -99,6 +100,8 @@ class LiveRecording:
         database: Database,
         name: str,
         options: LiveOptions,
+        *,
+        renew: Callable[[], Database],
         on_close: Callable[[RecordReport], None],
     ) -> None:
         self._options = options
@@ -129,6 +132,7 @@ class LiveRecording:
                 source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
                 behind=self._behind,
+                renew=renew,
             )
             self._held = self._held.pop_all()
         self.id = self._capture.entry.id

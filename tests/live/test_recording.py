@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -252,3 +253,43 @@ def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
     with pytest.raises(ZeroDivisionError):
         speak()
     assert store.topic("/talk").count() == 1
+
+
+def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.Store) -> None:
+    """Not at the end only: a recording may go on for hours."""
+    speech = channel("/speech")
+    with store.start("talk") as recording:
+        recording.write(speech, text(b"before"), log_time=1)
+        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
+        kill_mongod(store.directory.path)
+        recording.write(speech, text(b"while"), log_time=2)
+        wait_for(lambda: recording.index_failure is not None)
+        assert recording.lag == 1
+        wait_for(lambda: recording.index_failure is None and recording.lag == 0)
+        recording.write(speech, text(b"after"), log_time=3)
+        report = recording.close()
+    assert report.failure is None
+    assert (report.indexed, report.missed) == (3, 0)
+    assert store.topic("/speech").where("data == 'while'").count() == 1
+    assert not store.verify().findings
+
+
+def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
+    speech = channel("/speech")
+    pid = int(json.loads((store.directory.mongod / "mongod.json").read_text())["mongod"])
+    with store.start("talk") as recording:
+        recording.write(speech, text(b"0"), log_time=1)
+        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            started = time.monotonic()
+            for number in range(2, 200):
+                assert recording.write(speech, text(b"x"), log_time=number, wait=False)
+                time.sleep(0.01)
+            assert time.monotonic() - started < 20
+            wait_for(lambda: recording.stored[0] == 199)
+            assert recording.lag > 0
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        wait_for(lambda: recording.lag == 0)
+    assert store.topic("/speech").count() == 199
