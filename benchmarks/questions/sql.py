@@ -1,11 +1,41 @@
-"""What PostgreSQL and SQLite are asked in the same words: window functions."""
+"""What PostgreSQL and SQLite are asked in the same words.
+
+`field` gives the expression of a field by its path, as the indexes have it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
+
+Field: TypeAlias = Callable[[str], str]
+
+
+def closings(table: str, field: Field) -> str:
+    """How often the gripper was closed."""
+    return f"SELECT COUNT(*) FROM {table} WHERE {field('position')} = 0"
+
+
+def behind(table: str, field: Field) -> str:
+    """How many viewpoints lie behind the robot."""
+    return f"SELECT COUNT(*) FROM {table} WHERE {field('position.x')} <= 0"
+
+
+def in_region(table: str, field: Field) -> str:
+    """How many arm poses lie in the paper's box."""
+    x, y, z = (field(f"pose.position.{axis}") for axis in "xyz")
+    return (
+        f"SELECT COUNT(*) FROM {table} WHERE {z} > 1 "
+        f"AND {y} > -0.5 AND {y} < 0.5 AND {x} > 0.5 AND {x} < 1"
+    )
+
+
+def positions(table: str, field: Field) -> str:
+    """Coordinates of the viewpoints behind the robot."""
+    x, y, z = (field(f"position.{axis}") for axis in "xyz")
+    return f"SELECT {x}, {y}, {z} FROM {table} WHERE {x} <= 0"
 
 
 def changes(table: str, time: str, pose: str) -> str:

@@ -147,21 +147,13 @@ class SqliteJsonAsker(_Connected, Asker):
             return None
 
     def closings(self) -> int:
-        return self.number(
-            f"SELECT COUNT(*) FROM {_quoted(GRIPPER)} WHERE {expression('position')} = 0"
-        )
+        return self.number(sql.closings(_quoted(GRIPPER), expression))
 
     def behind(self) -> int:
-        return self.number(
-            f"SELECT COUNT(*) FROM {_quoted(VIEWPOINT)} WHERE {expression('position.x')} <= 0"
-        )
+        return self.number(sql.behind(_quoted(VIEWPOINT), expression))
 
     def in_region(self) -> int:
-        x, y, z = (expression(f"pose.position.{axis}") for axis in "xyz")
-        return self.number(
-            f"SELECT COUNT(*) FROM {_quoted(ARM)} WHERE {z} > 1 "
-            f"AND {y} > -0.5 AND {y} < 0.5 AND {x} > 0.5 AND {x} < 1"
-        )
+        return self.number(sql.in_region(_quoted(ARM), expression))
 
     def grasps(self, half_ns: int) -> int:
         mine, theirs = expression("_meta.t", "a.msg"), expression("_meta.t", "b.msg")
@@ -176,9 +168,7 @@ class SqliteJsonAsker(_Connected, Asker):
         )
 
     def positions(self) -> list[float]:
-        x, y, z = (expression(f"position.{axis}") for axis in "xyz")
-        query = f"SELECT {x}, {y}, {z} FROM {_quoted(VIEWPOINT)} WHERE {x} <= 0"
-        return sql.sums(self.rows(query))
+        return sql.sums(self.rows(sql.positions(_quoted(VIEWPOINT), expression)))
 
     def changes(self) -> int:
         pose = f"{expression('position')} || {expression('orientation')}"
