@@ -431,7 +431,7 @@ def losses(
     mongo: MongoOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the loss ledger: what is missing, from when to when, and why."""
+    """Show what is missing, from when to when, and why."""
     from hybridlog.cli import losses as command
 
     command.show(recording or [], topic or [], store, mongo, as_json=as_json)
@@ -498,7 +498,7 @@ def trigger(
     store: StoreOption = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Let a recorder with a ring write a snapshot now."""
+    """Let a recorder write its ring out now."""
     from hybridlog.cli import mark as command
 
     command.fire(name, recording or [], store, quiet=quiet)

@@ -16,7 +16,22 @@ from hybridlog.cli.main import EXIT_CODES
 from .running import COMMAND, environment, run
 
 HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
-COMMANDS = ["record", "ls", "info", "schema", "fetch", "export", "reindex", "verify", "rm", "demo"]
+COMMANDS = [
+    "record",
+    "losses",
+    "top",
+    "mark",
+    "trigger",
+    "ls",
+    "info",
+    "schema",
+    "fetch",
+    "export",
+    "reindex",
+    "verify",
+    "rm",
+    "demo",
+]
 
 
 def imported(*arguments: object) -> set[str]:
@@ -79,7 +94,7 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
 
 def test_usage_names_what_is_wanted() -> None:
     for command, words in (
-        ("record", "{PATH}..."),
+        ("record", "[PATH]..."),
         ("schema", "{TOPIC}"),
         ("verify", "[RECORDING]..."),
         ("rm", "{RECORDING}..."),
