@@ -78,10 +78,10 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
     with opened(
         choices.store, choices.mongo, create=True, needs_database=True, quiet=quiet
     ) as store:
-        recorder = Recorder(store, sources, chosen, shown.say)
-        with _until_told() as told_to_stop, _fired_by_signal(recorder, chosen):
+        with _until_told() as told_to_stop:
+            recorder = Recorder(store, sources, chosen, shown.say)
             recorder.start()
-            with shown.table():
+            with shown.table(), _fired_by_signal(recorder, chosen):
                 _watch(recorder, told_to_stop, shown)
             if not quiet:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")

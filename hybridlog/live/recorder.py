@@ -39,6 +39,7 @@ MARKS = "/hybridlog/marks"
 _LOOK_S = 1.0
 _JUMP_S = 0.5
 _MOST_SAID = 1000
+_MOST_LANES = 4096  # channel objects whose lane is found at once
 _SEQUENCES = 1 << 32
 
 
@@ -152,6 +153,7 @@ class Recorder:
         self._tell = say
         self._store_path = store.directory.path
         self._lanes: dict[Channel, _Lane] = {}
+        self._lanes_by_content: dict[tuple[object, ...], _Lane] = {}
         self._topics: dict[str, TopicRates] = {}
         self._present: dict[str, int] = {}
         self._lock = threading.Lock()
@@ -364,7 +366,7 @@ class Recorder:
         if self._refused is not None:
             self._lose(lane, *self._refused, received)
             return
-        kept = channel
+        kept = lane.channel
         if size > SMALL:
             keep = step(lane.priority, self._target.filled)
             if keep is not Keep.ALL and not self._keeps(lane, keep):
@@ -458,9 +460,20 @@ class Recorder:
     # How.
 
     def _meet(self, channel: Channel) -> _Lane:
-        """A message of a channel that is new."""
+        """A message of a channel that is new.
+
+        A publisher that connects again makes a new channel of the same content: that is
+        the old one, or a robot with a bad cable would run out of channels in a day.
+        """
+        content = (
+            channel.topic,
+            channel.message_encoding,
+            channel.schema,
+            tuple(sorted(channel.metadata.items())),
+            channel.has_publish_time,
+        )
         with self._lock:
-            lane = self._lanes.get(channel)
+            lane = self._lanes_by_content.get(content)
             if lane is None:
                 topic = channel.topic
                 type_name = channel.schema.name if channel.schema is not None else ""
@@ -475,7 +488,10 @@ class Recorder:
                     Priority.NORMAL if priority is None else Priority(int(priority)),
                 )
                 rates.tallies.append(lane.tally)
-                self._lanes[channel] = lane
+                self._lanes_by_content[content] = lane
+            if len(self._lanes) >= _MOST_LANES:
+                self._lanes.clear()  # they are found again by their content
+            self._lanes[channel] = lane
         return lane
 
     def _claim(self) -> bool:

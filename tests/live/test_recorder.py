@@ -289,6 +289,16 @@ def test_topics_are_chosen_before_they_are_subscribed_to(store: hl.Store) -> Non
     robot.recorder.stop()
 
 
+def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:
+    robot = Running(store)
+    for number in range(10_000):
+        robot.speaker.say(text_channel(), text(str(number)), SECOND + number)
+    assert len(robot.recorder.look().topics) == 1
+    (report,) = robot.recorder.stop()
+    assert len(report.entry.channels) == 1
+    assert report.entry.messages == 10_000
+
+
 def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
     robot = Running(store)
     for number in range(5000):
