@@ -73,6 +73,8 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
     # Everything that can be wrong with the options is wrong before a store is made.
     chosen = options()
     sources = _sources(live)
+    for source in sources:
+        source.check()
     quiet = choices.quiet
     shown = _Shown(as_json=choices.as_json, quiet=quiet)
     with opened(

@@ -115,6 +115,14 @@ class LiveSource(ABC):
     kind: str
     address: str
 
+    def check(self) -> None:  # noqa: B027 - most can say nothing before they start
+        """Refuse what `start` would refuse, before anything is made for a recording.
+
+        Raises:
+            SourceError: It can never work.
+            MissingDependencyError: What it needs is not installed.
+        """
+
     @abstractmethod
     def start(self, sink: Sink) -> None:
         """Begin to listen.
