@@ -10,7 +10,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import xmlrpc.client
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
@@ -44,7 +45,7 @@ _MAX_CLIENTS: Final = 64
 # Calling.
 
 
-async def call(network: Network, uri: str, method: str, *arguments: object) -> object:
+async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
     """Calls a method of the master or of a node, and gives what stands behind its status.
 
     Raises:
@@ -182,7 +183,7 @@ class RpcServer:
                 self._clients.add(task)
                 task.add_done_callback(self._clients.discard)
                 # Also when it is cancelled before it begins.
-                task.add_done_callback(lambda _, client=client: client.close())
+                task.add_done_callback(partial(_close, client))
         finally:
             self._socket.close()
             for task in tuple(self._clients):
@@ -226,3 +227,7 @@ class RpcServer:
             fault = xmlrpc.client.Fault(1, f"there is no method {shown(method or '')}")
             return xmlrpc.client.dumps(fault, methodresponse=True)
         return xmlrpc.client.dumps((known(values),), methodresponse=True)
+
+
+def _close(client: socket.socket, _: asyncio.Task[None]) -> None:
+    client.close()
