@@ -72,7 +72,7 @@ class Ledger:
         """Note messages that are lost.
 
         Args:
-            topic: Whose.
+            topic: Whose; empty when nobody knows.
             cause: Why.
             count: How many, None when that cannot be known.
             first: From when on, ns since the epoch, by the recorder's clock.
@@ -138,5 +138,5 @@ def _as_dict(topic: str, cause: Cause, detail: str, row: _Open) -> dict[str, Any
         "offset": None,
         "reason": detail,
         "to": row.last,
-        "topic": topic,
+        "topic": topic or None,
     }

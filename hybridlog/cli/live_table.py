@@ -140,7 +140,9 @@ def closing_rows(report: RecordReport, state: RecorderState) -> list[tuple[str, 
     if not state.lost.keys() - {Cause.THROTTLE.value}:
         rows.append(("lost", "nothing"))
     for cause, count in sorted(state.lost.items()):
-        topics = sorted({r["topic"] for r in entry.end.get("losses", []) if r["cause"] == cause})
+        topics = sorted(
+            {r["topic"] or "any" for r in entry.end.get("losses", []) if r["cause"] == cause}
+        )
         named = ", ".join(topics[:3]) + (" …" if len(topics) > 3 else "")
         what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
         rows.append((what, f"{count} ({named})"))

@@ -284,7 +284,7 @@ class Snapshots:
         for row in lost:
             if row["to"] >= begin:
                 recording.ledger.note(
-                    row["topic"],
+                    row["topic"] or "",
                     Cause(row["cause"]),
                     row["count"],
                     first=row["from"],

@@ -70,7 +70,7 @@ class Sink(Protocol):
         """Note messages that will never come.
 
         Args:
-            topic: Whose.
+            topic: Whose; empty when nobody knows.
             cause: Why.
             count: How many, None when that cannot be known.
             first: From when on, ns since the epoch, as the recorder's clock was.
