@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -73,13 +73,14 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
     # Everything that can be wrong with the options is wrong before a store is made.
     chosen = options()
     sources = _sources(live)
-    for source in sources:
-        source.check()
     quiet = choices.quiet
     shown = _Shown(as_json=choices.as_json, quiet=quiet)
-    with opened(
-        choices.store, choices.mongo, create=True, needs_database=True, quiet=quiet
-    ) as store:
+    with ExitStack() as held:
+        for source in sources:
+            held.enter_context(source).check()
+        store = held.enter_context(
+            opened(choices.store, choices.mongo, create=True, needs_database=True, quiet=quiet)
+        )
         with _until_told() as told_to_stop:
             recorder = Recorder(store, sources, chosen, shown.say)
             recorder.start()
