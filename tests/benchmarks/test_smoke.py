@@ -49,13 +49,12 @@ def test_every_backend_stores_what_it_says(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(600)
 def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
-    only = ["--backends", "hybridlog", "--seconds", "0.3"]
+    # The searches, for ceilings and for the speed at which logs drop, have tests of their own.
+    only = ["--backends", "hybridlog", "--no-ceilings", "--no-speed-up"]
     samples = run(tmp_path, "all", *TINY, *only)
     assert {sample.study for sample in samples} == {
         "throughput",
-        "ceiling",
         "persistence",
-        "speed-up",
         "queries",
         "reading",
     }
