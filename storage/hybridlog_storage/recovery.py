@@ -28,7 +28,7 @@ from hybridlog_storage.mcap_scan import (
     parse_content,
     scan,
 )
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Schema
 from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
     END_METADATA,
@@ -104,6 +104,9 @@ class _Rebuilder:
             return
         if isinstance(item, SchemaRecord):
             self._schemas[item.id] = item
+            # The crash may have come before the channel that it was written for.
+            schema = Schema(item.name, item.encoding, bytes(item.data))
+            self.segment.schemas.setdefault(item.id, schema)
         elif isinstance(item, ChannelRecord):
             channel = channel_of(item, self._schemas)
             self.segment.define(item.id, item.schema_id, channel, write=False)

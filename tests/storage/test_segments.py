@@ -293,3 +293,17 @@ def test_a_segment_that_was_left_open_is_recovered_with_its_padding(tmp_path: Pa
         with SegmentCheck(recovered.path) as check:
             assert list(check.between_chunks()) == []
         recovered.path.unlink()
+
+
+def test_a_crash_between_a_schema_and_its_channel(tmp_path: Path) -> None:
+    (path,), chunks = write(tmp_path, [many(50)], SegmentSettings(chunk_size=1 << 20))
+    whole = path.read_bytes()
+    schema = whole.index(SCHEMA.data)  # its definition is the end of its record
+    path.unlink()
+    opened = path.with_name(path.name + ".open")
+    opened.write_bytes(whole[: schema + len(SCHEMA.data)])
+    recovered = recover_segment(opened)
+    assert chunks
+    if recovered.path is not None:
+        with SegmentCheck(recovered.path) as check:
+            assert list(check.between_chunks()) == []
