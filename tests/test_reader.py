@@ -299,7 +299,11 @@ def test_tables_of_real_logs(store: hl.Store, name: str, topics: list[str]) -> N
     path = next(DATA / "real" / log for log in LOGS if log.startswith(name))
     truth = decoded(path, topics)
     for topic in topics:
-        check_tables(store.topic(topic).in_recording(name), truth[topic])
+        query, want = store.topic(topic).in_recording(name), truth[topic]
+        if len(want) and topic == "/luminar_pointcloud":
+            # A megabyte a message, compared number by number.
+            query, want = query.limit(1), want[:1]
+        check_tables(query, want)
 
 
 def test_tables_with_every_and_limit_and_reverse(store: hl.Store, robot: Truth) -> None:

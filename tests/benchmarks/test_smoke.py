@@ -12,6 +12,7 @@ import pytest
 from benchmarks.backends.registry import BACKENDS
 from benchmarks.questions.base import QUESTIONS
 from benchmarks.samples import Journal, Sample
+from hybridlog.demo.write import write_bag
 from tests.imports import ROOT
 
 TINY = ["--sizes", "5000", "--rates", "64", "--topics", "3", "--messages", "20"]
@@ -50,8 +51,12 @@ def test_every_backend_stores_what_it_says(tmp_path: Path) -> None:
 @pytest.mark.timeout(600)
 def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
     # The searches, for ceilings and for the speed at which logs drop, have tests of their own.
-    only = ["--backends", "hybridlog", "--no-ceilings", "--no-speed-up"]
-    samples = run(tmp_path, "all", *TINY, *only)
+    # What each backend answers has tests of its own; this one starts at once. A study whose
+    # answers are not those of the generator ends with 1.
+    only = ["--backends", "sqlite_json1", "--no-ceilings", "--no-speed-up"]
+    write_bag(tmp_path / "robot.bag", duration_s=2, topics=["/imu/data", "/base/scan"])
+    logs = ["--logs", str(tmp_path / "robot.bag")]
+    samples = run(tmp_path / "results", "all", *TINY, *only, *logs)
     assert {sample.study for sample in samples} == {
         "throughput",
         "persistence",
@@ -60,8 +65,7 @@ def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
     }
     assert {sample.status for sample in samples} == {"ok"}
     asked = {(s.backend, s.case["question"]) for s in samples if s.study == "queries"}
-    rows = ("hybridlog", "hybridlog_api", "hybridlog_indexed")
-    assert asked == {(row, question) for row in rows for question in QUESTIONS}
+    assert asked == {("sqlite_json1", question) for question in QUESTIONS}
     answers: dict[str, set[str]] = {}
     for sample in samples:
         if sample.study == "queries":
