@@ -111,7 +111,7 @@ def build_entry(
     entry.end = dict(ends[-1]) if ends else {}
     lost = [row for _, summary in sorted(summaries.items()) for row in summary.losses]
     if lost:
-        entry.end["losses"] = joined([*cast(Any, entry.end).get("losses", ()), *lost])
+        entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost])
     entries: dict[int, ChannelEntry] = {
         channel_id: channel_entry(channel_id, channel, indexer.reason(channel_id, channel))
         for channel_id, channel in sorted(channels_of(summaries.values()).items())

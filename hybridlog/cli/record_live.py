@@ -19,6 +19,7 @@ import typer
 from hybridlog.cli import output
 from hybridlog.cli.live_table import LiveTable, closing_rows
 from hybridlog.cli.opening import opened
+from hybridlog.cli.stopping import SIGNALS
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 
 if TYPE_CHECKING:
@@ -212,8 +213,7 @@ def _until_told() -> Iterator[threading.Event]:
             os._exit(128 + number)
         told.set()
 
-    names = [n for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
-    before = {number: signal.getsignal(number) for number in map(_number, names)}
+    before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
             signal.signal(number, stop)
@@ -240,10 +240,6 @@ def _fired_by_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[N
         yield
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-def _number(name: str) -> signal.Signals:
-    return signal.Signals[name]
 
 
 class _Shown:

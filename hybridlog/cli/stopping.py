@@ -12,9 +12,10 @@ import sys
 from types import FrameType
 from typing import Final
 
-_SIGNALS: Final = tuple(
+SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
+"""What tells a command to stop, as far as this system has it."""
 
 
 class Stopped(BaseException):
@@ -53,6 +54,6 @@ def install() -> None:
             return
         raise Stopped(number)
 
-    for number in _SIGNALS:
+    for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, stop)

@@ -30,10 +30,11 @@ class Lost(NamedTuple):
 
 
 class Heard:
-    """A sink that remembers."""
+    """A sink that remembers all that it is told, in order."""
 
     def __init__(self, wanted: Callable[[str, str], bool] = lambda *_: True) -> None:
         self.wanted = wanted
+        self.asked: list[tuple[str, str]] = []
         self.taken: list[Taken] = []
         self.losses: list[Lost] = []
         self.topics: list[tuple[Any, ...]] = []
@@ -51,6 +52,7 @@ class Heard:
             assert self._changed.wait_for(lambda: done(self), DEADLINE_S), vars(self)
 
     def wants(self, topic: str, type_name: str) -> bool:
+        self._note(self.asked, (topic, type_name))
         return self.wanted(topic, type_name)
 
     def take(

@@ -7,17 +7,15 @@ import socket
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from socketserver import ThreadingMixIn
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
-from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1_wire import decode_header, encode_header
 from hybridlog_storage.messages import Channel
+from tests.live_sources.heard import DEADLINE_S, Heard
 
-PATIENCE_S = 20.0
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
 
 
@@ -224,48 +222,8 @@ def sends(*payloads: bytes) -> Callable[[socket.socket], None]:
     return script
 
 
-@dataclass(frozen=True)
-class Taken:
-    channel: Channel
-    payload: bytes
-    received: int
-    sequence: int | None
-
-
-@dataclass(frozen=True)
-class Loss:
-    topic: str
-    cause: Cause
-    count: int | None
-    first: int
-    last: int
-    detail: str
-
-
-@dataclass
-class Collector:
+class Collector(Heard):
     """A sink that keeps everything, and lets a test wait for it."""
-
-    chooses: Callable[[str, str], bool] = lambda topic, type_name: True
-    taken: list[Taken] = field(default_factory=list)
-    losses: list[Loss] = field(default_factory=list)
-    topics: list[tuple[Any, ...]] = field(default_factory=list)
-    said: list[str] = field(default_factory=list)
-    ends: list[str] = field(default_factory=list)
-    asked: list[tuple[str, str]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.changed = threading.Condition()
-
-    @contextlib.contextmanager
-    def _change(self) -> Iterator[None]:
-        with self.changed:
-            yield
-            self.changed.notify_all()
-
-    def wants(self, topic: str, type_name: str) -> bool:
-        self.asked.append((topic, type_name))
-        return self.chooses(topic, type_name)
 
     def take(
         self,
@@ -278,47 +236,18 @@ class Collector:
     ) -> None:
         assert type(payload) is bytes
         assert sent is None
-        with self._change():
-            self.taken.append(Taken(channel, payload, received, sequence))
-
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
-        with self._change():
-            self.losses.append(Loss(topic, cause, count, first, last, detail))
-
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
-        with self._change():
-            self.topics.append((topic, type_name, publishers))
-
-    def topic_gone(self, topic: str) -> None:
-        with self._change():
-            self.topics.append((topic,))
+        super().take(channel, payload, received=received, sequence=sequence)
 
     def say(self, text: str) -> None:
         assert "\n" not in text
-        with self._change():
-            self.said.append(text)
-
-    def ended(self, reason: str = "") -> None:
-        with self._change():
-            self.ends.append(reason)
+        super().say(text)
 
     def payloads(self, topic: str = "/topic") -> list[bytes]:
-        with self.changed:
-            return [taken.payload for taken in self.taken if taken.channel.topic == topic]
+        return super().payloads(topic)
 
     def wait(self, condition: Callable[[], bool]) -> None:
         """Waits until something holds, which can change with any call."""
-        with self.changed:
-            assert self.changed.wait_for(condition, PATIENCE_S), self
+        self.until(lambda _: condition())
 
     def wait_for(self, *payloads: bytes, topic: str = "/topic") -> None:
         """Waits until just these messages have come."""
@@ -337,7 +266,7 @@ class Collector:
 
 def eventually(condition: Callable[[], bool]) -> None:
     """Waits until something outside a sink holds."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)

@@ -13,14 +13,12 @@ import textwrap
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Condition
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+from tests.live_sources.heard import Heard
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    from hybridlog.live_sources.base import Cause
-    from hybridlog_storage.messages import Channel
 
 WHEELS = (
     "ros-rclpy==9.1.2",
@@ -32,98 +30,24 @@ WHEELS = (
 PATIENCE_S = 30.0
 
 
-class Taken(NamedTuple):
-    channel: Channel
-    payload: bytes
-    received: int
-    sent: int | None
-    sequence: int | None
-
-
-class Lost(NamedTuple):
-    topic: str
-    cause: Cause
-    count: int | None
-    first: int
-    last: int
-    detail: str
-
-
-class Memory:
+class Memory(Heard):
     """A sink that keeps all it is told, in order."""
 
-    def __init__(self, wanted: Callable[[str, str], bool] = lambda *_: True) -> None:
-        self._wanted = wanted
-        self._changed = Condition()
-        self.asked: list[tuple[str, str]] = []
-        self.taken: list[Taken] = []
-        self.losses: list[Lost] = []
-        self.came: list[tuple[str, str, int]] = []
-        self.gone: list[str] = []
-        self.said: list[str] = []
-        self.ends: list[str] = []
+    @property
+    def came(self) -> list[tuple[Any, ...]]:
+        """Topics that came: name, type, publishers."""
+        return [told for told in self.topics if len(told) > 1]
 
-    def wants(self, topic: str, type_name: str) -> bool:
-        with self._changed:
-            self.asked.append((topic, type_name))
-            self._changed.notify_all()
-        return self._wanted(topic, type_name)
-
-    def take(
-        self,
-        channel: Channel,
-        payload: bytes,
-        *,
-        received: int,
-        sent: int | None = None,
-        sequence: int | None = None,
-    ) -> None:
-        with self._changed:
-            self.taken.append(Taken(channel, payload, received, sent, sequence))
-            self._changed.notify_all()
-
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
-        with self._changed:
-            self.losses.append(Lost(topic, cause, count, first, last, detail))
-            self._changed.notify_all()
-
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
-        with self._changed:
-            self.came.append((topic, type_name, publishers))
-            self._changed.notify_all()
-
-    def topic_gone(self, topic: str) -> None:
-        with self._changed:
-            self.gone.append(topic)
-            self._changed.notify_all()
-
-    def say(self, text: str) -> None:
-        with self._changed:
-            self.said.append(text)
-            self._changed.notify_all()
-
-    def ended(self, reason: str = "") -> None:
-        with self._changed:
-            self.ends.append(reason)
-            self._changed.notify_all()
+    @property
+    def gone(self) -> list[str]:
+        """Topics that went."""
+        return [told[0] for told in self.topics if len(told) == 1]
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
         """Until something is so."""
         with self._changed:
             done = self._changed.wait_for(condition, PATIENCE_S)
         assert done, f"{what}; said {self.said}, lost {self.losses}, gone {self.gone}"
-
-    def payloads(self, topic: str) -> list[bytes]:
-        return [taken.payload for taken in self.taken if taken.channel.topic == topic]
 
 
 def ros2_python() -> str | None:

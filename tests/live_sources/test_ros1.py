@@ -115,7 +115,7 @@ def test_it_registers_under_its_name_and_leaves_no_trace() -> None:
 
 
 def test_only_topics_that_are_wanted() -> None:
-    sink = Collector(chooses=lambda topic, type_name: topic == "/b")
+    sink = Collector(wanted=lambda topic, type_name: topic == "/b")
     a, b = FakePublisher(sends(b"a"), topic="/a"), FakePublisher(sends(b"b"), topic="/b")
     with _system(a, b, sink=sink) as (master, _):
         sink.wait_for(b"b", topic="/b")
@@ -184,7 +184,7 @@ def test_a_node_that_is_started_anew_at_another_address() -> None:
 
 def test_publishers_of_different_types() -> None:
     numbers = {"type": "std_msgs/Int8", "message_definition": "int8 data\n", "md5sum": "27"}
-    sink = Collector(chooses=lambda topic, type_name: type_name != "std_msgs/Bool")
+    sink = Collector(wanted=lambda topic, type_name: type_name != "std_msgs/Bool")
     bools = FakePublisher(sends(b"no"), node="/bool", fields={"type": "std_msgs/Bool"})
     with _system(FakePublisher(sends(b"text")), sink=sink) as (master, _):
         sink.wait_for(b"text")
@@ -200,7 +200,7 @@ def test_publishers_of_different_types() -> None:
 
 
 def test_a_topic_that_comes_back_with_a_type_that_is_not_wanted() -> None:
-    sink = Collector(chooses=lambda topic, type_name: type_name == "std_msgs/String")
+    sink = Collector(wanted=lambda topic, type_name: type_name == "std_msgs/String")
     with _system(sink=sink) as (master, _):
         with FakePublisher(sends(b"x")) as first:
             _announce(master, first)

@@ -182,7 +182,7 @@ def _hashes(sink: Collector, topic: str) -> list[str]:
 
 
 def _only(topic: str) -> Collector:
-    return Collector(chooses=lambda name, type_name: name == topic)
+    return Collector(wanted=lambda name, type_name: name == topic)
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_what_a_publisher_drops_is_counted(master: _Master) -> None:
             if len(self.taken) >= 20:
                 reading.wait(60)
 
-    sink = Slow(chooses=lambda name, type_name: name == "/flood")
+    sink = Slow(wanted=lambda name, type_name: name == "/flood")
     with _Publisher(master, "/flood", "image", queue=2) as publisher:
         with _listening(master, sink):
             for number in range(20):
