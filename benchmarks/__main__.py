@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-_WITH_OPTIONS_OF_THEIR_OWN = ("speed", "micro")
+_WITH_OPTIONS_OF_THEIR_OWN = ("speed", "live", "micro")
 
 
 def main(arguments: list[str], program: str = "python -m benchmarks") -> int:

@@ -375,6 +375,19 @@ def speed(
     add_help_option=False,
     context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
 )
+def live(
+    arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
+) -> None:
+    """Recording a running robot under load, beside rosbag record."""
+    from benchmarks.live.command import main as command
+
+    raise typer.Exit(command(arguments or []))
+
+
+@app.command(
+    add_help_option=False,
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
 def micro(
     arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
 ) -> None:

@@ -12,10 +12,11 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from benchmarks.documents import replace_section
 from benchmarks.side import SideError, run_side
 from benchmarks.speed import logs
 from benchmarks.speed.command import DOCS, STUDIES
-from benchmarks.speed.report import markdown, write_docs
+from benchmarks.speed.report import markdown
 from benchmarks.speed.results import Finding, Outcome, Sample, figure, ratio, values_of
 from tests.imports import ROOT
 
@@ -63,7 +64,7 @@ def test_table_in_the_docs_is_replaced(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- results -->\nold\n<!-- /results -->\nafter\n")
     for _ in range(2):
-        write_docs(outcome, page)
+        replace_section(page, "results", markdown(outcome))
     text = page.read_text()
     assert text.count(markdown(outcome)) == 1
     assert "old" not in text
@@ -72,7 +73,7 @@ def test_table_in_the_docs_is_replaced(tmp_path: Path) -> None:
     assert "| study | what | 3x | 2x to 4x | ≥ 20x | ✗ missed |" in text
     page.write_text("nothing")
     with pytest.raises(ValueError, match="one section"):
-        write_docs(outcome, page)
+        replace_section(page, "results", markdown(outcome))
 
 
 def test_docs_name_every_study_and_hold_the_section() -> None:

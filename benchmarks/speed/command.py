@@ -11,12 +11,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.documents import replace_section
 from benchmarks.machine import describe
 from benchmarks.progress import Steps, steps
 from benchmarks.side import SideError
 from benchmarks.speed import reading, record, start
 from benchmarks.speed.bench import Bench, Settings
-from benchmarks.speed.report import markdown, show, write_docs
+from benchmarks.speed.report import markdown, show
 from benchmarks.speed.results import Outcome
 
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
@@ -124,7 +125,7 @@ def _give(outcome: Outcome, chosen: argparse.Namespace) -> None:
         (chosen.out / "speed.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
         (chosen.out / "speed.md").write_text(markdown(outcome) + "\n", encoding="utf-8")
     if chosen.write_docs:
-        write_docs(outcome, DOCS)
+        replace_section(DOCS, "results", markdown(outcome))
     if chosen.json:
         print("\n".join(lines))
     else:

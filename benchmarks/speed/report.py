@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from benchmarks.speed.results import Finding, Outcome
 
 _HEADINGS = ("study", "figure", "value", "spread", "target", "")
-_SECTION = re.compile(r"(<!-- results -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 
 def show(outcome: Outcome, *, terminal: bool) -> None:
@@ -43,20 +40,6 @@ def markdown(outcome: Outcome) -> str:
     rows = [_HEADINGS, ("---", "---", "---:", "---", "---:", "---"), *_rows(outcome.findings)]
     table = "\n".join("| " + " | ".join(row) + " |" for row in rows)
     return f"{_title(outcome)}\n\n{table}\n\n{_machine(outcome)}"
-
-
-def write_docs(outcome: Outcome, path: Path) -> None:
-    """Replace the part of a document between `<!-- results -->` and `<!-- /results -->`.
-
-    Raises:
-        ValueError: The document has no such part.
-    """
-    text = path.read_text(encoding="utf-8")
-    table = markdown(outcome)
-    new, count = _SECTION.subn(lambda part: f"{part[1]}{table}\n{part[2]}", text)
-    if count != 1:
-        raise ValueError(f"{path} must have one section <!-- results --> … <!-- /results -->")
-    path.write_text(new, encoding="utf-8")
 
 
 def _title(outcome: Outcome) -> str:

@@ -1026,6 +1026,7 @@ def sdk() -> Any:
     )
 
 
+@pytest.mark.peer("Foxglove")
 def test_a_program_with_the_sdk(sdk: Any) -> None:
     context = sdk.Context()
     server = sdk.start_server(host="127.0.0.1", port=0, context=context, name="real")
@@ -1108,6 +1109,7 @@ def start_again(sdk: Any, port: int, context: Any) -> Any:
             time.sleep(0.05)
 
 
+@pytest.mark.peer("Foxglove")
 def test_an_sdk_server_that_begins_anew(sdk: Any) -> None:
     context = sdk.Context()
     made = plain(sdk, "/a", context)
@@ -1127,6 +1129,7 @@ def test_an_sdk_server_that_begins_anew(sdk: Any) -> None:
     assert [lost[:3] for lost in heard.losses] == [("/a", Cause.CONNECTION, None)]
 
 
+@pytest.mark.peer("Foxglove")
 def test_many_messages_of_the_sdk_come_in_order(sdk: Any) -> None:
     context = sdk.Context()
     made = plain(sdk, "/a", context)

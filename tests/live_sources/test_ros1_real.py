@@ -19,9 +19,8 @@ import pytest
 
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1 import Ros1Source
+from tests.live_sources.ros1_debian import PACKAGES, Ros1, ros1
 from tests.live_sources.ros1_peers import Collector, eventually
-
-PYTHON = "/usr/bin/python3"
 
 PUBLISHER = """
 import hashlib, io, json, sys
@@ -60,32 +59,24 @@ rospy.signal_shutdown("done")
 MASTER = "import rosmaster; rosmaster.rosmaster_main()"
 
 
-def _missing() -> str:
-    """Why the real peers cannot be had, empty when they can."""
-    try:
-        done = subprocess.run(
-            [PYTHON, "-c", "import rosmaster, rospy, sensor_msgs.msg, std_msgs.msg"],
-            capture_output=True,
-            text=True,
-            check=False,
+pytestmark = pytest.mark.peer("ROS 1")
+
+
+@pytest.fixture(scope="session")
+def debian() -> Ros1:
+    found = ros1()
+    if isinstance(found, str):
+        pytest.skip(
+            f"ROS 1 was NOT tested with real peers, {found}: apt-get install {' '.join(PACKAGES)}"
         )
-    except OSError as error:
-        return str(error)
-    return (done.stderr.strip().splitlines() or ["it fails"])[-1] if done.returncode else ""
-
-
-WHY = _missing()
-pytestmark = pytest.mark.skipif(
-    bool(WHY),
-    reason=f"ROS 1 was NOT tested with real peers ({WHY}): apt-get install "
-    "python3-rosmaster python3-rospy python3-std-msgs python3-sensor-msgs",
-)
+    return found
 
 
 class _Master:
     """`rosmaster --core` on a port of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, debian: Ros1) -> None:
+        self.debian = debian
         with socket.create_server(("127.0.0.1", 0)) as server:
             self.port = server.getsockname()[1]
         self.uri = f"http://127.0.0.1:{self.port}"
@@ -93,12 +84,12 @@ class _Master:
             **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
             "ROS_MASTER_URI": self.uri,
             "ROS_IP": "127.0.0.1",
-            "PYTHONPATH": "",
+            **debian.environment,
         }
 
     def __enter__(self) -> _Master:
         self._process = subprocess.Popen(
-            [PYTHON, "-c", MASTER, "--core", "-p", str(self.port)],
+            [self.debian.python, "-c", MASTER, "--core", "-p", str(self.port)],
             env=self.environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -129,7 +120,7 @@ class _Publisher:
     def __init__(self, master: _Master, topic: str, type_name: str = "text", **more: Any) -> None:
         order = {"node": "talker", "topic": topic, "type": type_name, **more}
         self._process = subprocess.Popen(
-            [PYTHON, "-c", PUBLISHER, json.dumps(order)],
+            [master.debian.python, "-c", PUBLISHER, json.dumps(order)],
             env=master.environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -165,8 +156,8 @@ class _Publisher:
 
 
 @pytest.fixture(scope="module")
-def master() -> Iterator[_Master]:
-    with _Master() as running:
+def master(debian: Ros1) -> Iterator[_Master]:
+    with _Master(debian) as running:
         yield running
 
 
@@ -246,8 +237,8 @@ def test_a_publisher_that_is_killed_and_started_anew(master: _Master) -> None:
         sink.wait(lambda: sink.topics[-1] == ("/mortal",))
 
 
-def test_the_master_is_started_anew() -> None:
-    master, sink = _Master(), _only("/steady")
+def test_the_master_is_started_anew(debian: Ros1) -> None:
+    master, sink = _Master(debian), _only("/steady")
     with master:
         with _Publisher(master, "/steady") as publisher, Ros1Source(master.uri) as source:
             source.start(sink)
@@ -308,18 +299,13 @@ with rosbag.Bag(sys.argv[1], "w") as bag:
         hashes.append(hashlib.sha256(payload.getvalue()).hexdigest())
 print(json.dumps(hashes))
 """
-PLAYER = Path("/usr/lib/rosbag/play")
 
 
-@pytest.mark.skipif(
-    not PLAYER.exists(),
-    reason="ROS 1 was NOT tested with a publisher in C++: apt-get install python3-rosbag",
-)
 def test_a_publisher_in_c_plus_plus(master: _Master, tmp_path: Path) -> None:
     """It plays a bag whose numbers say nothing of what it sends."""
     bag = tmp_path / "some.bag"
     done = subprocess.run(
-        [PYTHON, "-c", BAG, str(bag)],
+        [master.debian.python, "-c", BAG, str(bag)],
         env=master.environment,
         stdout=subprocess.PIPE,
         text=True,
@@ -328,7 +314,7 @@ def test_a_publisher_in_c_plus_plus(master: _Master, tmp_path: Path) -> None:
     with _listening(master, _only("/played")) as sink:
         subprocess.run(
             [
-                str(PLAYER),
+                str(master.debian.tools / "play"),
                 "--quiet",
                 "--wait-for-subscribers",
                 "--topics",

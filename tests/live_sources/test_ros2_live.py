@@ -29,6 +29,8 @@ from tests.live_sources.ros2_peers import (
     wait_until,
 )
 
+pytestmark = pytest.mark.peer("ROS 2")
+
 STRING = "std_msgs/msg/String"
 IMAGE = "sensor_msgs/msg/Image"
 

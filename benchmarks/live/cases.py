@@ -1,0 +1,333 @@
+"""The cases: each a load, what may go wrong with it, and what must be there afterwards."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import statistics
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from os import kill
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.backends.processes import working_below
+from benchmarks.harness.usage import machine, with_children
+from benchmarks.live.master import Master
+from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
+from benchmarks.live.talker import Load, data_of
+from benchmarks.side import SideError
+
+_FLUSH_S = 1.0
+"""The recorder's own interval between flushes, as it is by default."""
+
+
+class Row(NamedTuple):
+    """What a recorder did with a load.
+
+    Attributes:
+        case: Which case.
+        recorder: Whose.
+        values: Figures by name; units stand in the names.
+        text: The figures in words.
+        holds: Nothing is missing without a word, and what was damaged came back.
+    """
+
+    case: str
+    recorder: str
+    values: dict[str, float]
+    text: str
+    holds: bool
+
+
+class Case(NamedTuple):
+    """One case.
+
+    Attributes:
+        about: What it is.
+        seconds: It takes about so long, in a full and in a quick run.
+        run: Does it in a directory, fully or quickly.
+    """
+
+    about: str
+    seconds: tuple[float, float]
+    run: Callable[[Path, bool], Iterator[Row]]
+
+
+def _beside(name: str, load: Load) -> Case:
+    """The same load to ours and to `rosbag record`, one after the other."""
+
+    def run(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001 - one shape for all cases
+        said = load._replace(seconds=2.0) if quick else load
+        yield _recorded(name, said, work, "hybridlog")
+        if rosbag() is not None:
+            yield _recorded(name, said, work, "rosbag record")
+
+    about = (
+        f"{load.topics} topic{'s'[: load.topics > 1]} of {_size(load.size)} at {load.hz:g} Hz"
+        f"{f' in bursts of {load.burst}' if load.burst > 1 else ''}, "
+        f"{load.megabytes_per_s:,.0f} MB/s"
+    )
+    return Case(about, (2 * load.seconds + 25, 30), run)
+
+
+def _recorded(name: str, load: Load, work: Path, recorder: str) -> Row:
+    with _clean(work), Master() as master, _steal() as stolen:
+        running: Ours | Rosbag
+        if recorder == "hybridlog":
+            running = Ours(work / "store", master.uri, "--reserve", "0")
+        else:
+            running = Rosbag(work / "it.bag", master.uri)
+        try:
+            with speech(load, master.uri) as talker:
+                did = talker.ended()
+            time.sleep(1)
+            kept = running.stop()
+        finally:
+            running.close()
+    return _row(name, recorder, _Recorded(load, did, kept, stolen[0]))
+
+
+class _Recorded(NamedTuple):
+    """A load that has been said, and what a recorder has of it."""
+
+    load: Load
+    did: dict[str, float]
+    kept: Kept
+    stolen_s: float
+
+
+def _row(name: str, recorder: str, recorded: _Recorded) -> Row:
+    load, did, kept, stolen_s = recorded
+    missing = did["sent"] - kept.stored - kept.told
+    not_indexed = 0 if kept.indexed is None else kept.stored - kept.indexed
+    values = {
+        "offered_mb_per_s": round(load.megabytes_per_s, 1),
+        "sent": did["sent"],
+        "dropped_by_talker": did["dropped"],
+        "talker_late_ms": did["late_ms"],
+        "stored": kept.stored,
+        "told": kept.told,
+        "missing": missing,
+        "stored_share": round(kept.stored / did["sent"], 5),
+        "cpu_s": round(kept.cpu_s, 1),
+        "stolen_s": round(stolen_s, 1),
+    }
+    told = ", ".join(f"{cause} {count:,}" for cause, count in kept.causes.items())
+    text = (
+        f"{kept.stored:,} of {did['sent']:,.0f} stored ({_share(kept.stored, did['sent'])}), "
+        f"{told or 'nothing'} in the ledger, {missing:,.0f} missing without a word"
+    )
+    if did["dropped"]:
+        text += f"; the talker's queue dropped {did['dropped']:,.0f}"
+    return Row(name, recorder, values, text, missing == 0 and not_indexed == 0)
+
+
+def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
+    """mongod is halted, later killed, while a robot speaks."""
+    pause = 3.0 if quick else 20.0
+    load = Load(20, 40_000, 50, 2 * pause + 4)
+    for how in ("halted", "killed"):
+        with _clean(work), Master() as master, _steal() as stolen:
+            running = Ours(work / "store", master.uri, "--reserve", "0")
+            try:
+                with speech(load, master.uri) as talker:
+                    talker.began()
+                    time.sleep(2)
+                    _disturb(work / "store", how, pause)
+                    did = talker.ended()
+                kept = running.stop()
+            finally:
+                running.close()
+        case = f"mongod {how} for {pause:g} s" if how == "halted" else "mongod killed"
+        yield _row(case, "hybridlog", _Recorded(load, did, kept, stolen[0]))
+
+
+def _disturb(store: Path, how: str, pause: float) -> None:
+    servers = working_below(store, "mongod")
+    if not servers:
+        raise SideError("the recorder has no mongod of its own")
+    for server in servers:
+        kill(server, signal.SIGSTOP if how == "halted" else signal.SIGKILL)
+    if how == "halted":
+        time.sleep(pause)
+        for server in servers:
+            kill(server, signal.SIGCONT)
+
+
+def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
+    """kill -9 at random moments."""
+    load = Load(20, 40_000, 100, 0)
+    moments = random.Random(1)
+    lost_s, stored, wrong = [], 0, 0
+    count = 3 if quick else 50
+    for _ in range(count):
+        with _clean(work), Master() as master:
+            running = Ours(work / "store", master.uri, "--reserve", "0")
+            try:
+                with speech(load, master.uri) as talker:
+                    talker.began()
+                    time.sleep(moments.uniform(0, 6))
+                    killed_ns = running.kill()
+            finally:
+                running.close()
+            behind, messages, faults = _recovered(work / "store", load, killed_ns)
+            if messages:
+                lost_s.append(behind)
+            stored += messages
+            wrong += faults
+    worst = max(lost_s, default=0.0)
+    values = {
+        "kills": count,
+        "stored": stored,
+        "wrong": wrong,
+        "lost_s_median": round(statistics.median(lost_s), 3) if lost_s else 0.0,
+        "lost_s_worst": round(worst, 3),
+    }
+    text = (
+        f"{count} kills: {stored:,} messages came back, {wrong} of them wrong or out of order; "
+        f"the last one was {values['lost_s_median']:.2f} s old at the kill, {worst:.2f} s at most"
+    )
+    yield Row("kill -9", "hybridlog", values, text, wrong == 0 and worst < 2 * _FLUSH_S)
+
+
+def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int]:
+    """What a killed recorder has left.
+
+    Returns:
+        Age of the last message at the kill, in seconds; messages; messages that are not as
+        they were sent, or whose forerunner is missing, and findings of `verify`.
+    """
+    import hybridlog
+
+    data = data_of(load.size)
+    last_ns, wrong = 0, 0
+    before: dict[str, int] = defaultdict(int)
+    with hybridlog.open(store) as opened:
+        messages = 0
+        for message in opened.all_topics():
+            raw = bytes(message.raw)
+            sequence = int.from_bytes(raw[:4], "little")
+            wrong += sequence != before[message.topic] + 1 or raw[20:] != data
+            before[message.topic] = sequence
+            last_ns = max(last_ns, message.log_time_ns)
+            messages += 1
+        wrong += len(opened.verify().findings)
+    return (killed_ns - last_ns) / 1e9, messages, wrong
+
+
+def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
+    """Resident memory over a long run; what is sealed is removed, no disk is that large."""
+    seconds = 20.0 if quick else 600.0
+    load = Load(20, 100_000, 100, seconds)
+    ended = threading.Event()
+    with _clean(work), Master() as master, _steal() as stolen:
+        options = ("--reserve", "0", "--split-size", "1GB")
+        running = Ours(work / "store", master.uri, *options)
+        recorder: list[int] = []
+        database: list[int] = []
+        sweeper = threading.Thread(target=_sweep, args=(work / "store", ended))
+        sweeper.start()
+        try:
+            with speech(load, master.uri) as talker:
+                talker.began()
+                begin = time.monotonic()
+                while time.monotonic() - begin < seconds - 1:
+                    time.sleep(1)
+                    recorder.append(_resident(running.process.pid))
+                    servers = working_below(work / "store", "mongod")
+                    database.append(sum(map(_resident, servers)))
+                did = talker.ended()
+            ended.set()
+            sweeper.join()
+            kept = running.stop()
+        finally:
+            ended.set()
+            running.close()
+    row = _row("memory", "hybridlog", _Recorded(load, did, kept, stolen[0]))
+    tenth = max(len(recorder) // 10, 1)
+    early, late = (
+        statistics.median(part) / 1e6 for part in (recorder[tenth : 2 * tenth], recorder[-tenth:])
+    )
+    values = {
+        **row.values,
+        "seconds": seconds,
+        "rss_mb_early": round(early),
+        "rss_mb_late": round(late),
+        "rss_mb_peak": round(max(recorder) / 1e6),
+        "mongod_mb_peak": round(max(database) / 1e6),
+    }
+    text = (
+        f"{load.megabytes_per_s:.0f} MB/s for {seconds:.0f} s: {early:.0f} MB in the second "
+        f"tenth, {late:.0f} MB in the last, {values['rss_mb_peak']} MB at most; {row.text}"
+    )
+    yield Row("memory", "hybridlog", values, text, row.holds and late < 1.1 * early + 20)
+
+
+def _sweep(store: Path, ended: threading.Event) -> None:
+    """Removes all segments but the two youngest, again and again."""
+    while not ended.wait(1):
+        files = sorted(store.glob("recordings/*/*.mcap"), key=lambda path: path.stat().st_mtime)
+        for path in files[:-2]:
+            path.unlink()
+
+
+def _resident(pid: int) -> int:
+    """Bytes of memory that a process and its children hold."""
+    total = 0
+    for each in with_children([pid]):
+        try:
+            status = Path(f"/proc/{each}/status").read_text()
+        except OSError:
+            continue  # it has just ended
+        line = next((line for line in status.splitlines() if line.startswith("VmRSS")), "0 0")
+        total += int(line.split()[1]) * 1024
+    return total
+
+
+@contextmanager
+def _clean(work: Path) -> Iterator[None]:
+    """An empty directory, and nothing of it afterwards; servers in it have ended."""
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    try:
+        yield
+    finally:
+        deadline = time.monotonic() + 30
+        while working_below(work, "mongod") and time.monotonic() < deadline:
+            time.sleep(0.1)
+        shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def _steal() -> Iterator[list[float]]:
+    """Processor seconds that the host took from the machine while the block ran."""
+    before = machine()
+    found = [0.0]
+    yield found
+    after = machine()
+    if before is not None and after is not None:
+        found[0] = after.stolen - before.stolen
+
+
+def _size(size: int) -> str:
+    return f"{size // 1000} kB" if size >= 1000 else f"{size} B"
+
+
+def _share(part: float, whole: float) -> str:
+    return "100 %" if part == whole else f"{100 * part / whole:.2f} %"
+
+
+CASES: dict[str, Case] = {
+    "small": _beside("small", Load(1, 500, 30_000, 20, queue=1000)),
+    "bursts": _beside("bursts", Load(1, 500, 10_000, 20, burst=10)),
+    "large": _beside("large", Load(12, 640_000, 128, 10)),
+    "paper": _beside("paper", Load(20, 640_000, 64, 30)),
+    "database": Case("mongod halted, and killed", (130, 40), _stopped_database),
+    "kills": Case("kill -9 at 50 random moments under 80 MB/s", (600, 40), _kills),
+    "memory": Case("ten minutes at 200 MB/s", (640, 40), _memory),
+}

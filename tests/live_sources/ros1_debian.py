@@ -1,0 +1,142 @@
+"""ROS 1 as Debian packs it: rosmaster, rospy, rosbag's recorder and player.
+
+Installed ones are used. Where there are none, the packages are fetched once into the cache
+and unpacked there, which needs apt but neither root nor an installation.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import textwrap
+from pathlib import Path
+from typing import NamedTuple
+
+PACKAGES = (
+    "python3-rosmaster",
+    "python3-rospy",
+    "python3-std-msgs",
+    "python3-sensor-msgs",
+    "python3-rosbag",
+)
+_SYSTEM = Path("/")
+_STATUS = "/var/lib/dpkg/status"
+_TIMEOUT_S = 200
+
+
+class Ros1(NamedTuple):
+    """Where ROS 1 lies.
+
+    Attributes:
+        python: The Python that its modules are for.
+        tools: Folder of the commands `record` and `play`, which are written in C++.
+        environment: Variables that all of them need.
+    """
+
+    python: str
+    tools: Path
+    environment: dict[str, str]
+
+
+def ros1() -> Ros1 | str:
+    """ROS 1, or why it cannot be had."""
+    installed = _in(_SYSTEM)
+    if not _failure(installed):
+        return installed
+    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
+        return "it is not installed, and there is no apt to fetch it with"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hybridlog-tests"
+    place = cache / "ros1-debian"
+    cache.mkdir(parents=True, exist_ok=True)
+    with (cache / "ros1.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (place / "ready").exists():
+            shutil.rmtree(place, ignore_errors=True)
+            try:
+                _fetch(place)
+            except subprocess.SubprocessError as error:
+                said = getattr(error, "stderr", None) or str(error)
+                return f"apt cannot fetch it: {(said.strip().splitlines() or [''])[-1]}"
+            (place / "ready").touch()
+    fetched = _in(place / "tree")
+    return _failure(fetched) or fetched
+
+
+def _in(root: Path) -> Ros1:
+    """ROS 1 as it would be in a tree."""
+    own_python = root / "usr/bin/python3"
+    environment = {"PYTHONPATH": ""}
+    if root != _SYSTEM:
+        libraries = [*root.glob("usr/lib/*-linux-gnu"), *root.glob("lib/*-linux-gnu")]
+        environment = {
+            "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
+            "LD_LIBRARY_PATH": ":".join(map(str, libraries)),
+        }
+        if own_python.exists():
+            # Debian's Python was missing, too.
+            environment["PYTHONHOME"] = str(root / "usr")
+        else:
+            own_python = _SYSTEM / "usr/bin/python3"
+    return Ros1(str(own_python), root / "usr/lib/rosbag", environment)
+
+
+def _failure(found: Ros1) -> str:
+    """Why some ROS 1 does not work, empty when it does."""
+    modules = "import rosbag, rosmaster, rospy, sensor_msgs.msg, std_msgs.msg"
+    for command in ([found.python, "-c", modules], [found.tools / "record", "--help"]):
+        try:
+            subprocess.run(
+                command,
+                env={**os.environ, **found.environment},
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=60,
+            )
+        except subprocess.CalledProcessError as error:
+            return str((error.stderr.strip().splitlines() or ["it fails"])[-1])
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return str(error)
+    return ""
+
+
+def _fetch(place: Path) -> None:
+    """Fetches the packages and all that they need, and unpacks them.
+
+    Raises:
+        subprocess.SubprocessError: apt cannot.
+    """
+    for folder in ("state/lists/partial", "cache/archives/partial", "tree"):
+        (place / folder).mkdir(parents=True)
+    settings = place / "apt.conf"
+    settings.write_text(
+        textwrap.dedent(
+            f"""\
+            Dir::State "{place}/state";
+            Dir::State::status "{_STATUS}";
+            Dir::Cache "{place}/cache";
+            Debug::NoLocking "true";
+            APT::Install-Recommends "false";
+            APT::Sandbox::User "";
+            """
+        )
+    )
+
+    def run(*command: str | Path) -> None:
+        subprocess.run(
+            command,
+            env={**os.environ, "APT_CONFIG": str(settings)},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=_TIMEOUT_S,
+        )
+
+    run("apt-get", "update", "-qq")
+    run("apt-get", "install", "-qq", "--yes", "--download-only", *PACKAGES)
+    for package in sorted((place / "cache" / "archives").glob("*.deb")):
+        run("dpkg", "-x", package, place / "tree")
+    for done in ("state", "cache"):
+        shutil.rmtree(place / done)
