@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
@@ -11,6 +12,16 @@ from tests import real_peers
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
     os.environ.pop(name, None)
+
+# Whoever runs the tests in the background may have had signals ignored; programs that the
+# tests start would inherit that, and Ctrl-C would do nothing.
+for number, handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGTERM, signal.SIG_DFL),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -394,7 +394,8 @@ def test_contract(name: str, tmp_path: Path) -> None:
         sent = insert_from_threads(backend, 0, 20)
         servers = backend.processes()
         assert bool(servers) == (backend.kind == "hybrid" or name.startswith(("mongo", "postgres")))
-        assert all(is_alive(pid) for pid in servers)
+        # The first is the server; PostgreSQL's workers come and go.
+        assert all(is_alive(pid) for pid in servers[:1])
         backend.finish()
         assert dict(backend.counts()) == by_topic(sent)
         assert not getattr(backend, "refused", None)
