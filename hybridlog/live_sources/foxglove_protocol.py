@@ -231,21 +231,6 @@ def _parse_schema(
         return Schema(name, "", b""), f"is no base64 ({error})"
 
 
-def begins_with_header(channel: Channel) -> bool:
-    """Whether a ROS 1 payload begins with the number that its publisher counts up."""
-    schema = channel.schema
-    if channel.message_encoding != "ros1" or schema is None or schema.encoding != "ros1msg":
-        return False
-    for line in schema.data.decode(errors="replace").splitlines():
-        words = line.partition("#")[0].split(maxsplit=1)
-        if len(words) < 2 or "=" in words[1]:
-            if words and words[0].startswith("===="):
-                return False
-            continue
-        return words[0] in {"Header", "std_msgs/Header"}
-    return False
-
-
 def _is_text(value: object) -> TypeGuard[str]:
     """Whether a value is text that UTF-8 can hold; JSON also has halves of characters."""
     if not isinstance(value, str):

@@ -15,12 +15,12 @@ from hybridlog.live_sources.foxglove_numbers import HeaderNumbers
 from hybridlog.live_sources.foxglove_protocol import (
     Advertised,
     PeerError,
-    begins_with_header,
     parse_channel,
     parse_text,
     subscribe,
     unsubscribe,
 )
+from hybridlog.live_sources.ros1_header import is_numbered
 from hybridlog_storage.messages import Channel
 
 _MOST_CHANNELS: Final = 1 << 16
@@ -217,7 +217,7 @@ class Session:
                 "fields cannot be searched"
             )
         numbers = None
-        if begins_with_header(offer.channel):
+        if is_numbered(offer.channel):
             numbers = HeaderNumbers(partial(self._missing, topic))
         number = self._next
         self._next += 1

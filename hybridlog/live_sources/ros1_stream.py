@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1_counting import Counting
-from hybridlog.live_sources.ros1_wire import is_numbered, shown, u32
+from hybridlog.live_sources.ros1_header import is_numbered
+from hybridlog.live_sources.ros1_wire import shown, u32
 
 if TYPE_CHECKING:
     from collections.abc import Callable

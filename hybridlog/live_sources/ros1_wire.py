@@ -7,7 +7,6 @@ sends messages, each behind its length, until one side closes.
 
 from __future__ import annotations
 
-import re
 import struct
 from typing import TYPE_CHECKING, Final
 
@@ -27,8 +26,6 @@ u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from
 
 _MAX_FIELDS = 1000
 _LINE_LENGTH = 300
-_FIELD = re.compile(r"^[ \t]*([\w/]+(?:\[\d*\])?)[ \t]+(\w+)[ \t]*(=?)", re.MULTILINE)
-_HEADER_TYPES = frozenset({"Header", "std_msgs/Header", "roslib/Header"})
 
 
 class WireError(Exception):
@@ -82,23 +79,6 @@ def channel_of(topic: str, fields: Mapping[str, str]) -> Channel:
         encoding = "" if definition is None else "ros1msg"
         schema = Schema(name, encoding, (definition or "").encode())
     return Channel(topic, "ros1", schema, metadata, has_publish_time=False)
-
-
-def is_numbered(channel: Channel) -> bool:
-    """Whether a publisher writes its own count into `header.seq` of each message.
-
-    It does so where the first field of a type is `Header header`. Publishers that latch
-    are left out: rospy counts the message that it repeats for one late subscriber, and
-    all others then see a gap where nothing is missing.
-    """
-    if channel.schema is None or channel.metadata.get("latching") == "1":
-        return False
-    head, _, _ = channel.schema.data.decode(errors="replace").partition("\n=====")
-    for found in _FIELD.finditer(head):
-        kind, name, equals = found.groups()
-        if not equals:
-            return kind in _HEADER_TYPES and name == "header"
-    return False
 
 
 def shown(text: str | bytes, limit: int = _LINE_LENGTH) -> str:

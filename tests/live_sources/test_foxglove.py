@@ -24,9 +24,9 @@ from hybridlog.live_sources import foxglove, foxglove_protocol, foxglove_session
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.foxglove import FoxgloveSource
 from hybridlog.live_sources.foxglove_numbers import HeaderNumbers
-from hybridlog.live_sources.foxglove_protocol import PeerError, begins_with_header, parse_channel
+from hybridlog.live_sources.foxglove_protocol import PeerError, parse_channel
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Schema
 from tests.live_sources.heard import DEADLINE_S, Heard
 
 pytest.importorskip(
@@ -329,25 +329,6 @@ def test_a_broken_definition_leaves_a_channel_without(
     found = parse_channel(channel(encoding=encoding, schema=schema))
     assert found.channel.schema == Schema("T", "", b"")
     assert problem in found.problem
-
-
-@pytest.mark.parametrize(
-    ("definition", "expected"),
-    [
-        ("Header header\nfloat32 x", True),
-        ("# about\n\nuint8 DEBUG=1\nstd_msgs/Header header # =", True),
-        ("float32 x\nHeader header", False),
-        ("uint8 A=1\n====\nMSG: std_msgs/Header\nHeader header", False),
-        ("", False),
-    ],
-)
-def test_what_begins_with_a_header(definition: str, *, expected: bool) -> None:
-    for encoding, schema_encoding, is_ros1 in (
-        ("ros1", "ros1msg", True),
-        ("cdr", "ros2msg", False),
-    ):
-        made = Channel("/a", encoding, Schema("T", schema_encoding, definition.encode()))
-        assert begins_with_header(made) is (expected and is_ros1)
 
 
 def numbers_lost(numbers: Sequence[int]) -> list[tuple[int, int, int, str]]:

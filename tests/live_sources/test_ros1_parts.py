@@ -12,6 +12,7 @@ import pytest
 
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1_counting import Counting
+from hybridlog.live_sources.ros1_header import is_numbered
 from hybridlog.live_sources.ros1_network import PeerError, endpoint_of
 from hybridlog.live_sources.ros1_stream import Stream
 from hybridlog.live_sources.ros1_wire import (
@@ -19,7 +20,6 @@ from hybridlog.live_sources.ros1_wire import (
     channel_of,
     decode_header,
     encode_header,
-    is_numbered,
     shown,
 )
 from hybridlog_storage.messages import Channel, Schema
@@ -110,6 +110,8 @@ def test_types_that_publishers_number(definition: str, numbered: bool) -> None:
     fields = {"type": "a/B", "message_definition": definition}
     assert is_numbered(channel_of("/t", fields)) is numbered
     assert not is_numbered(channel_of("/t", {**fields, "latching": "1"}))
+    ros2 = Schema("a/B", "ros2msg", definition.encode())
+    assert not is_numbered(Channel("/t", "cdr", ros2))
 
 
 @pytest.mark.parametrize("text", ["\x1b[2J", "a\nb", "\x9b1m", "\u202eabc", "x" * 5000, "\ud800"])
