@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+from benchmarks.disturbance import share_taken
 
 Status = Literal["ok", "missing", "failed"]
 NAME = "samples.jsonl"
@@ -61,7 +64,9 @@ class Journal:
         self.path = directory / NAME
         self.headers: list[dict[str, Any]] = []
         self.samples: dict[str, Sample] = {}
-        """By key, the last of each."""
+        """By key, the last of each; of several that succeeded, that which the machine
+        disturbed least."""
+        self._successes: Counter[str] = Counter()
         for line in self._lines():
             kind = line.pop("kind")
             if kind == "run":
@@ -95,7 +100,20 @@ class Journal:
         known = self.samples.get(sample.key)
         return known is not None and known.status == "ok"
 
+    def successes(self, sample: Sample) -> int:
+        """How often a run has been done to its end."""
+        return self._successes[sample.key]
+
     def _keep(self, sample: Sample) -> None:
+        if sample.status == "ok":
+            self._successes[sample.key] += 1
+            known = self.samples.get(sample.key)
+            if (
+                known is not None
+                and known.status == "ok"
+                and share_taken(known.values) < share_taken(sample.values)
+            ):
+                return
         self.samples[sample.key] = sample
 
     def _append(self, line: Mapping[str, Any]) -> None:

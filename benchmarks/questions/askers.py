@@ -8,8 +8,8 @@ SAME: Final = {"hybridlog_recorder": "hybridlog"}
 """Backends that keep just what another one keeps, which is asked in their place."""
 
 # By name of the backend: rows of the tables and the classes (`module:class`) that fill
-# them. hybridlog has three: the paper's own queries, its own,
-# and the paper's with the paper's indexes, which are made just before.
+# them. hybridlog has four: the paper's own queries and its own, and both once more with
+# the paper's indexes, which the third makes and the fourth finds.
 ASKERS: Final[dict[str, dict[str, str]]] = {
     "mcap": {"mcap": "benchmarks.questions.files:McapAsker"},
     "bagfile": {"bagfile": "benchmarks.questions.files:BagAsker"},
@@ -26,6 +26,7 @@ ASKERS: Final[dict[str, dict[str, str]]] = {
         "hybridlog": "benchmarks.questions.mongo:HybridlogAppendixAsker",
         "hybridlog_api": "benchmarks.questions.api:ApiAsker",
         "hybridlog_indexed": "benchmarks.questions.mongo:HybridlogIndexedAsker",
+        "hybridlog_api_indexed": "benchmarks.questions.api:IndexedApiAsker",
     },
 }
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.questions.api import index_bytes
+from benchmarks.questions.api import add_indexes, index_bytes
 from benchmarks.questions.base import (
     ARM,
     ERROR,
@@ -173,9 +173,7 @@ class HybridlogIndexedAsker(HybridlogAppendixAsker):
 
     def start(self, backend: Backend) -> None:
         super().start(backend)
-        self._store.add_index(GRIPPER, "position")
-        self._store.add_index(VIEWPOINT, "position.x", "_meta.inserted_at")
-        self._store.add_index(ARM, *(f"pose.position.{axis}" for axis in "xyz"))
+        add_indexes(self._store)
 
 
 class MongoReading(Reading):

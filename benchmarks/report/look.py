@@ -36,6 +36,7 @@ _LOOKS = {
     "hybridlog_recorder": Look("hybridlog (recorder)", "#b34700", "d", "--"),
     "hybridlog_api": Look("hybridlog (its own API)", "#d55e00", "H", "--"),
     "hybridlog_indexed": Look("hybridlog (indexed)", "#b34700", "8", "-."),
+    "hybridlog_api_indexed": Look("hybridlog (its own API, indexed)", "#7a3300", "p", ":"),
     "mongo_json": Look("MongoDB", "#009e73", "s"),
     "mongo_json_indexed": Look("MongoDB (indexed)", "#009e73", "D", "--"),
     "postgres_autocommit": Look("PostgreSQL (autocommit)", "#56b4e9", "v"),

@@ -13,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.disturbance import MOST_RUNS, is_disturbed
 from benchmarks.harness.run import Setting
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
@@ -78,8 +79,19 @@ class Context:
         return Load.open(place)
 
     def to_do(self, sample: Sample) -> bool:
-        """Whether a run has still to be done: it is not in the journal as a success."""
-        return not self.journal.has(sample)
+        """Whether a run has still to be done.
+
+        It is not in the journal as a success, or the machine disturbed it, and it has not
+        been repeated often enough. A quick study repeats nothing.
+        """
+        if not self.journal.has(sample):
+            return True
+        known = self.journal.samples[sample.key]
+        return (
+            not self.quick
+            and is_disturbed(known.values)
+            and self.journal.successes(sample) < MOST_RUNS
+        )
 
     def run(
         self,
@@ -89,7 +101,7 @@ class Context:
         seconds: float,
         speed: float | None = None,
     ) -> Sample:
-        """Run one case with one backend once, unless the journal has it.
+        """Run one case with one backend, unless the journal has it; again when disturbed.
 
         Args:
             wanted: Study, case, backend and repetition.
@@ -107,12 +119,15 @@ class Context:
             sample = _filled(wanted, "missing", {}, reason)
             self.journal.add(sample)
             return sample
-        with self.steps.step(describe_run(wanted), seconds):
-            sample = self._run(wanted, load(), self.speed if speed is None else speed)
-        self.journal.add(sample)
-        if sample.status == "missing":
-            self.missing[wanted.backend] = sample.reason
-        return sample
+        while self.to_do(wanted):
+            with self.steps.step(describe_run(wanted), seconds):
+                sample = self._run(wanted, load(), self.speed if speed is None else speed)
+            self.journal.add(sample)
+            if sample.status == "missing":
+                self.missing[wanted.backend] = sample.reason
+            if sample.status != "ok":
+                return sample
+        return self.journal.samples[wanted.key]
 
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
         backend = self.backends[wanted.backend]

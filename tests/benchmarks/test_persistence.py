@@ -306,3 +306,38 @@ def test_a_log_through_the_harness(tmp_path: Path) -> None:
         assert one.values["persisted"] <= len(load)
         assert 0.9 < one.values["due_s"] < 1
     assert len(list((tmp_path / "loads").iterdir())) == 1
+
+
+class Scripted(Context):
+    """Runs whose figures are given."""
+
+    script: list[dict[str, Any]]
+
+    def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
+        values = {"published": 10, "wall_s": 1000.0, **self.script.pop(0)}
+        return replace(wanted, status="ok", values=values)
+
+
+@pytest.mark.parametrize(
+    ("script", "quick", "left", "counts"),
+    [
+        ([(9, 0)], False, 0, 9),
+        ([(10, 1e6)], False, 0, 10),
+        ([(9, 1e6), (8, 0)], False, 0, 8),
+        ([(9, 3e6), (7, 1e6), (8, 2e6), (10, 0)], False, 1, 7),
+        ([(9, 1e6), (10, 0)], True, 1, 9),
+    ],
+)
+def test_what_the_machine_disturbed_is_run_again(
+    tmp_path: Path, script: list[tuple[int, float]], left: int, counts: int, *, quick: bool
+) -> None:
+    found = Scripted(tmp_path, {"nothing": Nothing}, Journal(tmp_path), Quiet(), quick=quick)
+    found.script = [{"persisted": kept, "steal_s": taken} for kept, taken in script]
+    wanted = Sample("persistence", {"log": "a"}, "nothing", 0)
+    for _ in range(2):  # the second time there is nothing to do
+        sample = found.run(wanted, lambda: None, seconds=1.0)  # type: ignore[arg-type,return-value]
+        assert sample.values["persisted"] == counts
+        assert len(found.script) == left
+    kept = Journal(tmp_path)
+    assert kept.samples[wanted.key].values["persisted"] == counts
+    assert kept.successes(wanted) == len(script) - left
