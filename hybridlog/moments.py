@@ -127,7 +127,8 @@ def _holds(query: Query, key: bytes) -> NDArray[np.bool_]:
     if query.filter:
         own = {"$and": [own, query.filter]}
     database = query.store.database_for("A state")
-    return np.array([bool(database.count(collection_of(query.topics[0]), own))])
+    # An index of the user's on the predicate's fields would be the long way to one document.
+    return np.array([bool(database.count(collection_of(query.topics[0]), own, by_key=True))])
 
 
 def _merged(

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.messages import Batch
 
+_BATCH = 10_000  # index documents that come at a time
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
@@ -910,7 +911,10 @@ class Query:
         for topic in self.topics:
             for recording in recordings:
                 query = self._filter({**bounds, "_meta.rec": recording})
-                for raw in database.find_raw(collection_of(topic), query, _REFERENCE):
+                # With the order MongoDB weighs the range against an index of the user's.
+                for raw in database.find_raw(
+                    collection_of(topic), query, _REFERENCE, sort=[("_id", 1)]
+                ):
                     reference = reference_columns(raw)
                     self.counters.documents_read += len(reference.off)
                     places = np.stack([reference.seg, reference.chunk], axis=1)
@@ -922,10 +926,15 @@ class Query:
                             found.setdefault(key, []).append(reference.off[rows])
         return {key: np.sort(np.concatenate(parts)) for key, parts in found.items()}
 
-    def _conditions(
+    def conditions(
         self, recording: RecordingEntry, window: tuple[int, int] | None = None
     ) -> dict[str, object]:
-        """The query's time range in one recording, or in a part of it, as a MongoDB filter."""
+        """The query's time range in one recording, or in a part of it, as a MongoDB filter.
+
+        Args:
+            recording: Which.
+            window: Log time `[begin, end)`, ns, within the range of `between`.
+        """
         bounds = self._bounds_in(recording)
         conditions: dict[str, object] = {"_meta.rec": recording.id}
         if bounds is not None and self._clock != "log":
@@ -944,7 +953,7 @@ class Query:
         time: windows of several recordings that overlap in time go together.
         """
         if self._windows is None:
-            conditions = [self._conditions(target.recording) for target in targets]
+            conditions = [self.conditions(target.recording) for target in targets]
             return [_any_of(conditions)] if conditions else []
         found: list[tuple[int, int, RecordingEntry]] = []
         for target in targets:
@@ -956,7 +965,7 @@ class Query:
         for begin, end, recording in sorted(found, key=lambda item: item[:2]):
             if begin >= reach:
                 groups.append([])
-            groups[-1].append(self._conditions(recording, (begin, end)))
+            groups[-1].append(self.conditions(recording, (begin, end)))
             reach = max(reach, end)
         parts = [_any_of(group) for group in groups]
         return parts[::-1] if self._reverse else parts
@@ -979,11 +988,26 @@ class Query:
         if self.store.database is None:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
+        of_topic: dict[str, list[Target]] = {}
+        for target in targets:
+            for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()}):
+                of_topic.setdefault(topic, []).append(target)
+        if self.is_unbounded:
+            from hybridlog.counting import in_all_times
+
+            return sum(
+                in_all_times(self.store, topic, [t.recording for t in mine], self.filter)
+                for topic, mine in of_topic.items()
+            )
         return sum(
-            self.store.database.count(collection_of(topic), self._filter(part))
-            for target in targets
-            for part in self._parts([target])
-            for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()})
+            self.store.database.count_each(
+                [
+                    (collection_of(topic), self._filter(part))
+                    for topic, mine in of_topic.items()
+                    for target in mine
+                    for part in self._parts([target])
+                ]
+            )
         )
 
     def thinned_documents(
@@ -1004,16 +1028,26 @@ class Query:
         targets = [t for t in found if self._has(t, lanes, topic)]
         started = time.monotonic()
         taken = given = 0
-        for part in self._parts(targets):
+        collection, order = collection_of(topic), -1 if self._reverse else 1
+        parts = [self._filter(part) for part in self._parts(targets)]
+        # A limit ends the reading between two parts, so they are asked for one by one.
+        one_by_one = self._limit is not None or len(parts) == 1
+        for asked in [[part] for part in parts] if one_by_one else [parts]:
             most = 0 if self._limit is None else self._limit - given
-            for raw in database.find_raw(
-                collection_of(topic),
-                self._filter(part),
-                projection,
-                # With an index of the user's, documents come in its order unless told.
-                sort=[("_id", -1 if self._reverse else 1)],
-                limit=most if self._every == 1 else 0,
-                batch_size=10_000,
+            for raw in (
+                database.find_raw(
+                    collection,
+                    asked[0],
+                    projection,
+                    # With an index of the user's, documents come in its order unless told.
+                    sort=[("_id", order)],
+                    limit=most if self._every == 1 else 0,
+                    batch_size=_BATCH,
+                )
+                if one_by_one
+                else database.find_each(
+                    collection, asked, projection, order=order, batch_size=_BATCH
+                )
             ):
                 count = len(split(raw))
                 rows = np.arange((-taken) % self._every, count, self._every)

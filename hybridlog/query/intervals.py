@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
+    from hybridlog.reader import Query
+
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
@@ -196,6 +198,28 @@ class Intervals:
             end = np.minimum(mine[one, 1], theirs[pair, 1])
             parts.append((name, np.stack([begin, end, np.zeros_like(begin)], axis=1)))
         return Intervals.of(parts)
+
+    def containing(self, query: Query) -> Intervals:
+        """Only those in which the log time of at least one message of a question lies.
+
+        The message must be of the interval's own recording. Intervals that overlap are
+        each looked at, and nothing but the index is read.
+
+        Args:
+            query: The messages, of the same store.
+
+        Raises:
+            UsageError: it has `limit` or `every`.
+            DatabaseError: MongoDB is away and there is a predicate.
+        """
+        from hybridlog.counting import any_in_each
+
+        found = np.zeros(len(self), np.bool_)
+        for code, name in enumerate(self._recordings):
+            rows = np.flatnonzero(self._recording == code)
+            spans = np.stack([self._begin[rows], self._end[rows]], axis=1)
+            found[rows] = any_in_each(query, name, spans)
+        return self._take(found)
 
     def within(self, spans: Mapping[str, Span]) -> Intervals:
         """Each without what lies outside of its recording; they stay as many.

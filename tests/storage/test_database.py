@@ -252,6 +252,39 @@ def test_find_raw_with_all_its_arguments(database: Database, name: str) -> None:
     assert list(database.find_raw("none")) == []
 
 
+def test_many_questions_at_once(database: Database, name: str) -> None:
+    documents = encoded(500)
+    database.insert_raw(name, b"".join(documents), 500)
+    database.create_index(name, [("x", 1)])
+    keys = [number.to_bytes(20, "big") for number in range(501)]
+    spans = [(n, min(n + n % 4, 500)) for n in range(0, 500, 2)]
+    ranges = [{"_id": {"$gte": keys[a], "$lt": keys[b]}, "x": {"$ne": 6}} for a, b in spans]
+    want = [sum(x != 6 for x in range(a, b)) for a, b in spans]
+    assert database.count_each([(name, one) for one in ranges]) == want
+    assert database.count_each([(name, one) for one in ranges], most=1) == [min(n, 1) for n in want]
+    # A collection that is not there is empty, at the beginning and elsewhere.
+    mixed = [("none", ranges[1]), (name, ranges[1]), ("none", {})]
+    assert database.count_each(mixed) == [0, want[1], 0]
+    assert database.count_each([]) == []
+    for order in (1, -1):
+        found = b"".join(database.find_each(name, ranges, order=order, batch_size=7))
+        parts = [[x for x in range(a, b) if x != 6][::order] for a, b in spans]
+        assert found == b"".join(documents[x] for part in parts for x in part)
+    some = list(database.find_each(name, ranges, {"_id": 0, "x": 1}))
+    assert [d["x"] for b in some for d in bson.decode_all(b)] == [x for p in parts for x in p[::-1]]
+    assert list(database.find_each("none", ranges)) == list(database.find_each(name, [])) == []
+    assert database.count(name, ranges[1], by_key=True) == want[1]
+
+
+def test_large_questions_go_in_several_commands(
+    database: Database, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database.insert_raw(name, b"".join(encoded(5)), 5)
+    monkeypatch.setattr(module, "_BYTES_TOGETHER", 2000)
+    long = [(name, {"x": {"$in": [n, *range(-200, 0)]}}) for n in range(7)]
+    assert database.count_each(long) == [1, 1, 1, 1, 1, 0, 0]
+
+
 def test_a_reader_that_stops_early_leaves_no_cursor(
     database: Database, plain: pymongo.database.Database, name: str
 ) -> None:
@@ -353,6 +386,10 @@ def test_a_wrong_predicate_is_the_users_error(
             list(ask(name, predicate) or ())
     with pytest.raises(WhereError):
         database.count(name, predicate)
+    with pytest.raises(WhereError):
+        database.count_each([(name, predicate), (name, {})])
+    with pytest.raises(WhereError):
+        list(database.find_each(name, [{}, predicate]))
     with pytest.raises(WhereError):
         list(database.aggregate(name, [{"$match": predicate}]))
 
