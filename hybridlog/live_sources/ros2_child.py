@@ -32,6 +32,9 @@ _IDLE_S = 0.5
 _BREATH_S = 0.001
 _FEW = 64
 _FEW_BYTES = 1 << 20
+_MUCH_BYTES = 1 << 20
+_GLANCE_S = 0.01
+_CATCH_UP_S = 0.5
 _LAST_WORDS_S = 2.0
 
 
@@ -122,16 +125,24 @@ class Child:
                 continue
             count += taken
             size += taken_size
+            if taken_size >= _MUCH_BYTES:
+                # The recorder goes on meanwhile, and the next topic finds room.
+                self._outbox.send()
         self._outbox.close_batch()
         return count, size
 
     def _finish(self, writable: select.poll) -> None:
         """Hands over what has come by now, as long as that takes no more than a moment."""
-        deadline = time.monotonic() + _LAST_WORDS_S
-        while self._take(0.0)[0] >= _FEW and time.monotonic() < deadline:
-            self._outbox.send()
+        self._topics.end()
+        deadline = time.monotonic() + _CATCH_UP_S
+        while self._take(_GLANCE_S)[0] >= _FEW or not self._topics.has_caught_up():
+            if time.monotonic() >= deadline:
+                break
+            if not self._outbox.send():
+                writable.poll(2)
         self._topics.account(final=True)
         self._teller.bye()
+        deadline = time.monotonic() + _LAST_WORDS_S
         while not self._outbox.send() and time.monotonic() < deadline:
             writable.poll(100)
 

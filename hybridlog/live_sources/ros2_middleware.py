@@ -15,6 +15,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from hybridlog.live_sources.ros2_profile import default_profile
 from hybridlog.live_sources.ros2_qos import DURATIONS, Profile
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ class Subscription:
 
     Attributes:
         profile: What it asks for.
+        tells_all: The middleware counts what it loses before the first message and after
+            the last too, and nothing that was sent before it listened.
         take: The next message and its information, None when there is none.
     """
 
@@ -61,6 +64,8 @@ class Subscription:
         self._middleware = middleware
         self._subscription = handle
         self._losses = middleware.losses_of(self.handle)
+        # Others may count otherwise.
+        self.tells_all = middleware.implementation.startswith("rmw_fastrtps")
 
     @property
     def tells_losses(self) -> bool:
@@ -103,16 +108,17 @@ class Middleware:
         self._rclpy = rclpy
         self._native = rclpy_implementation
         self._silent = _no_callbacks()
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self._context = rclpy.get_default_context()
         name = f"hybridlog_recorder_{os.getpid()}"
         self._name = f"/{name}"
-        self._node = rclpy.create_node(
-            name,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-        )
+        with default_profile():
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+            self._context = rclpy.get_default_context()
+            self._node = rclpy.create_node(
+                name,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
         self._guard = self._node.create_guard_condition(lambda: None)
         self._wait_set: Any = None
         self._open: list[Subscription] = []

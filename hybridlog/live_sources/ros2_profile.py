@@ -95,12 +95,18 @@ def default_profile(environment: MutableMapping[str, str] = os.environ) -> Itera
         allowed = _MOST_ALLOWED.read_text(encoding="ascii")
     except OSError:
         allowed = ""
-    with tempfile.NamedTemporaryFile("w", suffix=".xml", encoding="utf-8") as file:
-        file.write(profile(allowed))
-        file.flush()
-        environment.update(dict.fromkeys(VARIABLES, file.name))
-        try:
-            yield True
-        finally:
-            for name in VARIABLES:
-                environment.pop(name, None)
+    try:
+        number, name = tempfile.mkstemp(prefix="hybridlog-", suffix=".xml")
+    except OSError:
+        # No folder can be written to. Fast DDS does without, and may lose more.
+        yield False
+        return
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as file:
+            file.write(profile(allowed))
+        environment.update(dict.fromkeys(VARIABLES, name))
+        yield True
+    finally:
+        for variable in VARIABLES:
+            environment.pop(variable, None)
+        Path(name).unlink(missing_ok=True)

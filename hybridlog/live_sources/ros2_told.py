@@ -28,17 +28,16 @@ class Told:
         """The middleware says that it has lost some more."""
         self._said += count
 
-    def head(self, before: int, waiting: int) -> int:
+    def head(self, before: int) -> int:
         """The first message of all has come.
 
         Args:
             before: Messages that its publisher sent before it.
-            waiting: Numbers in gaps that have not been told of.
 
         Returns:
             How many of them were lost; the others were sent before we listened.
         """
-        found = max(0, min(before, self._said - self._explained() - waiting))
+        found = max(0, min(before, self._said - self._explained()))
         self._heads += found
         return found
 
@@ -53,7 +52,7 @@ class Told:
         """What is to be told of now; to be called at each look, after all gaps.
 
         Args:
-            waiting: Numbers in gaps that have not been told of.
+            waiting: Messages in gaps that have not been told of.
             final: There will be no other look.
         """
         # A publisher may take a message back without the middleware calling it lost.

@@ -91,6 +91,20 @@ class Topics:
         self._definitions = definitions
         self._overrides = overrides
         self._topics: dict[tuple[str, str], Topic] = {}
+        self._ended: int | None = None
+
+    def end(self) -> None:
+        """The recorder wants what was sent until now, and no more."""
+        self._ended = time.time_ns()
+
+    def has_caught_up(self) -> bool:
+        """Whether, since the end, a message has come of all that spoke just before.
+
+        Only the next message shows what is missing before it.
+        """
+        since = self._ended
+        streams = [topic.stream for topic in self._live if topic.stream is not None]
+        return since is None or all(stream.has_caught_up(since) for stream in streams)
 
     def look(self) -> None:
         """Looks at the graph, follows its changes, and tells what has been lost."""
@@ -246,25 +260,23 @@ class Topics:
             final: Nothing more will come.
         """
         self._list()
+        ended = (self._ended or time.time_ns()) if final else None
         for topic in self._live:
             assert topic.stream is not None
-            self._account(topic, topic.stream, final=final)
+            self._account(topic, topic.stream, ended)
         self._teller.refusals()
 
-    def _account(self, topic: Topic, stream: Stream, *, final: bool) -> None:
+    def _account(self, topic: Topic, stream: Stream, ended: int | None) -> None:
         if len(topic.nodes) > MAX_PUBLISHERS:
             topic.nodes.clear()
         topic.nodes.update((offer.publisher, offer.node) for offer in topic.offers if offer.node)
-        for loss in stream.look(topic.offers, final=final):
+        for loss in stream.look(topic.offers, final=ended):
             node = topic.nodes.get(loss.publisher, "")
-            if not stream.named and topic.offers:
+            if (not stream.named or not loss.publisher) and len(topic.offers) == 1:
                 node = topic.offers[0].node
             times = loss.first, loss.last
-            detail = f"from {node}" if node else ""
+            detail = ", ".join(filter(None, (f"from {node}" if node else "", loss.place)))
             self._teller.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
-        told = stream.subscription.losses()
-        if told and not stream.numbered:
-            self._teller.lost(topic.name, "transport", told, detail="the middleware says so")
         if not (stream.numbered or stream.subscription.tells_losses):
             self._teller.say(
                 "this ROS gives messages no numbers, so losses on the way cannot be counted"

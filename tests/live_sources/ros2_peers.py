@@ -80,6 +80,7 @@ ROBOT = """
     import json, sys, time
     import rclpy
     from rclpy.qos import QoSProfile
+    from rclpy.serialization import serialize_message
     from importlib import import_module
 
     rclpy.init()
@@ -113,6 +114,13 @@ ROBOT = """
         for number in range(count):
             publisher.publish(kind(height=number, data=bytes([number]) * size))
             time.sleep(0.01)
+
+    def flood(names, rounds, size):
+        kind = publishers[names[0]][1]
+        message = serialize_message(kind(data=bytes(size)))
+        for _ in range(rounds):
+            for name in names:
+                publishers[name][0].publish(message)
 
     print("ready", flush=True)
     for line in sys.stdin:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import socket
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -19,8 +21,9 @@ from hybridlog.live_sources.ros2_definitions import (
     parse_type,
 )
 from hybridlog.live_sources.ros2_middleware import Offer
-from hybridlog.live_sources.ros2_numbers import MAX_GAPS, Loss, Numbers
+from hybridlog.live_sources.ros2_numbers import MAX_GAPS, SUSPICIOUS_NS, WELL, Loss, Numbers
 from hybridlog.live_sources.ros2_outbox import Outbox
+from hybridlog.live_sources.ros2_profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live_sources.ros2_qos import (
     BEST_EFFORT,
     DEPTH,
@@ -37,6 +40,7 @@ from hybridlog.live_sources.ros2_qos import (
 )
 from hybridlog.live_sources.ros2_receiver import Receiver
 from hybridlog.live_sources.ros2_teller import Teller
+from hybridlog.live_sources.ros2_told import Told
 from hybridlog.live_sources.ros2_topics import Topics
 from hybridlog.live_sources.ros2_wire import MAX_PAYLOAD
 from hybridlog.schema.definition import parse_definition
@@ -119,6 +123,137 @@ def test_unsure_gaps_are_dropped_when_numbers_begin_anew() -> None:
     seen(numbers, 1, 5)
     numbers.begin_anew()
     assert numbers.losses(final=True) == []
+
+
+def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not() -> None:
+    numbers = Numbers()
+    numbers.see(A, 1, 500)
+    numbers.see(A, 4, 300)
+    assert numbers.losses(final=True) == [Loss(A, 2, 300, 500)]
+
+
+def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
+    numbers = Numbers()
+    seen(numbers, 1, 5, 6)
+    seen(numbers, 1, 2, publisher=B)
+    loss = numbers.suspect(A, 10_000)
+    assert loss is not None
+    assert loss[:4] == (A, None, 600, 10_000)
+    assert numbers.suspect(A, 10_000) is None
+    assert numbers.suspect(B, 10_000) is None
+    assert numbers.suspect(b"nobody", 10_000) is None
+
+
+def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
+    numbers = Numbers()
+    seen(numbers, 1, 5, *range(6, 6 + WELL))
+    assert numbers.suspect(A, 10_000) is None
+    numbers.see(B, 1, 0)
+    numbers.see(B, 3, 1)
+    numbers.see(B, 4, 2 + SUSPICIOUS_NS)
+    assert numbers.suspect(B, 10**18) is None
+    seen(numbers, 50, 100)
+    assert numbers.suspect(A, 100 * 100) is None
+
+
+def test_who_speaks_out_of_order_is_not_suspected() -> None:
+    numbers = Numbers()
+    seen(numbers, 1, 3, 2)
+    assert numbers.suspect(A, 10_000) is None
+
+
+# What the middleware says.
+
+
+def test_what_the_middleware_says_of_gaps_is_not_told_twice() -> None:
+    told = Told()
+    told.hear(5)
+    assert told.beyond(5, final=False) == 0
+    assert told.gap(5) == 5
+    assert [told.beyond(0, final=False) for _ in range(9)] == [0] * 9
+    assert told.beyond(0, final=True) == 0
+
+
+def test_losses_before_the_first_message_are_told() -> None:
+    told = Told()
+    told.hear(3)
+    assert told.head(2) == 2
+    assert told.beyond(0, final=True) == 1
+    told = Told()
+    told.hear(3)
+    assert told.head(100) == 3
+    assert told.beyond(0, final=True) == 0
+
+
+def test_losses_after_the_last_message_are_told_after_a_while_and_once() -> None:
+    told = Told()
+    told.hear(2)
+    assert [told.beyond(0, final=False) for _ in range(8)] == [0, 0, 0, 2, 0, 0, 0, 0]
+    # Now one comes, and shows the gap.
+    told.hear(1)
+    assert told.gap(3) == 1
+    assert told.beyond(0, final=True) == 0
+
+
+def test_gaps_that_the_middleware_does_not_know_of_excuse_no_later_loss() -> None:
+    told = Told()
+    assert told.gap(10) == 10
+    assert told.beyond(0, final=False) == 0
+    told.hear(4)
+    assert told.beyond(0, final=True) == 4
+
+
+# The profile.
+
+
+def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    environment: dict[str, str] = {"PATH": "x"}
+    with default_profile(environment) as is_used:
+        assert is_used
+        [name] = {environment[variable] for variable in VARIABLES}
+        tree = ET.parse(name)
+    assert environment == {"PATH": "x"}
+    assert not Path(name).exists()
+    found = {element.tag.rpartition("}")[2]: element.text for element in tree.iter()}
+    assert int(found["receiveBufferSize"] or 0) >= 1 << 17
+
+
+@pytest.mark.parametrize(
+    ("allowed", "size"),
+    [("212992\n", 212992), ("1000", 1 << 17), ("", 1 << 17), ("-5", 1 << 17), ("9" * 30, 32 << 20)],
+)
+def test_sockets_are_asked_for_what_the_kernel_allows(allowed: str, size: int) -> None:
+    assert f"<receiveBufferSize>{size}<" in profile(allowed)
+
+
+@pytest.mark.parametrize("name", [*VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE"])
+def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> None:
+    environment = {name: "theirs"}
+    assert is_set_up(environment, tmp_path)
+    with default_profile(environment) as is_used:
+        assert not is_used
+        assert environment == {name: "theirs"}
+    assert environment == {name: "theirs"}
+    assert not is_set_up({name: ""}, tmp_path)
+
+
+def test_a_profile_in_the_folder_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
+    assert is_set_up({}, tmp_path)
+
+
+def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    environment: dict[str, str] = {}
+    with default_profile(environment) as is_used:
+        assert not is_used
+        assert not environment
 
 
 # Quality of service.
@@ -359,7 +494,7 @@ class FakeSubscription:
         self.profile = profile
         self.queue: list[tuple[bytes, dict[str, Any]]] = []
         self.told = 0
-        self.tells_losses = True
+        self.tells_losses = self.tells_all = True
         self.is_closed = False
 
     def take(self) -> tuple[bytes, dict[str, Any]] | None:
@@ -595,13 +730,92 @@ def test_losses_name_the_publisher(tmp_path: Path) -> None:
         (b"", info(number, gid)) for number in (1, 2, 3, 7, 8) for gid in (A, B) if number != gid[0]
     ]
     rig.child._take(0.0)
-    rig.ros.graph = {}
     rig.topics.look()
     rig.topics.look()
     assert [(lost["count"], lost["detail"]) for lost in rig.told("lost")] == [
         (3, "from /one"),
         (3, "from /two"),
     ]
+
+
+def test_the_last_messages_of_who_goes_in_an_overload_are_feared_for(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"), offer(B, node="/two"))
+    rig.ros.made[0].queue = [
+        *((b"", info(number, A)) for number in (1, 5, 6)),
+        *((b"", info(number, B)) for number in (1, 2, 3)),
+    ]
+    rig.child._take(0.0)
+    rig.topics.look()
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(B, node="/two")]}
+    rig.topics.look()
+    rig.topics.account(final=True)
+    rows = [(lost["count"], lost["detail"]) for lost in rig.told("lost")]
+    assert rows == [(None, "from /one, after its last message, after others"), (3, "from /one")]
+
+
+@pytest.mark.parametrize("gid", [A, None])
+@pytest.mark.parametrize(
+    ("reliability", "ago", "feared"),
+    [(RELIABLE, 1, True), (RELIABLE, 5, False), (BEST_EFFORT, 5, True)],
+)
+def test_what_a_silent_publisher_sent_last_at_the_end(
+    tmp_path: Path, gid: bytes | None, reliability: int, ago: int, feared: bool
+) -> None:
+    rig = live_topic(tmp_path, offer(reliability=reliability))
+    at = time.time_ns() - ago * 10**9
+    rig.ros.made[0].queue = [(b"", info(n, gid, received_timestamp=at)) for n in (1, 5)]
+    rig.child._take(0.0)
+    rig.topics.end()
+    rig.topics.account(final=True)
+    counts = [lost["count"] for lost in rig.told("lost")]
+    assert counts == ([None, 3] if feared else [3])
+
+
+def test_the_end_waits_for_those_that_spoke_a_moment_ago(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(), offer(B))
+    assert rig.topics.has_caught_up()
+    old = time.time_ns() - 2 * 10**9
+    rig.ros.made[0].queue = [(b"", info(1)), (b"", info(1, B, received_timestamp=old))]
+    rig.child._take(0.0)
+    rig.topics.end()
+    assert not rig.topics.has_caught_up()
+    rig.ros.made[0].queue = [(b"", info(4))]
+    rig.child._take(0.0)
+    assert rig.topics.has_caught_up()
+    rig.topics.account(final=True)
+    assert [lost["count"] for lost in rig.told("lost")] == [2]
+
+
+def test_what_the_middleware_lost_before_and_after_is_told(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"))
+    made = rig.ros.made[0]
+    made.told = 2
+    # Of the nine before the first, seven were sent before anybody listened.
+    made.queue = [(b"", info(number)) for number in (10, 11, 14)]
+    rig.child._take(0.0)
+    made.told = 2 + 5
+    rig.topics.look()
+    rig.topics.look()
+    rig.topics.account(final=True)
+    assert [(lost["count"], lost["detail"].partition(", ")[2]) for lost in rig.told("lost")] == [
+        (2, "before the first message that came"),
+        (2, ""),
+        (None, "after its last message, after others"),
+        (5, "before the first message that came or after the last, as the middleware says"),
+    ]
+    assert all(lost["detail"].startswith("from /one") for lost in rig.told("lost"))
+
+
+def test_other_middlewares_are_believed_where_there_are_no_numbers_only(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    made = rig.ros.made[0]
+    made.tells_all = False
+    made.told = 9
+    made.queue = [(b"", info(number)) for number in range(10, 30)]
+    rig.child._take(0.0)
+    made.told = 9
+    rig.topics.account(final=True)
+    assert not rig.told("lost")
 
 
 def unnamed(rig: Rig, *numbers: int) -> None:
@@ -633,6 +847,15 @@ def test_without_names_nobody_is_accused_when_publishers_change(tmp_path: Path) 
     [said] = rig.told("say")
     assert "does not tell the messages of its publishers apart" in said["text"]
     assert len(rig.messages) == 8
+
+
+def test_without_names_the_middleware_is_believed_of_several(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(), offer(B))
+    unnamed(rig, 1, 500, 4, 502)
+    rig.ros.made[0].told = 3
+    rig.topics.account(final=True)
+    [lost] = rig.told("lost")
+    assert (lost["count"], lost["detail"]) == (3, "the middleware says so")
 
 
 def test_without_numbers_the_middleware_is_believed(tmp_path: Path) -> None:
