@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from hybridlog.indexing import ChunkIndexer, IndexWriter, Lag
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, StoreError
-from hybridlog_storage.segment_format import END_METADATA, json_metadata
+from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -97,6 +97,29 @@ class Capture:
             Why the index is not complete, None when it is.
         """
         self.writer.close(json_metadata(END_METADATA, end))
+        return self._finish()
+
+    def give_up(
+        self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
+    ) -> DatabaseError | None:
+        """Bring the recording to its end where nothing more can be written.
+
+        Args:
+            end: As for `close`.
+            lost: Rows of the loss ledger.
+
+        Returns:
+            Why the index is not complete, None when it is.
+
+        Raises:
+            DiskFullError: There is not even room for that.
+        """
+        self.writer.give_up(
+            [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
+        )
+        return self._finish()
+
+    def _finish(self) -> DatabaseError | None:
         self.index.close()
         self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries)
         failure = self.index.failure

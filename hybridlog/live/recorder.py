@@ -162,6 +162,7 @@ class Recorder:
         self._over = threading.Event()
         self._reason = ""
         self._left = options.max_messages
+        self._room = options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
         self._marks = Channel(
@@ -170,6 +171,7 @@ class Recorder:
         self._started = time.monotonic()
         self._offset = time.time() - self._started
         self._looked = self._started
+        self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._state: RecorderState | None = None
         self._target: LiveRecording | Snapshots
@@ -182,6 +184,7 @@ class Recorder:
                 options.snapshots,
                 options.budget_bytes,
                 lambda reason: self._begin(store, {"trigger": reason}),
+                lambda reason: self.mark(reason, {"trigger": reason}),
                 self._tell,
             )
         try:
@@ -255,8 +258,21 @@ class Recorder:
         self._over.set()
         self._door.close()
         if isinstance(self._target, Snapshots):
-            return self._target.close()
-        return [self._target.close()]
+            reports = self._target.close()
+        else:
+            reports = [self._target.close()]
+        if self._target.cut_off:
+            self._refuse(Cause.DISK, "the disk was full")
+            with self._lock:
+                for topic, count in self._target.cut_off.items():
+                    key = topic, Cause.DISK
+                    self._lost[key] = self._lost.get(key, 0) + count
+        return reports
+
+    @property
+    def stopped_for_disk(self) -> bool:
+        """Whether the disk ended it: it is full, or its reserve was reached."""
+        return self._refused is not None and self._refused[0] is Cause.DISK
 
     def look(self) -> RecorderState:
         """How it is doing. Also sees to the bounds; call it about once a second."""
@@ -309,12 +325,10 @@ class Recorder:
 
     def mark(self, text: str, tags: Mapping[str, str]) -> None:
         """Set a mark: a message on `MARKS` that questions and triggers can use."""
-        now = time.time_ns()
-        self._target.write(
-            self._marks,
-            json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False).encode(),
-            log_time=now,
-        )
+        content = json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False)
+        # What came as bytes that are no UTF-8 stands in it as JSON's own escapes.
+        payload = content.encode("utf-8", "backslashreplace")
+        self.take(self._marks, payload, received=time.time_ns())
 
     def fire(self, reason: str) -> None:
         """Write a snapshot.
@@ -357,7 +371,7 @@ class Recorder:
         lane = self._lanes.get(channel) or self._meet(channel)
         size = len(payload)
         through = lane.throttle is None or lane.throttle.lets_through(received)
-        if through and not self._claim():
+        if through and not self._claim(size):
             return  # what comes after the end is not part of the recording
         lane.tally.add(size, received)
         if not through:
@@ -366,27 +380,30 @@ class Recorder:
         if self._refused is not None:
             self._lose(lane, *self._refused, received)
             return
-        kept = lane.channel
+        whole = True
         if size > SMALL:
             keep = step(lane.priority, self._target.filled)
-            if keep is not Keep.ALL and not self._keeps(lane, keep):
-                payload, kept = self._reduced(lane, payload, received)
+            whole = keep is Keep.ALL or self._keeps(lane, keep)
+        number = 0 if sequence is None else sequence % _SEQUENCES
         try:
-            taken = self._target.write(
-                kept,
+            if whole and self._target.write(
+                lane.channel,
                 payload,
                 log_time=received,
                 publish_time=sent,
-                sequence=0 if sequence is None else sequence % _SEQUENCES,
+                sequence=number,
                 wait=False,
-            )
+            ):
+                return
+            if size > SMALL:
+                # Its fields find room where its payload does not.
+                self._keep_fields(lane, payload, received, sent, number)
+            else:
+                self._lose_for_room(lane, received)
         except HybridlogError as error:
             cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
             self._refuse(cause, str(error))
             self._lose(lane, cause, str(error), received)
-            return
-        if not taken:
-            self._lose(lane, Cause.QUEUE, "the memory budget was spent", received)
 
     def lost(
         self,
@@ -494,16 +511,22 @@ class Recorder:
             self._lanes[channel] = lane
         return lane
 
-    def _claim(self) -> bool:
+    def _claim(self, size: int) -> bool:
         """Whether another message belongs to the recording; counts it, where that matters."""
-        if self._left is None or self._refused is not None:
+        if self._refused is not None or (self._left is None and self._room is None):
             return not self._closed
         with self._lock:
-            self._left -= 1
-            left = self._left
-        if left <= 0:
-            self._end("as many messages as wanted")
-        return left >= 0
+            if self._closed:
+                return False
+            if self._left is not None:
+                self._left -= 1
+            if self._room is not None:
+                self._room -= size
+            self._closed = self._left == 0 or (self._room is not None and self._room <= 0)
+            is_last = self._closed
+        if is_last:
+            self._end(f"as many {'messages' if self._left == 0 else 'bytes'} as wanted")
+        return True
 
     def _keeps(self, lane: _Lane, keep: Keep) -> bool:
         """Whether this one of a thinned topic keeps its payload."""
@@ -519,12 +542,30 @@ class Recorder:
         lane.thinned += 1
         return lane.thinned % EVERY == 1
 
-    def _reduced(self, lane: _Lane, payload: bytes, received: int) -> tuple[bytes, Channel]:
-        """What is kept of a message whose payload is given up."""
+    def _keep_fields(
+        self, lane: _Lane, payload: bytes, received: int, sent: int | None, number: int
+    ) -> None:
+        """Keep what can be kept of a message whose payload is given up."""
         if lane.reduced is None:
             lane.reduced = reduced_channel(lane.channel)
-        self._lose(lane, Cause.DEGRADE, "payload given up, fields kept", received)
-        return reduce(lane.channel, payload), lane.reduced
+        if self._target.write(
+            lane.reduced,
+            reduce(lane.channel, payload),
+            log_time=received,
+            publish_time=sent,
+            sequence=number,
+            wait=False,
+        ):
+            self._lose(lane, Cause.DEGRADE, "payload given up, fields kept", received)
+        else:
+            self._lose_for_room(lane, received)
+
+    def _lose_for_room(self, lane: _Lane, received: int) -> None:
+        self.say(
+            f"{lane.channel.topic}: the memory budget is spent, so messages are lost while that "
+            "lasts (see the loss ledger); --budget gives more"
+        )
+        self._lose(lane, Cause.QUEUE, "the memory budget was spent", received)
 
     def _lose(self, lane: _Lane, cause: Cause, detail: str, received: int) -> None:
         self._note(lane.channel.topic, cause, 1, first=received, last=received, detail=detail)
@@ -544,22 +585,27 @@ class Recorder:
     def _end(self, reason: str) -> None:
         with self._lock:
             self._reason = self._reason or reason
-            self._closed = self._left is None and self._refused is None
+            self._closed = self._closed or self._refused is None
         self._over.set()
 
     def _see_bounds(self, state: RecorderState) -> None:
         options = self._options
         if options.duration_s is not None and state.elapsed_s >= options.duration_s:
             self._end("the duration is over")
-        elif options.max_bytes is not None and state.stored_bytes >= options.max_bytes:
-            self._end("as many bytes as wanted")
-        elif state.free_bytes < options.reserve_bytes:
-            left = f"{state.free_bytes / 1e9:.1f} GB"
+            return
+        grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
+        # What waits in memory will be written, and as much again before the next look.
+        coming = state.filled * options.budget_bytes + grown
+        if state.free_bytes - coming < options.reserve_bytes:
             self._refuse(
                 Cause.DISK,
-                f"The disk has only {left} left: free some, or lower --reserve.",
+                f"The disk has only {_megabytes(state.free_bytes)} left: free some, or lower "
+                "--reserve.",
             )
-        elif self._target.failed:
+        failure = self._target.failure
+        if isinstance(failure, DiskFullError):
+            self._refuse(Cause.DISK, str(failure))
+        elif failure is not None:
             self._end("the recording failed")
 
     def _see_clock(self, now: float) -> None:
@@ -571,6 +617,10 @@ class Recorder:
                 f"the clock of this machine was set {'forward' if jump > 0 else 'back'} by "
                 f"{abs(jump):.1f} s; log times jump with it"
             )
+
+
+def _megabytes(count: float) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 _MARK_SCHEMA = (

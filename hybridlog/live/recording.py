@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Capture
-from hybridlog.losses import Ledger
+from hybridlog.live.policy import SMALL
+from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -105,10 +106,12 @@ class LiveRecording:
         on_close: Callable[[RecordReport], None],
     ) -> None:
         self._options = options
+        self._small_bound = options.budget_bytes * 5 // 4
         self._on_close = on_close
         self._started = time.monotonic()
         self._ids: dict[Channel, int] = {}
         self._channels: list[Channel] = []
+        self._taken: list[int] = []  # messages, by index of the channel
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
         self._unwritten = 0
@@ -121,6 +124,8 @@ class LiveRecording:
         self._report: RecordReport | None = None
         self.ledger = Ledger()
         """What is missing from this recording."""
+        self.cut_off: Counter[str] = Counter()
+        """Messages that were taken and found no room on the disk, by topic; known at the end."""
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -181,7 +186,8 @@ class LiveRecording:
             publish_time: When it was sent, ns since the epoch; None for the log time, which
                 is what a channel without publish times has.
             sequence: The sender's number, 0 to 2³²-1.
-            wait: False to refuse the message instead of waiting.
+            wait: False to refuse the message instead of waiting. Messages of up to `SMALL`
+                bytes may go beyond the budget by a quarter: fields land when payloads cannot.
 
         Returns:
             Whether it was taken.
@@ -195,7 +201,8 @@ class LiveRecording:
         if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
             raise UsageError("a time or the sequence number of a message is out of its range")
         with self._lock:
-            while self._unwritten and self._unwritten + len(payload) > self._options.budget_bytes:
+            bound = self._small_bound if len(payload) <= SMALL else self._options.budget_bytes
+            while self._unwritten and self._unwritten + len(payload) > bound:
                 self._check()
                 if not wait:
                     return False
@@ -207,6 +214,8 @@ class LiveRecording:
             if index is None:
                 index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
+                self._taken.append(0)
+            self._taken[index] += 1
             self._inbox.append(_Message(index, now, sent, sequence, payload))
             self._unwritten += len(payload)
             self._inbox_bytes += len(payload)
@@ -237,25 +246,31 @@ class LiveRecording:
         return self._capture.index.failure
 
     @property
-    def failed(self) -> bool:
-        """Whether nothing more can be taken; `close` says why."""
-        return self._failure is not None
+    def failure(self) -> BaseException | None:
+        """Why nothing more can be taken, None while it can."""
+        return self._failure
 
     def close(self) -> RecordReport:
         """Write, index and seal everything; tells how the recording went.
 
+        On a full disk what was flushed is sealed, and the rest is in the ledger.
+
         Raises:
-            DiskFullError: No space; what was flushed before stays, and the next opening of
-                the store seals it.
+            DiskFullError: There is no room even for that; what was flushed before stays, and
+                the next opening of the store seals it.
         """
         if self._report is not None:
             return self._report
         self._stop()
         with self._held:
             try:
-                if self._failure is not None:
+                end = {"status": "complete", "losses": []}
+                if isinstance(self._failure, DiskFullError):
+                    failure = self._capture.give_up(end, self._cut_off())
+                elif self._failure is not None:
                     raise self._failure
-                failure = self._capture.close({"status": "complete", "losses": []})
+                else:
+                    failure = self._close_whole(end)
             except BaseException:
                 self._capture.leave()
                 raise
@@ -271,6 +286,30 @@ class LiveRecording:
         )
         self._on_close(self._report)
         return self._report
+
+    def _close_whole(self, end: Mapping[str, Any]) -> DatabaseError | None:
+        """Write everything; on a disk that is full only now, what there is room for."""
+        try:
+            return self._capture.close(end)
+        except DiskFullError:
+            return self._capture.give_up(end, self._cut_off())
+
+    def _cut_off(self) -> list[dict[str, Any]]:
+        """Rows of the ledger, with what was taken and is in no file."""
+        now = time.time_ns()
+        for channel, taken in zip(self._channels, self._taken, strict=True):
+            count = taken - self._capture.writer.written_of(channel)
+            if count:
+                self.cut_off[channel.topic] += count
+                self.ledger.note(
+                    channel.topic,
+                    Cause.DISK,
+                    count,
+                    first=min(self._capture.writer.last_log_time, now),
+                    last=now,
+                    detail="the disk was full",
+                )
+        return self.ledger.take(everything=True)
 
     def abort(self) -> None:
         """Take the whole recording back."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.live.ring import Held, Ring
 from hybridlog.losses import Cause, Ledger
 from hybridlog.query.evaluate import holds
+from hybridlog.query.mongo_filter import to_filter
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.query.where import Expression, parse
 from hybridlog.schema.codec import codec_for
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import HybridlogError, UsageError, WhereError
 
 if TYPE_CHECKING:
     from hybridlog.live.recording import LiveRecording
@@ -95,7 +96,11 @@ class Snapshots:
         options: What a snapshot holds.
         budget_bytes: Payload bytes that the ring may hold.
         start: Starts a recording, by the reason for it.
+        again: Called with the reason for a trigger that finds a snapshot being written.
         say: Called with what the user should know.
+
+    Attributes:
+        cut_off: Messages of snapshots that found no room on the disk, by topic.
     """
 
     def __init__(
@@ -103,9 +108,14 @@ class Snapshots:
         options: SnapshotOptions,
         budget_bytes: int,
         start: Callable[[str], LiveRecording],
+        again: Callable[[str], None],
         say: Callable[[str], None],
     ) -> None:
+        self.cut_off: Counter[str] = Counter()
         self._options = options
+        self._again = again
+        self._reasons: set[str] = set()
+        self._unmet = dict.fromkeys(trigger.text for trigger in options.triggers)
         self._ring = Ring(round(options.ring_s * 1e9), budget_bytes)
         self._start = start
         self._say = say
@@ -139,8 +149,7 @@ class Snapshots:
         held = Held(channel, payload, log_time, publish_time, sequence)
         triggers = self._watched.get(channel)
         if triggers is None:
-            fitting = (t for t in self._options.triggers if t.fits(channel.topic))
-            triggers = self._watched[channel] = tuple(fitting)
+            triggers = self._watched[channel] = tuple(self._fitting(channel))
         with self._lock:
             self._ring.add(held)
             active = self._active
@@ -174,9 +183,17 @@ class Snapshots:
         until = now + round(self._options.after_s * 1e9)
         with self._lock:
             self._until = max(self._until, until)
-            if self._active is not None or (self._dumping and not self._dumping.done()):
-                return
-            self._dumping = self._worker.submit(self._write_out, reason, now)
+            goes_on = self._active is not None or (
+                self._dumping is not None and not self._dumping.done()
+            )
+            is_new = reason not in self._reasons
+            if goes_on:
+                self._reasons.add(reason)
+            else:
+                self._reasons = {reason}
+                self._dumping = self._worker.submit(self._write_out, reason, now)
+        if goes_on and is_new:
+            self._again(reason)
 
     def look(self) -> None:
         """End a snapshot whose time is over although nothing comes any more."""
@@ -205,6 +222,8 @@ class Snapshots:
             if self._active is not None:
                 self._end(self._active)
         self._worker.shutdown(wait=True)
+        for text in self._unmet:
+            self._say(f"no topic fits the trigger {text!r}")
         if self._failure is not None:
             raise self._failure
         return self._reports
@@ -249,15 +268,32 @@ class Snapshots:
         return None if active is None else active.index_failure
 
     @property
-    def failed(self) -> bool:
-        """Whether nothing more can be taken; `close` says why."""
+    def failure(self) -> BaseException | None:
+        """Why nothing more can be taken, None while it can."""
         active = self._active
-        return self._failure is not None or (active is not None and active.failed)
+        return self._failure or (None if active is None else active.failure)
 
     @property
     def count(self) -> int:
         """Snapshots so far, the one that is being written included."""
         return len(self._reports) + (self._active is not None)
+
+    @property
+    def unmet(self) -> list[str]:
+        """Triggers whose topic never came."""
+        return list(self._unmet)
+
+    def _fitting(self, channel: Channel) -> Iterator[Trigger]:
+        """The triggers for a channel; says which of them can never fire."""
+        for trigger in self._options.triggers:
+            if not trigger.fits(channel.topic):
+                continue
+            self._unmet.pop(trigger.text, None)
+            fault = "" if trigger.predicate is None else _fault(trigger.predicate, channel)
+            if fault:
+                self._say(f"trigger {trigger.text!r} can never fire on {channel.topic}: {fault}")
+            else:
+                yield trigger
 
     @staticmethod
     def _happened(trigger: Trigger, held: Held) -> bool:
@@ -294,7 +330,7 @@ class Snapshots:
         self._say(f"snapshot {recording.id} because of {reason!r}")
         try:
             for held in kept:
-                while recording.filled > _HALF and not recording.failed:
+                while recording.filled > _HALF and recording.failure is None:
                     time.sleep(0.001)
                 recording.write(
                     held.channel,
@@ -317,9 +353,20 @@ class Snapshots:
         stored = recording.stored
         try:
             report = recording.close()
+            self.cut_off.update(recording.cut_off)
         except HybridlogError as error:
             self._failure = error
             self._say(f"snapshot {recording.id} is not complete: {error}")
             return
         self._reports.append(report)
         self._stored = (self._stored[0] + stored[0], self._stored[1] + stored[1])
+
+
+def _fault(predicate: Expression, channel: Channel) -> str:
+    """Why a predicate can never hold for a channel, as far as its type tells; else empty."""
+    types = {path.path: path.type for path in codec_for(channel).paths()}
+    try:
+        to_filter(predicate, types or None)
+    except WhereError as error:
+        return str(error)
+    return ""

@@ -92,8 +92,16 @@ class AppendFile:
         """Write all parts at the end; they are in the file when this returns.
 
         Raises:
-            OSError: when the system refuses; a part may have been written by then.
+            OSError: when the system refuses; the file is then as it was before.
         """
+        before = self.position
+        try:
+            self._append(parts)
+        except OSError:
+            self._step_back(before)
+            raise
+
+    def _append(self, parts: Sequence[Buffer]) -> None:
         if self._stage is None:
             self.position += write_all(self._fd, parts)
             return
@@ -168,6 +176,18 @@ class AppendFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+    def _step_back(self, position: int) -> None:
+        """Forget a write that failed: what lay before it is whole, and can be added to.
+
+        What is added is not written past the page cache any more: little is.
+        """
+        self._stage = None
+        self.position = position
+        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        with suppress(OSError):  # the error that led here says more
+            self.cut(position)
 
     def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
         """Write pieces and what was staged behind them; keep what is behind the last block."""

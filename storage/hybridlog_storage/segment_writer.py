@@ -10,7 +10,7 @@ go, and only then their owner hears of them: **log first, index second**.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -163,18 +163,23 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, path, "creating") from error
         segment = cls(path, number, file)
-        segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
-        segment.add_metadata(
-            json_metadata(
-                RECORDING_METADATA,
-                {
-                    **recording,
-                    "segment": number,
-                    "format": FORMAT_VERSION,
-                    "next_seq": next_seq,
-                },
+        try:
+            segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
+            segment.add_metadata(
+                json_metadata(
+                    RECORDING_METADATA,
+                    {
+                        **recording,
+                        "segment": number,
+                        "format": FORMAT_VERSION,
+                        "next_seq": next_seq,
+                    },
+                )
             )
-        )
+        except BaseException:
+            file.close()
+            path.unlink()  # or the next try would find it there
+            raise
         return segment
 
     @property
@@ -328,8 +333,9 @@ class SegmentFile:
 
     def seal(self, *, sync: bool = True) -> Path:
         """Write the summary, close, and give the file its final name."""
-        self._write([record_bytes(DataEnd(data_section_crc=0))])
-        self._write([self._summary(self.position), MAGIC])
+        # In one go: where there is no room, the file is as before, and can be sealed again.
+        end = record_bytes(DataEnd(data_section_crc=0))
+        self._write([end, self._summary(self.position + len(end)), MAGIC])
         final = self.path.with_name(self.path.name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX)
         try:
             self._file.finish(sync=sync)
@@ -484,6 +490,8 @@ class RecordingWriter:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
         self.channels: dict[int, Channel] = {}
+        self.written: Counter[int] = Counter()
+        """Messages that are in the files, by channel id."""
         self._directory = directory
         self._recording = recording
         self._on_chunk = on_chunk
@@ -498,6 +506,7 @@ class RecordingWriter:
         self._broken: BaseException | None = None
         self._next_seq = 0
         self._stored_seq = 0
+        self._last_log_time = 0
         self._segment: SegmentFile | None = None
         self._number = 0
         self._opened = 0.0
@@ -608,6 +617,32 @@ class RecordingWriter:
             self._shut_down()
         return self._closed
 
+    def give_up(self, extras: Sequence[Metadata]) -> None:
+        """When nothing more can be written: seal what is in the file, drop what is not.
+
+        Args:
+            extras: Last records, for which there may be room.
+
+        Raises:
+            DiskFullError: There is not; the next opening of the store seals the segment.
+        """
+        self._syncing = None
+        self._shut_down()
+        segment = self._open_segment()
+        for extra in extras:
+            segment.add_metadata(extra)
+        self._seal()
+
+    @property
+    def last_log_time(self) -> int:
+        """Log time of the latest message in the files, ns; 0 without any."""
+        return self._last_log_time
+
+    def written_of(self, channel: Channel) -> int:
+        """Messages of a channel that are in the files."""
+        known = self._known.get(channel)
+        return 0 if known is None else self.written[known.channel_id]
+
     def abort(self) -> None:
         """Stop at once; sealed segments and flushed chunks stay where they are."""
         self._broken = self._broken or StoreError("The recording was stopped.")
@@ -712,6 +747,9 @@ class RecordingWriter:
         elif self.settings.sync == "seal" and not segment.direct:
             self._sync_behind(segment)
         self.totals.chunks += 1
+        for channel_id, data in chunk.indexes.items():
+            self.written[channel_id] += entries_of(data)
+        self._last_log_time = max(self._last_log_time, chunk.last)
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         span = self.settings.segment_span_s

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -193,7 +194,7 @@ def test_when_the_budget_is_spent_the_rest_is_counted(
     blocked.set()
     rows = robot.rows()
     kept = in_segments(store, robot.recorder.name)
-    assert 200 < kept["/chatter", "ros1"] < 300
+    assert 300 < kept["/chatter", "ros1"] < 340
     assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
 
 
@@ -220,6 +221,43 @@ def test_a_full_disk_ends_it_and_what_comes_is_counted(
         assert state.lost["disk"] >= 2
         with pytest.raises(DiskFullError):
             robot.recorder.stop()
+
+
+def test_a_disk_that_has_room_for_little_more(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was flushed is sealed at once, and what was not is in the ledger."""
+    robot = Running(store)
+    channel = scan_channel()
+    for number in range(5):
+        robot.speaker.say(channel, scan(number, 400_000))
+    wait_for(lambda: robot.recorder._target._capture.writer.written.total() == 5)  # type: ignore[union-attr]
+    pwritev = os.pwritev
+
+    def full(fd: int, pieces: list[memoryview], position: int) -> int:
+        # As a disk does that has some blocks left: it takes a part first.
+        if len(pieces[0]) > 4096:
+            return pwritev(fd, [pieces[0][:4096]], position)
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(append_file.os, "pwritev", full)
+    for number in range(200):
+        robot.speaker.say(channel, scan(number, 400_000))
+        if robot.recorder.wait(0.01):
+            break
+    robot.speaker.say(channel, scan(1, 100))
+    (report,) = robot.recorder.stop()
+    assert robot.recorder.stopped_for_disk
+    state = robot.recorder.look()
+    assert report.failure is None
+    assert report.entry.status == "complete"
+    lost = sum(row["count"] for row in report.entry.end["losses"])
+    assert {row["cause"] for row in report.entry.end["losses"]} == {"disk"}
+    assert state.lost == {"disk": lost}
+    assert report.entry.messages + lost == state.messages
+    assert report.entry.messages >= 5
+    assert [m.raw for m in store.topic("/scan")][:5] == [scan(n, 400_000) for n in range(5)]
+    assert store.verify().findings == []
 
 
 def test_it_stops_before_the_disk_is_full(store: hl.Store) -> None:
@@ -438,3 +476,69 @@ def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> N
         assert recording.messages >= 40
         assert sum(row["count"] for row in recording.end["losses"]) >= 40
         assert running(path) == []
+
+
+def test_fields_land_when_no_payload_finds_room(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever their priority: three large messages are more than the budget."""
+    blocked = threading.Event()
+    lay_down = LiveRecording._lay_down
+
+    def slow(self: LiveRecording, group: object) -> int:
+        blocked.wait()
+        return lay_down(self, group)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
+    options = RecorderOptions(reserve_bytes=0, budget_bytes=4 << 20, priorities=rules)
+    robot = Running(store, options)
+    for number in range(10):
+        for rule in rules:
+            robot.speaker.say(scan_channel(rule.pattern), scan(number, 3_000_000))
+    blocked.set()
+    rows = robot.rows()
+    assert {cause for _, cause in rows} == {"degrade"}
+    kept = in_segments(store, robot.recorder.name)
+    for rule in rules:
+        assert kept[rule.pattern, "ros1"] + rows[rule.pattern, "degrade"] == 10
+        assert kept[rule.pattern, "hybridlog.reduced"] == rows[rule.pattern, "degrade"]
+
+
+def test_a_mark_that_is_no_text(store: hl.Store) -> None:
+    robot = Running(store)
+    robot.recorder.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
+    robot.rows()
+    (message,) = store.topic(MARKS)
+    assert json.loads(bytes(message.raw)) == {
+        "text": "bad\udcff\udcfebytes",
+        "tags": {"a": "\udc80"},
+    }
+    assert robot.recorder.look().messages == 1
+
+
+def test_the_bytes_wanted_are_counted_as_they_come(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=0, max_bytes=1000))
+    for number in range(100):
+        robot.speaker.say(scan_channel(), scan(number, 288))  # 300 bytes
+    assert robot.recorder.wait(0)
+    robot.rows()
+    assert store.topic("/scan").count() == 4
+
+
+def test_the_reserve_holds_for_what_waits_in_memory(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LiveRecording, "filled", 0.5)
+    disk = shutil.disk_usage("/")._replace(free=150 << 20)
+    monkeypatch.setattr(recorder_module.shutil, "disk_usage", lambda _: disk)
+    robot = Running(store, RecorderOptions(reserve_bytes=100 << 20, budget_bytes=64 << 20))
+    robot.recorder.look()
+    assert not robot.recorder.wait(0)
+    robot.rows()
+    robot = Running(store, RecorderOptions(reserve_bytes=120 << 20, budget_bytes=64 << 20))
+    robot.recorder.look()
+    assert robot.recorder.wait(0)
+    assert robot.recorder.stopped_for_disk
+    assert "only 157 MB left" in robot.recorder.reason
+    robot.rows()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
 from hybridlog.live.ring import Held, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Trigger
 from hybridlog.losses import Cause
@@ -128,7 +128,9 @@ def test_a_trigger_while_a_snapshot_is_written_prolongs_it(store: hl.Store) -> N
     robot.until(2)
     reports = robot.recorder.stop()
     assert [report.entry.tags["trigger"] for report in reports] == ["first", "third"]
-    assert reports[0].entry.messages == 2
+    assert reports[0].entry.messages == 3  # the second trigger has left a mark
+    marks = [message.decode() for message in store.topic(MARKS)]
+    assert marks == [{"text": "second", "tags": {"trigger": "second"}}]
 
 
 def test_without_a_trigger_nothing_is_kept(store: hl.Store) -> None:
@@ -172,3 +174,18 @@ def test_everything_is_kept_already(store: hl.Store) -> None:
     with pytest.raises(UsageError, match="--ring"):
         recorder.fire("now")
     recorder.stop()
+
+
+def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
+    texts = ("/scan: nope == 1", '/scan: near == "x"', "/nowhere: a == 1", "/scan: near > 1")
+    robot = Robot(store, SnapshotOptions(60, triggers=tuple(map(Trigger.of, texts))))
+    for number in range(4):
+        robot.speaker.say(scan_channel(), scan(number, 10))
+    robot.until(1)
+    robot.recorder.stop()
+    said = "\n".join(robot.said)
+    assert "'/scan: nope == 1' can never fire on /scan: " in said
+    assert "there is no field nope" in said
+    assert """'/scan: near == "x"' can never fire on /scan: """ in said
+    assert "no topic fits the trigger '/nowhere: a == 1'" in said
+    assert said.count("near > 1") == 1  # the snapshot itself
