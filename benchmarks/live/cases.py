@@ -19,7 +19,7 @@ from benchmarks.backends.processes import working_below
 from benchmarks.harness.usage import machine, with_children
 from benchmarks.live.master import Master
 from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
-from benchmarks.live.talker import Load, data_of
+from benchmarks.live.talker import Data, Load
 from benchmarks.side import SideError
 
 _FLUSH_S = 1.0
@@ -204,7 +204,7 @@ def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int
     """
     import hybridlog
 
-    data = data_of(load.size)
+    data = Data(load.size)
     last_ns, wrong = 0, 0
     before: dict[str, int] = defaultdict(int)
     with hybridlog.open(store) as opened:
@@ -212,7 +212,7 @@ def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int
         for message in opened.all_topics():
             raw = bytes(message.raw)
             sequence = int.from_bytes(raw[:4], "little")
-            wrong += sequence != before[message.topic] + 1 or raw[20:] != data
+            wrong += sequence != before[message.topic] + 1 or raw[20:] != data.of(sequence)
             before[message.topic] = sequence
             last_ns = max(last_ns, message.log_time_ns)
             messages += 1

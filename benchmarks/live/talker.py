@@ -30,6 +30,8 @@ TYPE = "hybridlog_benchmark/Blob"
 _MD5 = "0" * 31 + "1"
 _HEAD = struct.Struct("<IIIII")
 """Sequence, seconds, nanoseconds, length of the frame's name, length of the data."""
+_ROW = 64 << 20
+_STEP = 1_000_003
 _PATIENCE_S = 20.0
 _SETTLE_S = 1.5
 
@@ -64,9 +66,21 @@ class Load(NamedTuple):
         return -(-int(self.seconds * self.hz) // self.burst) * self.burst * self.topics
 
 
-def data_of(size: int) -> bytes:
-    """The data of every message of a size."""
-    return random.Random(size).randbytes(max(size - _HEAD.size, 0))
+class Data:
+    """Random bytes, other ones in each message: a part of one long row of them.
+
+    Args:
+        size: Bytes of a message, its head included.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._row = memoryview(random.Random(1).randbytes(_ROW + size))
+        self._size = max(size - _HEAD.size, 0)
+
+    def of(self, sequence: int) -> memoryview:
+        """What stands in a message."""
+        begin = sequence * _STEP % _ROW
+        return self._row[begin : begin + self._size]
 
 
 @dataclass(slots=True)
@@ -166,7 +180,7 @@ class Talker:
 
     def _speak(self) -> dict[str, float]:
         load = self._load
-        data = data_of(load.size)
+        data = Data(load.size)
         total = load.messages // load.topics if load.seconds else sys.maxsize
         if not load.seconds:
             threading.Thread(target=self._watch_input, daemon=True).start()
@@ -180,7 +194,7 @@ class Talker:
             for _ in range(load.burst):
                 sequence += 1
                 for connections in self._connections:
-                    message = _message(sequence, data)
+                    message = _message(sequence, data.of(sequence))
                     for connection in connections:
                         connection.put(message, load.queue)
                         connection.flush()
@@ -210,7 +224,7 @@ class Talker:
             connection.flush()
 
 
-def _message(sequence: int, data: bytes) -> bytes:
+def _message(sequence: int, data: memoryview) -> bytes:
     seconds, nanoseconds = divmod(time.time_ns(), 10**9)
     head = _HEAD.pack(sequence, seconds, nanoseconds, 0, len(data))
     return b"".join((struct.pack("<I", _HEAD.size + len(data)), head, data))
