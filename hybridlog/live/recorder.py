@@ -8,6 +8,7 @@ the ledger says.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import threading
@@ -194,6 +195,7 @@ class Recorder:
                 {
                     "state": self._ask_state,
                     "mark": self._ask_mark,
+                    "numbers": self._ask_numbers,
                     "trigger": self._ask_trigger,
                     "stop": self._ask_stop,
                 },
@@ -469,6 +471,23 @@ class Recorder:
             raise UsageError("a trigger has a reason")
         self.fire(reason)
         return {"recording": self.name}
+
+    def _ask_numbers(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Least, mean and greatest of a field lately, out of the ring."""
+        topic, path, begin = request.get("topic"), request.get("path"), request.get("begin")
+        if not isinstance(topic, str) or not isinstance(path, str) or not isinstance(begin, int):
+            raise UsageError("a field has a topic, a path and a time to begin at")
+        if not isinstance(self._target, Snapshots):
+            raise UsageError("this recorder keeps everything: its index has the fields")
+        found = self._target.numbers(topic, path, begin)
+        if not found:
+            return {"n": 0}
+        return {
+            "n": len(found),
+            "least": min(found),
+            "mean": math.fsum(found) / len(found),
+            "greatest": max(found),
+        }
 
     def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         self._end("it was told to stop")

@@ -69,6 +69,16 @@ class Ring:
         ]
         return front + found
 
+    def latest(self, topic: str, begin: int, most: int) -> list[Held]:
+        """The latest messages of a topic since a log time, ns, at most so many."""
+        found: list[Held] = []
+        for held in reversed(self._messages):
+            if held.log_time < begin or len(found) == most:
+                break
+            if held.channel.topic == topic:
+                found.append(held)
+        return found
+
     def _latch(self, message: Held, depth: int) -> None:
         latched = self._latched.setdefault(message.channel, deque(maxlen=depth))
         latched.append(message)

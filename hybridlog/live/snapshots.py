@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.ring import Held, Ring
 from hybridlog.losses import Cause, Ledger
-from hybridlog.query.evaluate import holds
+from hybridlog.query.evaluate import holds, numbers_at
 from hybridlog.query.mongo_filter import to_filter
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.query.where import Expression, parse
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
 
 _MOST_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
+_MOST_WATCHED = 1000  # messages of which somebody looks at a field
 _HALF = 0.5  # of a recording's budget, left for what comes while the ring is written
 
 
@@ -277,6 +278,16 @@ class Snapshots:
     def count(self) -> int:
         """Snapshots so far, the one that is being written included."""
         return len(self._reports) + (self._active is not None)
+
+    def numbers(self, topic: str, path: str, begin: int) -> list[float]:
+        """What a field has been in the ring's latest messages since a log time, ns."""
+        with self._lock:
+            latest = self._ring.latest(topic, begin, _MOST_WATCHED)
+        return [
+            number
+            for held in latest
+            for number in numbers_at(codec_for(held.channel).fields(held.payload), path)
+        ]
 
     @property
     def unmet(self) -> list[str]:

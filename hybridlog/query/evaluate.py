@@ -41,6 +41,18 @@ def holds(expression: Expression, document: Mapping[str, object]) -> bool:
     return _node(expression.root, document)
 
 
+def numbers_at(document: Mapping[str, object], path: str) -> list[float]:
+    """The numbers that a path such as `pose.position.x` or `ranges.min` leads to.
+
+    Args:
+        document: As for `holds`.
+        path: Names and places with dots between them.
+    """
+    parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
+    values = (value for leaf in _reach(document, parts) for value in _elements(leaf))
+    return [value for value in values if isinstance(value, int | float) and _is_number(value)]
+
+
 def _node(node: Node, document: Mapping[str, object]) -> bool:
     if isinstance(node, And):
         return all(_node(item, document) for item in node.items)

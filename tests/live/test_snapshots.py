@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.live.door import visit
 from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
 from hybridlog.live.ring import Held, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Trigger
@@ -189,3 +190,26 @@ def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
     assert """'/scan: near == "x"' can never fire on /scan: """ in said
     assert "no topic fits the trigger '/nowhere: a == 1'" in said
     assert said.count("near > 1") == 1  # the snapshot itself
+
+
+def test_fields_of_the_ring_can_be_watched(store: hl.Store) -> None:
+    robot = Robot(store, SnapshotOptions(60))
+    now = time.time_ns()
+    for number in range(10):
+        robot.speaker.say(scan_channel(), scan(number, 10), now + number)
+
+    def asked(**content: object) -> dict[str, object]:
+        return visit(store.directory.path, robot.recorder.name, "numbers", **content)
+
+    assert asked(topic="/scan", path="near", begin=now + 4) == {
+        "n": 6,
+        "least": 2.0,
+        "mean": 3.25,
+        "greatest": 4.5,
+    }
+    assert asked(topic="/scan", path="data.max", begin=now)["greatest"] == 9
+    assert asked(topic="/scan", path="nope", begin=now) == {"n": 0}
+    assert asked(topic="/other", path="near", begin=now) == {"n": 0}
+    with pytest.raises(UsageError, match="a field has a topic"):
+        asked(topic="/scan", path=5, begin=now)
+    robot.recorder.stop()
