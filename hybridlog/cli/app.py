@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +12,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from hybridlog.cli.complete import complete_recording, complete_topic
+from hybridlog.cli.complete import (
+    complete_field,
+    complete_recording,
+    complete_running,
+    complete_topic,
+)
 from hybridlog.cli.exit_codes import as_text
 
 
@@ -32,18 +38,29 @@ class _RecordCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Take `--ros1 URI` for `--ros1 --master URI`, and `--throttle A B` for `A=B`."""
         written: list[str] = []
-        rest = iter(args)
-        for word in rest:
+        rest = list(args)
+        while rest:
+            word = rest.pop(0)
+            before = written[-1] if written else ""
             if word.startswith("--ros1="):
                 written += ["--master", word.removeprefix("--ros1=")]
-            elif "://" in word and written[-1:] == ["--ros1"]:
+            elif before == "--ros1" and _is_value(word) and not _is_file(word):
                 written += ["--master", word]
-            elif written[-1:] in (["--throttle"], ["--priority"]) and "=" not in word:
-                following = next(rest, None)
-                written.append(word if following is None else f"{word}={following}")
+            elif before in {"--throttle", "--priority"} and "=" not in word:
+                # Where a value was forgotten, the next option must not be taken for it.
+                has_value = bool(rest) and _is_value(rest[0])
+                written.append(f"{word}={rest.pop(0)}" if has_value else word)
             else:
                 written.append(word)
         return super().parse_args(ctx, written)
+
+
+def _is_value(word: str) -> bool:
+    return not word.startswith("-")
+
+
+def _is_file(word: str) -> bool:
+    return os.path.exists(word)  # noqa: PTH110 - what is too long for a path is no error here
 
 
 app = typer.Typer(
@@ -136,6 +153,17 @@ RecordingOption = Annotated[
         help="Only this recording (id, name, or the beginning of an id). Repeatable.",
         metavar="RECORDING",
         autocompletion=complete_recording,
+    ),
+]
+RunningOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--recording",
+        "-r",
+        help="Only this recorder (id or name of its recording, or the beginning of the id). "
+        "Repeatable.",
+        metavar="RECORDING",
+        autocompletion=complete_running,
     ),
 ]
 BetweenOption = Annotated[
@@ -283,6 +311,7 @@ def record(
         typer.Option(
             help="Live: at most so many messages a second, such as /camera 5Hz. Repeatable.",
             metavar="TOPIC RATE",
+            autocompletion=complete_topic,
         ),
     ] = None,
     priority: Annotated[
@@ -291,6 +320,7 @@ def record(
             help="Live: low, normal or high; who keeps payloads longest when more comes than "
             "can be written. Repeatable.",
             metavar="TOPIC WORD",
+            autocompletion=complete_topic,
         ),
     ] = None,
     budget: Annotated[
@@ -340,7 +370,7 @@ def record(
     until Ctrl-C. What cannot be kept is counted: see `hybridlog losses`.
     """
     from hybridlog.cli import record as command
-    from hybridlog.cli.record_live import LiveChoices
+    from hybridlog.cli.live_choices import LiveChoices
 
     command.run(
         paths or [],
@@ -426,7 +456,13 @@ def losses(
     store: StoreOption = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option("--topic", "-t", help="Only of these. Repeatable.", metavar="TOPIC"),
+        typer.Option(
+            "--topic",
+            "-t",
+            help="Only of these. Repeatable.",
+            metavar="TOPIC",
+            autocompletion=complete_topic,
+        ),
     ] = None,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
@@ -442,9 +478,10 @@ def top(
     recording: Annotated[
         str | None,
         typer.Argument(
-            help="Which, when several are being recorded.",
+            help="Which, when several are being recorded: id or name of the recording, or the "
+            "beginning of the id.",
             metavar="RECORDING",
-            autocompletion=complete_recording,
+            autocompletion=complete_running,
         ),
     ] = None,
     store: StoreOption = None,
@@ -454,6 +491,7 @@ def top(
             help="Least, mean and greatest of a field in the last seconds, such as "
             "scan:ranges.min. Repeatable.",
             metavar="TOPIC:FIELD",
+            autocompletion=complete_field,
         ),
     ] = None,
     last: Annotated[
@@ -477,7 +515,7 @@ def mark(
     tag: Annotated[
         list[str] | None, typer.Option(help="Keep KEY=VALUE with it. Repeatable.", metavar="K=V")
     ] = None,
-    recording: RecordingOption = None,
+    recording: RunningOption = None,
     store: StoreOption = None,
     quiet: QuietOption = False,
 ) -> None:
@@ -494,7 +532,7 @@ def mark(
 @app.command()
 def trigger(
     name: Annotated[str, typer.Argument(help="Why, in a word.", metavar="NAME")],
-    recording: RecordingOption = None,
+    recording: RunningOption = None,
     store: StoreOption = None,
     quiet: QuietOption = False,
 ) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
+
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog.reader import Query
     from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
 
 
 def question(store: Store, topics: Sequence[str] | None, recordings: Sequence[str] | None) -> Query:
@@ -25,10 +29,29 @@ def question(store: Store, topics: Sequence[str] | None, recordings: Sequence[st
         TopicError: a name fits nothing, or several things.
     """
     if not recordings:
-        return store.topic(*topics) if topics else store.all_topics()
+        if not topics:
+            return store.all_topics()
+        with _explained(store.recordings):
+            return store.topic(*topics)
     from hybridlog.query.topics import resolve
 
     chosen = store.select(recordings)
     known = {channel.topic for entry in chosen for channel in entry.channels}
-    names = resolve(topics, known) if topics else sorted(known)
+    with _explained(lambda: chosen):
+        names = resolve(topics, known) if topics else sorted(known)
     return store.query(names, [entry.id for entry in chosen])
+
+
+@contextmanager
+def _explained(recordings: Callable[[], Sequence[RecordingEntry]]) -> Iterator[None]:
+    """A topic that is not there may be one that is only just being recorded."""
+    try:
+        yield
+    except TopicError as error:
+        names = [entry.id for entry in recordings() if entry.status == "open"]
+        if not names:
+            raise
+        are = "is" if len(names) == 1 else "are"
+        raise TopicError(
+            f"{error}; {', '.join(names)} {are} still being recorded, and can be asked afterwards"
+        ) from error

@@ -20,6 +20,22 @@ def complete_recording(context: typer.Context, incomplete: str) -> list[str]:
     return []
 
 
+def complete_running(context: typer.Context, incomplete: str) -> list[str]:
+    """Recorders that run now, by the beginning of their id."""
+    from hybridlog.live.door import running
+
+    with _nothing_on_error():
+        return [name for name in running(_store(context).path) if name.startswith(incomplete)]
+    return []
+
+
+def complete_field(context: typer.Context, incomplete: str) -> list[str]:
+    """Topics, with the colon that a field follows."""
+    if ":" in incomplete:
+        return []
+    return [f"{topic}:" for topic in complete_topic(context, incomplete)]
+
+
 def complete_topic(context: typer.Context, incomplete: str) -> list[str]:
     """Topics that begin with what was typed; without a slash, short names as well.
 
@@ -28,7 +44,8 @@ def complete_topic(context: typer.Context, incomplete: str) -> list[str]:
     """
     with _nothing_on_error():
         directory = _store(context)
-        wanted = tuple(context.params.get("recording") or ())
+        given = context.params.get("recording") or ()
+        wanted = (given,) if isinstance(given, str) else tuple(given)
         ids = directory.recording_ids()
         # A recording may be given by its name, too, which is not looked up here.
         topics = _topics(directory, [i for i in ids if i.startswith(wanted)] or ids)

@@ -51,7 +51,11 @@ def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
 
 def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     if not losses:
-        return "being recorded" if entry.status == "open" else "complete"
+        if entry.status == "open":
+            return "being recorded"
+        # A log of no messages is complete without any; of a robot nobody can say that.
+        is_live = not entry.source["bytes"]
+        return "nothing was received" if is_live and not entry.messages else "complete"
     lost = sum(loss["count"] or 0 for loss in losses)
     if any(loss["count"] is None for loss in losses):
         known = f"at least {counted(lost, 'message')}" if lost else "an unknown number of messages"

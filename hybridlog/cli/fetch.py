@@ -288,7 +288,8 @@ def closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
     taken = f"{output.size(counters.bytes_read)} read from disk"
     if counters.chunks_read:
         taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
-    found = "" if count else f"{output.counted(counters.messages, 'message')}, "
+    given = counters.messages - counters.reduced
+    found = "" if count else f"{output.counted(given, 'message')}, "
     output.note(
         f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
         f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
 from hybridlog.losses import Cause
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hybridlog.live.statistics import TopicState
     from hybridlog.recorder import RecordReport
 
+_SHORT = 60  # characters of a reason
 _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 
 
@@ -81,8 +82,6 @@ def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Grou
     if len(topics) > rows:
         lines.append(Text(f"… and {output.counted(len(topics) - rows, 'more topic')}"))
     lines.append(Text(summary(state), style="bold"))
-    if state.index_failure:
-        lines.append(Text(f"index: {output.printable(state.index_failure)}", style="yellow"))
     lines.extend(Text(output.printable(line)) for line in below)
     return Group(*lines)
 
@@ -97,15 +96,31 @@ def summary(state: RecorderState) -> str:
         f"{output.size(rate)}/s",
         f"{output.size(state.stored_bytes)} stored",
         f"memory {100 * state.filled:.0f} %",
-        f"index {state.lag} behind" if state.lag else "index up to date",
+        _index(state),
         f"{output.size(state.free_bytes)} free",
     ]
     causes = {cause: count for cause, count in state.lost.items() if cause != Cause.THROTTLE}
     lost = sum(causes.values())
-    if lost:
-        named = ", ".join(f"{cause} {count}" for cause, count in sorted(causes.items()))
-        parts.append(f"lost {lost} ({named})")
+    if causes:
+        # A cause without a number: how many they are cannot be known.
+        named = ", ".join(
+            f"{cause} {count or 'unknown'}" for cause, count in sorted(causes.items())
+        )
+        parts.append(f"lost {lost or 'unknown'} ({named})")
     return " · ".join(parts)
+
+
+def _index(state: RecorderState) -> str:
+    if state.index_failure:
+        return f"index {state.lag} behind: {in_short(state.index_failure)}"
+    return f"index {state.lag} behind" if state.lag else "index up to date"
+
+
+def in_short(reason: str) -> str:
+    """The beginning of a reason, for a place where not much fits."""
+    line = output.printable(reason.partition("\n")[0])
+    sentence = line.partition(". ")[0].rstrip(".")
+    return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"
 
 
 def _cells(topic: TopicState) -> list[Text | str]:
@@ -124,8 +139,16 @@ def _cells(topic: TopicState) -> list[Text | str]:
     ]
 
 
-def closing_rows(report: RecordReport, state: RecorderState) -> list[tuple[str, str]]:
-    """What stands in the table at the end."""
+def closing_rows(
+    report: RecordReport, state: RecorderState, unreached: Sequence[str]
+) -> list[tuple[str, str]]:
+    """What stands in the table at the end.
+
+    Args:
+        report: How the recording went.
+        state: Of the recorder, at its end.
+        unreached: Sources that never answered.
+    """
     entry = report.entry
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
     rows = [
@@ -137,13 +160,22 @@ def closing_rows(report: RecordReport, state: RecorderState) -> list[tuple[str, 
         ("messages indexed", str(report.indexed)),
         ("time", f"{report.elapsed_s:.1f} s ({rate:,.0f} messages/s)"),
     ]
-    if not state.lost.keys() - {Cause.THROTTLE.value}:
+    if unreached:
+        rows.append(("lost", f"unknown, never reached: {', '.join(unreached)}"))
+    elif not state.lost.keys() - {Cause.THROTTLE.value}:
         rows.append(("lost", "nothing"))
     for cause, count in sorted(state.lost.items()):
-        topics = sorted(
-            {r["topic"] or "any" for r in entry.end.get("losses", []) if r["cause"] == cause}
-        )
+        losses = [row for row in entry.end.get("losses", []) if row["cause"] == cause]
+        topics = sorted({row["topic"] or "any" for row in losses})
         named = ", ".join(topics[:3]) + (" …" if len(topics) > 3 else "")
         what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
-        rows.append((what, f"{count} ({named})"))
+        rows.append((what, f"{_number(count, losses)} ({named})"))
     return rows
+
+
+def _number(known: int, losses: Sequence[Mapping[str, Any]]) -> str:
+    """How many are lost, as far as that can be known."""
+    if not known:
+        return "unknown"
+    is_more = any(row["count"] is None for row in losses)
+    return f"at least {known}" if is_more else str(known)

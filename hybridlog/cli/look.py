@@ -11,7 +11,9 @@ from hybridlog.cli.asking import question
 from hybridlog.cli.observed import observed_fields
 from hybridlog.cli.opening import opened
 from hybridlog.cli.segment import show_segment
+from hybridlog.latched import depth_of
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.messages import REDUCED, Channel
 
 if TYPE_CHECKING:
     from hybridlog.query.plan import Lane
@@ -56,18 +58,24 @@ def _line(entry: RecordingEntry, *, narrow: bool) -> list[str]:
     if entry.name != entry.id:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
+    known = not _is_unknown(entry)
     start = output.short_time(span[0], minutes=narrow) if span else "-"
     cells = [
         entry.id,
         start,
         output.short_duration(span[1] - span[0]) if span else "-",
-        str(entry.messages),
+        str(entry.messages) if known else "-",
         ", ".join(notes),
     ]
     if not narrow:
-        cells.insert(3, str(len({c.topic for c in entry.channels})))
-        cells.insert(5, output.size(entry.stored_bytes))
+        cells.insert(3, str(len({c.topic for c in entry.channels})) if known else "-")
+        cells.insert(5, output.size(entry.stored_bytes) if known else "-")
     return cells
+
+
+def _is_unknown(entry: RecordingEntry) -> bool:
+    """What a recording holds is written into the catalog when a segment is sealed."""
+    return entry.status == "open" and not entry.channels
 
 
 def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_json: bool) -> None:
@@ -245,19 +253,22 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     span = entry.span
     losses = coverage.losses_of(entry)
     source = entry.source
+    status = _STATUS.get(entry.status, entry.status)
+    if entry.status == "open":
+        status += f"; `hybridlog top {entry.id}` shows it"
+    held = (
+        f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
+        f"{output.counted(entry.chunks, 'chunk')}"
+    )
     rows = [
         ("name", entry.name),
-        ("status", _STATUS.get(entry.status, entry.status)),
+        ("status", status),
         ("source", _source(source)),
         ("start", format_time(span[0]) if span else "-"),
         ("last", format_time(span[1]) if span else "-"),
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
-        ("messages", str(entry.messages)),
-        (
-            "stored",
-            f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
-            f"{output.counted(entry.chunks, 'chunk')}",
-        ),
+        ("messages", "-" if _is_unknown(entry) else str(entry.messages)),
+        ("stored", "-" if _is_unknown(entry) else held),
         ("coverage", coverage.describe(entry, losses)),
         *(("", coverage.line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
@@ -295,7 +306,9 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[
         notes.append(f"not indexed: {channel.reason}")
     if stats.unreadable:
         notes.append(f"{stats.unreadable} unreadable")
-    if channel.metadata.get("latching") == "1":
+    if channel.message_encoding == REDUCED:
+        notes.append("fields only")
+    if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
     skew = "-" if indexed else "?"
     if stats.stamped:

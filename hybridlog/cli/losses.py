@@ -41,6 +41,12 @@ def show(
     else:
         named = output.counted(len(entries), "recording")
         output.say(f"Nothing is missing from {named}, as far as the ledger knows.")
+    for entry in entries:
+        if entry.status == "open":
+            output.note(
+                f"{entry.id} is still being recorded: what it lacks stands here at its end, and "
+                f"`hybridlog top {entry.id}` shows it now."
+            )
 
 
 def _print(rows: Sequence[dict[str, Any]], entries: Sequence[RecordingEntry]) -> None:

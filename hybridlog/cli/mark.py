@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybridlog.cli import output
+from hybridlog_storage.errors import UsageError
 
 
 def run(
@@ -16,6 +17,8 @@ def run(
     from hybridlog.live.door import choose, visit
     from hybridlog.store import store_path
 
+    if not text.strip():
+        raise UsageError("A mark needs a text: say what happened.")
     pairs = tags_of(tags)
     path = store_path(store)
     for name in choose(path, recordings):
@@ -29,6 +32,8 @@ def fire(name: str, recorders: Sequence[str], store: Path | None, *, quiet: bool
     from hybridlog.live.door import choose, visit
     from hybridlog.store import store_path
 
+    if not name.strip():
+        raise UsageError("A trigger needs a name: say why, in a word.")
     path = store_path(store)
     for recorder in choose(path, recorders):
         answer = visit(path, recorder, "trigger", reason=name)

@@ -18,7 +18,7 @@ Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
 _UNITS = ("B", "kB", "MB", "GB", "TB")
-_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgG]?)(i?)[bB]?\s*")
+_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
 
 def console(*, error: bool = False) -> Console:
@@ -106,6 +106,12 @@ def _escaped(code: int) -> str:
     return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
+def quoted(text: str) -> str:
+    """What was typed, in quotes; bytes that are no text are shown as such."""
+    raw = text.encode("utf-8", "surrogateescape")
+    return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
+
+
 def say(text: str = "") -> None:
     """A line of the answer, on standard output."""
     print(printable(text))  # noqa: T201
@@ -178,7 +184,7 @@ def parse_size(text: str) -> int:
         raise UsageError(f"{text!r} is no size: write 65536, 500kB or 1MiB.")
     number, prefix, binary = match.groups()
     base = 1024 if binary else 1000
-    power = " kmg".index(prefix.lower()) if prefix else 0
+    power = " kmgt".index(prefix.lower()) if prefix else 0
     return int(float(number) * base**power)
 
 

@@ -24,7 +24,7 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.cli.record_live import LiveChoices
+    from hybridlog.cli.live_choices import LiveChoices
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
@@ -54,10 +54,12 @@ class Choices:
 
 def run(paths: list[Path], live: LiveChoices, choices: Choices) -> None:
     """Record logs, or a running robot."""
-    from hybridlog.cli import record_live
+    from hybridlog.cli.live_choices import check_choices
 
-    record_live.refuse_with_logs(live, paths)
+    check_choices(live, paths)
     if live.any_source:
+        from hybridlog.cli import record_live
+
         _refuse_for_live(choices)
         record_live.run(live, lambda: _live_options(live, choices), choices)
     else:
@@ -75,7 +77,7 @@ def _refuse_for_live(choices: Choices) -> None:
 
 
 def _live_options(live: LiveChoices, choices: Choices) -> RecorderOptions:
-    from hybridlog.cli.record_live import recorder_options
+    from hybridlog.cli.live_choices import recorder_options
 
     return recorder_options(
         live,
@@ -173,7 +175,7 @@ def _record_one(
             )
         _check_not_empty(report, source, store, options)
     for pattern in matcher.unused() if matcher is not None else ():
-        output.note(f"{path}: no topic fits {pattern!r}.")
+        output.note(f"{path}: no topic fits {output.quoted(pattern)}.")
     return report
 
 

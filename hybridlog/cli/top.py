@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.live_table import LiveTable, drawn
 from hybridlog.cli.opening import opened
+from hybridlog.cli.stopping import Stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ def run(
     path = store_path(store)
     (name,) = choose(path, [] if recording is None else [recording])
     on_screen = not as_json and sys.stdout.isatty() and not once
-    with ExitStack() as held:
+    with _left_by_ctrl_c(), ExitStack() as held:
         database = None
         if asked:
             opened_store = held.enter_context(opened(store, mongo, needs_database=True))
@@ -61,7 +63,11 @@ def run(
         for raw in states(path, name, _EVERY_S):
             if not raw:
                 continue  # it has only just started
-            values = [] if database is None else _values(database, name, raw, asked, span)
+            values = []
+            if asked and raw.get("snapshots") is not None:
+                values = _values_of_ring(path, name, raw, asked, span)
+            elif database is not None:
+                values = _values(database, name, raw, asked, span)
             if as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
@@ -70,8 +76,18 @@ def run(
                 output.console().print(drawn(_state(raw), rows=_ALL_ROWS, below=_lines(values)))
             if once or not (as_json or on_screen):
                 return
-    if not as_json:
-        output.note(f"{name} has ended.")
+        if not as_json:
+            output.note(f"{name} has ended.")
+
+
+@contextmanager
+def _left_by_ctrl_c() -> Iterator[None]:
+    """Who has watched long enough presses Ctrl-C: nothing is interrupted by that."""
+    try:
+        yield
+    except Stopped as stopped:
+        if stopped.number != signal.SIGINT:
+            raise
 
 
 def _field(text: str) -> _Field:
@@ -89,16 +105,11 @@ def _values(
     span: int,
 ) -> list[dict[str, Any]]:
     """Least, mean and greatest of each field in the last seconds, out of the index."""
-    from hybridlog.query.topics import resolve
     from hybridlog_storage.collection_names import collection_of
 
-    topics = [topic["topic"] for topic in state["topics"]]
     since = time.time_ns() - span
     found = []
-    for field in fields:
-        (topic, *others) = resolve([field.topic], topics)
-        if others:
-            raise UsageError(f"{field.topic!r} fits several topics: name one.")
+    for topic, field in _resolved(state, fields):
         value = f"${field.path}"
         group = {
             "_id": None,
@@ -118,6 +129,44 @@ def _values(
     return found
 
 
+def _values_of_ring(
+    store: Path,
+    recorder: str,
+    state: Mapping[str, Any],
+    fields: Sequence[_Field],
+    span: int,
+) -> list[dict[str, Any]]:
+    """The same out of the memory of a recorder that stores nothing until it must."""
+    from hybridlog.live.door import visit
+
+    since = time.time_ns() - span
+    return [
+        {
+            "topic": topic,
+            "field": field.path,
+            **visit(store, recorder, "numbers", topic=topic, path=field.path, begin=since),
+        }
+        for topic, field in _resolved(state, fields)
+    ]
+
+
+def _resolved(state: Mapping[str, Any], fields: Sequence[_Field]) -> Iterator[tuple[str, _Field]]:
+    """Each field with the full name of its topic.
+
+    Raises:
+        TopicError: No topic has that name.
+        UsageError: Several have.
+    """
+    from hybridlog.query.topics import resolve
+
+    topics = [topic["topic"] for topic in state["topics"]]
+    for field in fields:
+        (topic, *others) = resolve([field.topic], topics)
+        if others:
+            raise UsageError(f"{field.topic!r} fits several topics: name one.")
+        yield topic, field
+
+
 def _lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = []
     for row in values:
@@ -130,6 +179,8 @@ def _lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _number(value: object) -> str:
+    if value is None:
+        return "-"  # such as the mean of texts
     return f"{value:.6g}" if isinstance(value, int | float) else str(value)
 
 

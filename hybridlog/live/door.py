@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import threading
 import time
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """What a request gets; raises `HybridlogError` to refuse."""
 
+_ODD = re.compile(r"[^A-Za-z0-9._-]+")
 _SIGNS = "recorders"
 _SUFFIX = ".json"
 
@@ -157,7 +159,12 @@ def visit(store: Path, name: str, ask: str, **content: Any) -> dict[str, Any]:
 
 
 def _sign(store: Path, name: str) -> Path:
-    return store / _SIGNS / f"{name}{_SUFFIX}"
+    return store / _SIGNS / f"{_as_id(name)}{_SUFFIX}"
+
+
+def _as_id(name: str) -> str:
+    """What a name becomes in an id, and in the name of a file."""
+    return _ODD.sub("-", name).strip("-.") or "-"
 
 
 def _gone(name: str) -> str:
@@ -216,18 +223,16 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
 
     Args:
         store: The store's directory.
-        named: As the user has named them.
+        named: As the user has named them: id or name of the recording, or the beginning of
+            the id. A recorder with a ring goes by the name that its snapshots will have.
 
     Raises:
-        UsageError: There is none, or there are several and none was named.
+        UsageError: There is none, or there are several and none was named, or a name fits
+            none or several.
     """
     there = running(store)
     if named:
-        unknown = [name for name in named if name not in there]
-        if unknown:
-            what = ", ".join(there) or "nothing"
-            raise UsageError(f"{unknown[0]!r} is not being recorded now; what is: {what}.")
-        return list(named)
+        return list(dict.fromkeys(_named(name, there) for name in named))
     if not there:
         raise UsageError(
             "Nothing is being recorded into this store now; start with `hybridlog record`."
@@ -235,3 +240,25 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
     if len(there) > 1:
         raise UsageError(f"Several recordings are being made: name one of {', '.join(there)}.")
     return there
+
+
+def _named(name: str, there: Sequence[str]) -> str:
+    """The running recorder that a name stands for.
+
+    Raises:
+        UsageError: None, or several.
+    """
+    wanted = _as_id(name)
+    ring = re.compile(rf"{re.escape(wanted)}-ring-\d+")
+    fitting = (
+        [one for one in there if one == name]
+        or [one for one in there if one == wanted]
+        or [one for one in there if ring.fullmatch(one)]
+        or [one for one in there if name and one.startswith(name)]
+    )
+    if len(fitting) > 1:
+        raise UsageError(f"{name!r} may be {', '.join(fitting)}: write more of it.")
+    if not fitting:
+        what = ", ".join(there) or "nothing"
+        raise UsageError(f"{name!r} is not being recorded now; what is: {what}.")
+    return fitting[0]

@@ -110,15 +110,18 @@ class LiveSource(ABC):
     Attributes:
         kind: `ROS 1`, `ROS 2`, `Foxglove`, `replay`.
         address: What was connected to, as the catalog shows it.
+        was_reached: Whether somebody has answered there so far; always, where nobody has to.
     """
 
     kind: str
     address: str
+    was_reached: bool = True
 
     def check(self) -> None:  # noqa: B027 - most can say nothing before they start
         """Refuse what `start` would refuse, before anything is made for a recording.
 
         Raises:
+            UsageError: An address or another setting that is none.
             SourceError: It can never work.
             MissingDependencyError: What it needs is not installed.
         """
@@ -131,7 +134,8 @@ class LiveSource(ABC):
         not raise: the source says so, and tries again with growing pauses.
 
         Raises:
-            SourceError: It can never work: an address that is none, a file that is no log.
+            UsageError: An address or another setting that is none.
+            SourceError: It can never work: a file that is no log.
             MissingDependencyError: What it needs is not installed.
         """
 

@@ -54,6 +54,7 @@ class FoxgloveSource(LiveSource):
             raise UsageError("the largest message must be allowed at least 1 MiB")
         self._url = url
         self.address = without_user(url)
+        self.was_reached = False
         self._limit = max_message_bytes
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -62,7 +63,7 @@ class FoxgloveSource(LiveSource):
         """Refuse an address that is none.
 
         Raises:
-            SourceError: It is none.
+            UsageError: It is none.
         """
         parse_address(self._url)
 
@@ -70,7 +71,7 @@ class FoxgloveSource(LiveSource):
         """Begin to listen; a server that is not there yet is waited for.
 
         Raises:
-            SourceError: The address is none.
+            UsageError: The address is none.
             MissingDependencyError: `websockets` is not installed.
         """
         address = parse_address(self._url)
@@ -80,9 +81,12 @@ class FoxgloveSource(LiveSource):
             raise MissingDependencyError(
                 "recording from Foxglove needs websockets: pip install 'hybridlog[foxglove]'"
             ) from error
-        client = Client(sink, address, self._limit, self._stop)
+        client = Client(sink, address, self._limit, self._stop, self._reached)
         self._thread = threading.Thread(target=client.run, name="hybridlog-foxglove", daemon=True)
         self._thread.start()
+
+    def _reached(self) -> None:
+        self.was_reached = True
 
     def stop(self) -> None:
         """Say goodbye, take what is under way, and close.

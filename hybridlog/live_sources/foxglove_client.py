@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Final
 
 from hybridlog.live_sources.base import Sink
@@ -24,13 +25,19 @@ class Client:
         address: The server.
         max_message_bytes: Largest payload that is taken.
         stop: Set when it shall stop.
+        reached: Called each time the server has let us in.
 
     Raises:
-        SourceError: The address is none.
+        UsageError: The address is none.
     """
 
     def __init__(
-        self, sink: Sink, address: Address, max_message_bytes: int, stop: threading.Event
+        self,
+        sink: Sink,
+        address: Address,
+        max_message_bytes: int,
+        stop: threading.Event,
+        reached: Callable[[], None],
     ) -> None:
         websocket_uri(address)
         self._sink = sink
@@ -38,6 +45,7 @@ class Client:
         self._address = address
         self._limit = max_message_bytes
         self._stop = stop
+        self._reached = reached
         self._missed: dict[str, int] = {}
 
     def run(self) -> None:
@@ -71,6 +79,7 @@ class Client:
         try:
             opened = open_websocket(self._address, self._stop.is_set)
             with opened.socket:
+                self._reached()
                 connection = Connection(opened, self._limit, self._stop.is_set)
                 session = Session(self._sink, self._voice, connection.send, self._missed)
                 try:

@@ -17,7 +17,7 @@ from websockets.typing import Subprotocol
 from websockets.uri import WebSocketURI, parse_uri
 
 from hybridlog.live_sources.foxglove_protocol import SUBPROTOCOLS, Address, PeerError
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import UsageError
 
 TICK_S: Final = 0.25
 """How soon a connection that is silent sees that it shall stop."""
@@ -49,12 +49,12 @@ def websocket_uri(address: Address) -> WebSocketURI:
     """The address as websockets wants it.
 
     Raises:
-        SourceError: It finds fault with it.
+        UsageError: It finds fault with it.
     """
     try:
         return parse_uri(address.url)
     except (InvalidURI, ValueError) as error:
-        raise SourceError(
+        raise UsageError(
             f"{address.shown}: no address of a Foxglove server; give one like ws://robot:8765"
         ) from error
 

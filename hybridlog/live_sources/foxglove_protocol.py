@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol, TypeGuard
 from urllib.parse import urlsplit
 
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
@@ -108,27 +108,27 @@ def parse_address(url: str) -> Address:
     """Parses the address of a server.
 
     Raises:
-        SourceError: It is none.
+        UsageError: It is none.
     """
     cure = "give an address like ws://robot:8765"
     shown = without_user(url)
     if not url.isprintable() or " " in url:
-        raise SourceError(f"{shown}: no address of a Foxglove server; {cure}")
+        raise UsageError(f"{shown}: no address of a Foxglove server; {cure}")
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError as error:
-        raise SourceError(f"{shown}: no address of a Foxglove server ({error}); {cure}") from error
+        raise UsageError(f"{shown}: no address of a Foxglove server ({error}); {cure}") from error
     if parts.scheme not in _PORTS:
-        raise SourceError(f"{shown}: does not begin with ws:// or wss://; {cure}")
+        raise UsageError(f"{shown}: does not begin with ws:// or wss://; {cure}")
     if not host:
-        raise SourceError(f"{shown}: names no host; {cure}")
+        raise UsageError(f"{shown}: names no host; {cure}")
     if parts.fragment:
-        raise SourceError(f"{shown}: an address of a server has no part behind '#'; {cure}")
+        raise UsageError(f"{shown}: an address of a server has no part behind '#'; {cure}")
     if port == 0:
-        raise SourceError(f"{shown}: nobody can listen on port 0; {cure}")
+        raise UsageError(f"{shown}: nobody can listen on port 0; {cure}")
     if parts.username is not None and parts.password is None:
-        raise SourceError(
+        raise UsageError(
             f"{shown}: a user without a password; give both "
             "(wss://user:password@robot:8765) or none"
         )

@@ -117,6 +117,7 @@ class Session:
         """Take a message."""
         route = self._routes.get(subscription)
         if route is None:
+            self._left_out("of a subscription that we do not have")
             self._voice.complain(
                 "sends messages of a subscription that we do not have; they are left out"
             )
@@ -155,7 +156,13 @@ class Session:
 
     def broken(self, reason: str) -> None:
         """A binary message that cannot be what it says."""
+        self._left_out("too short to be a message")
         self._voice.complain(f"sends {reason}; it is left out")
+
+    def _left_out(self, detail: str) -> None:
+        """A message of nobody knows which topic is a row as well."""
+        now = time.time_ns()
+        self._sink.lost("", Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
 
     def _topic_of(self, subscription: int) -> str | None:
         route = self._routes.get(subscription)

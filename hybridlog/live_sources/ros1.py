@@ -21,8 +21,9 @@ from hybridlog.live_sources.ros1_reader import Reader
 from hybridlog.live_sources.ros1_rpc import RpcServer
 from hybridlog.live_sources.ros1_slave import listen, methods, uri_of
 from hybridlog.live_sources.ros1_subscription import Context
+from hybridlog.live_sources.ros1_troubles import Troubles
 from hybridlog.live_sources.ros1_wire import shown
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -63,6 +64,7 @@ class Ros1Source(LiveSource):
         poll_s: float = 1.0,
     ) -> None:
         self.address = master_uri or os.environ.get("ROS_MASTER_URI") or _DEFAULT_URI
+        self.was_reached = False
         self.caller = f"/hybridlog_{os.getpid()}_{secrets.token_hex(4)}"
         self._max_message_bytes = max_message_bytes
         self._poll_s = poll_s
@@ -75,7 +77,7 @@ class Ros1Source(LiveSource):
         """Refuses an address that is none.
 
         Raises:
-            SourceError: The master's address is none.
+            UsageError: The master's address is none.
         """
         self._endpoint()
 
@@ -83,7 +85,7 @@ class Ros1Source(LiveSource):
         """Begins to follow the master, which need not be there yet.
 
         Raises:
-            SourceError: The master's address is none.
+            UsageError: The master's address is none.
         """
         endpoint = self._endpoint()
         self._thread = threading.Thread(
@@ -104,9 +106,13 @@ class Ros1Source(LiveSource):
         try:
             return endpoint_of(self.address, _DEFAULT_PORT)
         except PeerError as error:
-            raise SourceError(
-                f"{error}: where is the ROS master? Say it with --ros1 or ROS_MASTER_URI"
+            raise UsageError(
+                f"{error}: a ROS master's looks like {_DEFAULT_URI}; say it with --ros1 or "
+                "ROS_MASTER_URI"
             ) from error
+
+    def _reached(self) -> None:
+        self.was_reached = True
 
     def _run(self, sink: Sink, uri: str) -> None:
         """The thread of the event loop."""
@@ -165,11 +171,14 @@ class Ros1Source(LiveSource):
 
         network = Network()
         listening, host = await listen(network, os.environ, sink.say)
-        graph = Graph(Master(network, uri, self.caller, uri_of(host, listening)), uri, self._poll_s)
+        master = Master(network, uri, self.caller, uri_of(host, listening))
+        graph = Graph(master, uri, self._poll_s, self._reached)
         server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
         reader = Reader(end)
+        troubles = Troubles(sink.say)
         context = Context(
-            network, self.caller, sink, reader, self._max_message_bytes, spawn, graph.hint
+            *(network, self.caller, sink, reader, self._max_message_bytes),
+            *(spawn, graph.hint, troubles),
         )
         reader.start()
         try:
@@ -183,4 +192,5 @@ class Ros1Source(LiveSource):
                 await asyncio.wait(tuple(tasks), timeout=1)
             listening.close()
             reader.stop()
+            troubles.tell()
             await graph.farewell()

@@ -42,12 +42,16 @@ class Graph:
         master: Whom to ask.
         uri: Its address, for people.
         poll_s: How often it is asked, seconds.
+        reached: Called each time it has answered.
     """
 
-    def __init__(self, master: Master, uri: str, poll_s: float) -> None:
+    def __init__(
+        self, master: Master, uri: str, poll_s: float, reached: Callable[[], None]
+    ) -> None:
         self._master = master
         self._uri = uri
         self._poll_s = poll_s
+        self._reached = reached
         self._subscriptions: dict[str, Subscription] = {}
         self._types: dict[str, str] = {}
         self._listed: dict[str, frozenset[str]] = {}
@@ -103,6 +107,7 @@ class Graph:
         hinted, self._hinted = self._hinted, set()
         try:
             state = await self._master.state()
+            self._reached()
             await self._learn_types(state)
             self._choose(context, state)
             stale = [

@@ -6,7 +6,14 @@ import asyncio
 import socket
 from typing import Final
 
-from hybridlog.live_sources.ros1_network import PATIENCE_S, Endpoint, Network, PeerError
+from hybridlog.live_sources.ros1_network import (
+    PATIENCE_S,
+    Endpoint,
+    Network,
+    PeerError,
+    UnreachedError,
+    reason_of,
+)
 from hybridlog.live_sources.ros1_rpc import call
 from hybridlog.live_sources.ros1_wire import (
     ANY,
@@ -43,11 +50,16 @@ async def subscribe(
         of the publisher's header.
 
     Raises:
-        PeerError: The publisher refuses, or does not speak as it should.
-        OSError: It cannot be reached, or hangs up.
+        UnreachedError: The publisher cannot be reached.
+        PeerError: It refuses, or does not speak as it should.
+        OSError: It hangs up.
     """
     protocol = await call(network, uri, "requestTopic", caller, topic, [["TCPROS"]])
-    connected = await network.connect(_place_of(protocol))
+    place = _place_of(protocol)
+    try:
+        connected = await network.connect(place)
+    except OSError as error:
+        raise UnreachedError(f"{shown(str(place))}: {reason_of(error)}") from error
     try:
         for option in _KEEPALIVE:
             connected.setsockopt(*option)

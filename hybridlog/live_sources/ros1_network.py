@@ -27,6 +27,10 @@ class PeerError(Exception):
     """A peer that cannot be reached or does not speak as it should; says what is wrong."""
 
 
+class UnreachedError(PeerError):
+    """A peer that does not answer at all."""
+
+
 class Endpoint(NamedTuple):
     """Where a program listens.
 

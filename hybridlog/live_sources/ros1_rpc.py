@@ -20,6 +20,7 @@ from hybridlog.live_sources.ros1_network import (
     Endpoint,
     Network,
     PeerError,
+    UnreachedError,
     endpoint_of,
     reason_of,
 )
@@ -49,7 +50,8 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
     """Calls a method of the master or of a node, and gives what stands behind its status.
 
     Raises:
-        PeerError: No answer within 10 s, or one that makes no sense.
+        UnreachedError: No answer within 10 s.
+        PeerError: An answer that makes no sense.
         RefusedError: The answer is no.
     """
     endpoint = endpoint_of(uri)
@@ -64,7 +66,7 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
             with await network.connect(endpoint) as connected:
                 answer = await _exchange(connected, head.encode("ascii") + body)
     except OSError as error:
-        raise PeerError(reason_of(error)) from error
+        raise UnreachedError(reason_of(error)) from error
     values, _ = _parsed(answer)
     return _value_of(values[0] if values else None)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live_sources.ros1_handshake import subscribe
-from hybridlog.live_sources.ros1_network import PeerError, reason_of
+from hybridlog.live_sources.ros1_network import PeerError
 from hybridlog.live_sources.ros1_stream import Stream
 from hybridlog.live_sources.ros1_wire import ANY, channel_of, shown
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hybridlog.live_sources.base import Sink
     from hybridlog.live_sources.ros1_network import Network
     from hybridlog.live_sources.ros1_reader import Reader
+    from hybridlog.live_sources.ros1_troubles import Troubles
     from hybridlog_storage.messages import Channel
 
 _FIRST_PAUSE_S: Final = 0.25
@@ -39,6 +40,7 @@ class Context:
         max_message_bytes: Longest message that is believed.
         spawn: Runs a coroutine until the source stops.
         look_again: Asks the master for the publishers of a topic soon.
+        troubles: Tells of publishers from which nothing can be had.
     """
 
     network: Network
@@ -48,6 +50,7 @@ class Context:
     max_message_bytes: int
     spawn: Callable[[Coroutine[None, None, None]], None]
     look_again: Callable[[str], None]
+    troubles: Troubles
 
 
 class Subscription:
@@ -149,17 +152,18 @@ class _Link:
 
     Attributes:
         is_listed: The master lists it.
-        is_up: It is connected, or nothing speaks against it yet.
+        is_up: It is connected.
         has_ended: `run` has returned.
     """
 
     def __init__(self, subscription: Subscription, uri: str) -> None:
         self.is_listed = True
-        self.is_up = True
+        self.is_up = False
         self.has_ended = False
         self._subscription = subscription
         self._uri = uri
         self._failures = 0
+        self._has_told = False
         self._hurry = asyncio.Event()
 
     def list(self, *, is_listed: bool) -> None:
@@ -180,7 +184,10 @@ class _Link:
                 if not self.is_listed:
                     return
                 self._failures += 1
-                self._complain(context, error)
+                # One failure is nothing: nodes that end are listed a little longer than
+                # they live.
+                if self._failures >= 2:
+                    context.troubles.note(self._uri, topic, error)
             else:
                 channel = self._subscription.channel(fields)
                 if channel is None:
@@ -191,15 +198,6 @@ class _Link:
             # It may have come back under another address, which only the master knows.
             context.look_again(topic)
             await self._pause()
-
-    def _complain(self, context: Context, error: Exception) -> None:
-        # One failure is nothing: nodes that end are listed a little longer than they live.
-        if self._failures >= 2:
-            context.sink.say(
-                f"{shown(self._subscription.topic)}: nothing can be had from its publisher at "
-                f"{shown(self._uri)}: {reason_of(error)}; trying on. Is it dead (`rosnode "
-                "cleanup`), or on a computer whose name is not known here (set ROS_IP there)?"
-            )
 
     async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
         """Has a connection read until it ends."""
@@ -214,13 +212,18 @@ class _Link:
             loop.call_soon_threadsafe(settle, failure)
 
         began = loop.time()
-        context.reader.add(
-            Stream(connected, channel, context.sink, context.max_message_bytes, closed)
-        )
+        stream = Stream(connected, channel, context.sink, context.max_message_bytes, closed)
         self._set_up(is_up=True)
+        context.reader.add(stream)
         failure = await ended
-        self._failures = 0 if loop.time() - began > _STABLE_S else self._failures + 1
-        if failure:
+        if loop.time() - began > _STABLE_S:
+            self._failures, self._has_told = 0, False
+            context.troubles.over(self._uri, self._subscription.topic)
+        else:
+            self._failures += 1
+        # A publisher that breaks off again and again is told of once; the ledger has all.
+        if failure and not self._has_told:
+            self._has_told = True
             name = channel.metadata.get("callerid", "a node without a name")
             context.sink.say(
                 f"{shown(self._subscription.topic)}: lost the connection to {shown(name)} at "

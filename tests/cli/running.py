@@ -50,7 +50,7 @@ def run(*arguments: object, store: Path | None = None, code: int | None = 0, **e
     if store is not None:
         env["HYBRIDLOG_STORE"] = str(store)
     ended = subprocess.run(
-        [*COMMAND, *map(str, arguments)],
+        [*COMMAND, *(a if isinstance(a, bytes) else str(a) for a in arguments)],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         env=environment(**env),
@@ -67,6 +67,23 @@ def run(*arguments: object, store: Path | None = None, code: int | None = 0, **e
     if code is not None:
         assert done.code == code, (done.code, done.out[-2000:], done.err[-2000:])
     return done
+
+
+def complete(words: str) -> list[str]:
+    """What bash would offer for the last word."""
+    ended = subprocess.run(
+        COMMAND,
+        capture_output=True,
+        text=True,
+        env=environment(
+            _HYBRIDLOG_COMPLETE="complete_bash",
+            COMP_WORDS=f"hybridlog {words}",
+            COMP_CWORD=str(len(words.split())),
+        ),
+        check=True,
+    )
+    assert ended.stderr == ""
+    return ended.stdout.split()
 
 
 def start(*arguments: object, output: IO[bytes], wrapper: tuple[str, ...] = ()) -> Any:

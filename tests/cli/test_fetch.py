@@ -15,6 +15,8 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 
+from hybridlog.cli.fetch import closing_line
+from hybridlog.query.plan import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
 from . import odd_log
@@ -392,3 +394,8 @@ def test_json_is_asked_as_it_stands(store: Path) -> None:
     done = run("fetch", "-t", "json", "--where", "a == 1", "-n", "1", store=store)
     assert json.loads(done.out)["b"] == [1, 2]
     assert run("fetch", "-t", "json", "--where", "a == 2", store=store).out == ""
+
+
+def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
+    closing_line(Counters(messages=251, reduced=12), 0.1, count=False)
+    assert capsys.readouterr().err.startswith("239 messages, ")

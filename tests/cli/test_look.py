@@ -7,6 +7,10 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
+from hybridlog.cli.look import _channel_row
+from hybridlog.cli.output import parse_size, quoted
+from hybridlog_storage.catalog import ChannelEntry
+from hybridlog_storage.messages import REDUCED
 from tests.independent import read_bag
 
 from .odd_log import HOSTILE_NAME
@@ -155,3 +159,20 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
     found = run("info", "odd", "--json", store=store)
     assert HOSTILE_NAME in {c["topic"] for c in found.json["channels"]}
     assert "\x1b" not in found.out
+
+
+def test_notes_of_a_channel() -> None:
+    def notes(encoding: str, **metadata: str) -> str:
+        entry = ChannelEntry(1, "/a", encoding, None, "T", metadata, False, None)
+        return _channel_row(entry, indexed=True, narrow=False)[-1]
+
+    assert notes("cdr", offered_qos_profiles="- durability: 1\n  depth: 1") == "latched"
+    assert notes("cdr", offered_qos_profiles="- durability: 2") == ""
+    assert notes("ros1", latching="1") == "latched"
+    assert notes(REDUCED) == "fields only"
+
+
+def test_sizes_and_names_as_they_are_typed() -> None:
+    assert parse_size("100TB") == 10**14
+    assert parse_size("1 TiB") == 1 << 40
+    assert quoted("b\udcff\x1b") == "'b\\xff\\x1b'"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import time
@@ -14,8 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
-from tests.cli.running import COMMAND, environment, run
+from hybridlog.cli.app import app
+from hybridlog.cli.live_table import closing_rows, summary
+from hybridlog.live.recorder import RecorderState
+from hybridlog.recorder import RecordReport
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import UsageError
+from tests.cli.running import COMMAND, complete, environment, run
 from tests.independent import read
 
 SMALL_S = 5
@@ -61,13 +70,20 @@ def until_it_speaks(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 def end(process: subprocess.Popen[str], number: int | None = signal.SIGINT) -> dict[str, Any]:
     """End it as Ctrl-C does; its report."""
+    return end_and_hear(process, number)[0]
+
+
+def end_and_hear(
+    process: subprocess.Popen[str], number: int | None = signal.SIGINT
+) -> tuple[dict[str, Any], str]:
+    """End it as Ctrl-C does; its report, and what it said besides."""
     if number is not None:
         process.send_signal(number)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, (process.returncode, err)
     assert "Traceback" not in err, err
     report: dict[str, Any] = json.loads(out.splitlines()[-1])["report"]
-    return report
+    return report, err
 
 
 def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
@@ -139,10 +155,15 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
 
 def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
-    with recorder(store, "--replay", logs / "robot.bag", "--speed", 0.3) as process:
+    with recorder(
+        store, "--replay", logs / "robot.bag", "--speed", 0.2, "--name", "first drive"
+    ) as process:
         until_it_speaks(process)
-        run("mark", "gripper slipped", "--tag", "trial=7", store=store)
-        state = run("top", "--json", "--once", "--field", "base/scan:ranges.min", store=store).json
+        # By name, by the beginning of the id, and by nothing at all.
+        run("mark", "gripper slipped", "--tag", "trial=7", "-r", "first drive", store=store)
+        state = run(
+            "top", "first-d", "--json", "--once", "--field", "base/scan:ranges.min", store=store
+        ).json
         assert state["messages"] > 0
         (field,) = state["fields"]
         assert field["topic"] == "/base/scan"
@@ -153,6 +174,10 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         assert "messages/s" in shown
         refused = run("trigger", "now", store=store, code=2)
         assert "--ring" in refused.err
+        assert "is not being recorded now" in run("mark", "x", "-r", "b", store=store, code=2).err
+        assert complete(f"mark x --store {store} -r fi") == ["first-drive"]
+        assert_it_is_told_as_unfinished(store)
+        assert_ctrl_c_leaves_top(store)
         end(process)
     found = run(
         "fetch", "-t", "marks", "--where", "tags.trial = '7'", "--format", "jsonl", store=store
@@ -162,19 +187,47 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         assert "Nothing is being recorded" in run(*command, store=store, code=2).err
 
 
+def assert_it_is_told_as_unfinished(store: Path) -> None:
+    (entry,) = run("ls", store=store).lines[1:]
+    assert entry.split()[:6] == ["first-drive", "-", "-", "-", "-", "-"]
+    assert "being recorded" in entry
+    info = run("info", store=store).out
+    assert "being recorded; `hybridlog top first-drive` shows it" in info
+    assert re.search(r"(?m)^messages +-$", info)
+    assert "first-drive is still being recorded" in run("losses", store=store).err
+    refused = run("fetch", "-t", "/imu/data", store=store, code=2)
+    assert "first-drive is still being recorded" in refused.err
+
+
+def assert_ctrl_c_leaves_top(store: Path) -> None:
+    watching = subprocess.Popen(
+        [*COMMAND, "top", "--json", "--store", str(store)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    assert watching.stdout is not None
+    assert watching.stdout.readline()
+    watching.send_signal(signal.SIGINT)
+    _, err = watching.communicate(timeout=30)
+    assert (watching.returncode, err) == (0, "")
+
+
 def test_a_ring_keeps_what_lies_around_a_trigger(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     with recorder(
         *(store, "--replay", logs / "robot.bag", "--speed", 0.3),
-        *("--ring", "30s", "--before", "1s", "--after", "1s"),
+        *("--ring", "30s", "--before", "1s", "--after", "1s", "--quiet", "--name", "the ring"),
     ) as process:
         until_it_speaks(process)
         time.sleep(2)
-        run("trigger", "bump", store=store)
+        run("trigger", "bump", "-r", "the ring", store=store)
         time.sleep(2.5)
         os.kill(process.pid, signal.SIGUSR1)
         time.sleep(1.5)
-        report = end(process)
+        report, said = end_and_hear(process)
+    assert said == ""  # snapshots are no trouble
     assert [r["tags"]["trigger"] for r in report["recordings"]] == ["bump", "SIGUSR1"]
     for entry in run("ls", "--json", store=store).json:
         assert 0 < entry["messages"] < report["messages_received"]
@@ -193,24 +246,112 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "Nothing to record"),
-        (["--replay", "{logs}/small.bag", "{logs}/small.bag"], "not both"),
-        (["--replay", "{logs}/small.bag", "--between", "+1s", "+2s"], "for logs"),
-        (["--replay", "{logs}/small.bag", "--throttle", "/a"], "wants a topic and a value"),
-        (["--replay", "{logs}/small.bag", "--throttle", "/a", "fast"], "is no rate"),
-        (["--replay", "{logs}/small.bag", "--priority", "/a", "urgent"], "no priority"),
-        (["--replay", "{logs}/small.bag", "--before", "1s"], "are for --ring"),
-        (["--replay", "{logs}/small.bag", "--ring", "1s", "--before", "2s"], "longer than --ring"),
-        (["--replay", "{logs}/small.bag", "--ring", "1s", "--trigger", "/a: x >"], "x >"),
-        (["--replay", "{logs}/small.bag", "--duration", "soon"], "soon"),
-        (["--replay", "{logs}/small.bag", "--max-size", "much"], "is no size"),
-        (["--replay", "{logs}/small.bag", "--split-duration", "0s"], "longer than no time"),
+        ("", "Nothing to record"),
+        ("--replay {bag} {bag}", "not both"),
+        ("--replay {bag} --between +1s +2s", "for logs"),
+        ("--replay {bag} --throttle /a", "(--throttle TOPIC RATE)"),
+        ("--replay {bag} --throttle /a --duration 1s", "(--throttle TOPIC RATE), not '/a'"),
+        ("--replay {bag} --priority /a --duration 1s", "(--priority TOPIC WORD), not '/a'"),
+        ("--replay {bag} --throttle /a fast", "is no rate"),
+        ("--replay {bag} --priority /a urgent", "no priority"),
+        ("--replay {bag} --before 1s", "are for --ring"),
+        ("--replay {bag} --ring 1s --before 2s", "longer than --ring"),
+        ("--replay {bag} --ring 0s", "--ring must be longer"),
+        ("--replay {bag} --ring 2d", "--ring must be at most a day"),
+        ("--replay {bag} --ring 1s --trigger '/a: x >'", "x >"),
+        ("--replay {bag} --duration soon", "soon"),
+        ("--replay {bag} --duration 0s", "--duration must be longer"),
+        ("--replay {bag} --max-size much", "--max-size: 'much' is no size"),
+        ("--replay {bag} --max-size 0", "--max-size must be at least 1 B"),
+        ("--replay {bag} --budget 5kB", "--budget must be at least 1 MiB"),
+        ("--replay {bag} --split-size 1", "--split-size must be at least 1 MiB"),
+        ("--replay {bag} --flush-interval 0s", "--flush-interval must be longer"),
+        ("--replay {bag} --split-duration 0s", "longer than no time"),
+        ("{bag} --duration 3s --throttle /a 5Hz", "--duration and --throttle are for a running"),
+        ("{bag} --ring 3s", "--ring is for a running robot"),
+        ("{bag} --split-size 5GB --qos f", "--qos and --split-size are for a running robot"),
+        ("--ros1 http://localhost:1 --qos f", "--qos is for --ros2"),
+        ("--ros1 http://localhost:1 --speed 2", "--speed is for --replay"),
+        ("--ros1 127.0.0.1:11311", "'127.0.0.1:11311' is no address of the form http://host:port"),
+        ("--ros1 localhost", "'localhost' is no address of the form http://host:port"),
+        ("--ros1 '' --duration 1s", "looks like http://host:11311"),
+        ("--ros1 {bag}", "looks like http://host:11311"),
+        ("--foxglove http://robot", "does not begin with ws://"),
+        ("--ros2 --qos /nowhere/qos.yaml", "--qos: /nowhere/qos.yaml: cannot be opened"),
     ],
 )
 def test_options_that_make_no_sense_leave_no_store(
-    logs: Path, tmp_path: Path, arguments: list[str], said: str
+    logs: Path, tmp_path: Path, arguments: str, said: str
 ) -> None:
     store = tmp_path / "store"
-    done = run("record", *(a.format(logs=logs) for a in arguments), store=store, code=2)
-    assert said in done.err, done.err
+    words = shlex.split(arguments.format(bag=logs / "small.bag"))
+    done = CliRunner().invoke(app, ["record", *words], env={"HYBRIDLOG_STORE": str(store)})
+    assert isinstance(done.exception, UsageError), done
+    assert said in str(done.exception)
     assert not store.exists()
+
+
+def test_nothing_is_left_is_told_and_a_disk_without_room_is_code_7(
+    logs: Path, tmp_path: Path
+) -> None:
+    arguments = ("record", "--replay", logs / "small.bag", "--speed", 20, "--reserve")
+    done = run(*arguments, "4000TB", "-q", store=tmp_path / "store", code=7)
+    assert "--reserve" in done.err
+    assert done.out == ""
+    done = run(*arguments, 0, "-t", "/imu/*", "-x", "/imu/*", store=tmp_path / "store")
+    assert "no topic is left" in done.err
+
+
+def test_a_damaged_log_is_told_when_it_is_replayed(logs: Path, tmp_path: Path) -> None:
+    done = run(
+        *("record", "--replay", logs / "torn.bag", "--speed", 50, "--reserve", 0),
+        *("--throttle", "/nope", "5Hz", "--priority", b"b\xff", "low", "-t", "/nothing", "-t", "*"),
+        store=tmp_path / "store",
+        code=4,
+    )
+    assert re.search(r"(?m)^lost: unreadable +unknown \(any\)", done.out)
+    assert re.search(r"(?m)^hybridlog: messages lost, unreadable: .*torn\.bag, byte \d+", done.err)
+    assert "no topic fits '/nope' of --throttle" in done.err
+    assert "no topic fits 'b\\xff' of --priority" in done.err
+    assert "no topic fits '/nothing'" in done.err
+
+
+def test_a_robot_that_was_never_there_is_told(tmp_path: Path) -> None:
+    done = run(
+        *("record", "--ros1", "http://127.0.0.1:1", "--foxglove", "ws://127.0.0.1:1"),
+        *("--duration", "1s", "--reserve", 0),
+        store=tmp_path / "store",
+        code=3,
+    )
+    for address in ("http://127.0.0.1:1", "ws://127.0.0.1:1"):
+        assert f"hybridlog: {address} was never reached" in done.err
+    assert re.search(r"(?m)^lost +unknown, never reached: http", done.out)
+    assert "nothing was received" in run("info", store=tmp_path / "store").out
+
+
+def state_with(lost: dict[str, int], *, lag: int = 0, failure: str = "") -> RecorderState:
+    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, failure, 10**9, 10**6)
+
+
+@pytest.mark.parametrize(
+    ("known", "counts", "shown"),
+    [(0, [None], "unknown"), (5, [5, None], "at least 5"), (7, [7], "7")],
+)
+def test_a_number_of_losses_that_nobody_knows(
+    known: int, counts: list[int | None], shown: str
+) -> None:
+    rows = [{"topic": None, "cause": "unreadable", "count": count} for count in counts]
+    source = {"path": "x", "kind": "replay", "bytes": 0}
+    entry = RecordingEntry("r", 1, "r", {}, source, 0, "complete", {"losses": rows})
+    state = state_with({"unreadable": known})
+    found = dict(closing_rows(RecordReport(entry, [], 0, 0, None, 0, 1.0), state, []))
+    assert found["lost: unreadable"] == f"{shown} (any)"
+    assert "lost" not in found
+    if not known:
+        assert "lost unknown (unreadable unknown)" in summary(state)
+
+
+def test_an_index_that_lags_says_why() -> None:
+    failure = "MongoDB at localhost:1 does not answer. Is it running? See the log."
+    line = summary(state_with({}, lag=238, failure=failure))
+    assert "index 238 behind: MongoDB at localhost:1 does not answer ·" in line

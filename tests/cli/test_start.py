@@ -13,7 +13,7 @@ import pytest
 from hybridlog.cli.app import app
 from hybridlog.cli.main import EXIT_CODES
 
-from .running import COMMAND, environment, run
+from .running import COMMAND, complete, environment, run
 
 HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
 COMMANDS = [
@@ -103,23 +103,6 @@ def test_usage_names_what_is_wanted() -> None:
         assert words in run(command, "--help").out
 
 
-def complete(words: str) -> list[str]:
-    """What bash would offer for the last word."""
-    ended = subprocess.run(
-        COMMAND,
-        capture_output=True,
-        text=True,
-        env=environment(
-            _HYBRIDLOG_COMPLETE="complete_bash",
-            COMP_WORDS=f"hybridlog {words}",
-            COMP_CWORD=str(len(words.split())),
-        ),
-        check=True,
-    )
-    assert ended.stderr == ""
-    return ended.stdout.split()
-
-
 def test_completion(store: Path) -> None:
     assert complete(f"info --store {store} r") == ["robot"]
     assert complete(f"verify --store {store} o") == ["odd"]
@@ -129,6 +112,10 @@ def test_completion(store: Path) -> None:
     assert complete(f"fetch --store {store} --topic image_") == []
     assert complete(f"fetch --store {store} --recording odd --topic /base") == []
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
+    assert complete(f"losses --store {store} -t /base/s") == ["/base/scan"]
+    assert complete(f"record --store {store} --throttle /base/s") == ["/base/scan"]
+    assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
+    assert complete(f"trigger x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
     assert complete("info --store /nowhere r") == []
 

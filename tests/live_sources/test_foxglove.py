@@ -25,7 +25,7 @@ from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.foxglove import FoxgloveSource
 from hybridlog.live_sources.foxglove_numbers import HeaderNumbers
 from hybridlog.live_sources.foxglove_protocol import PeerError, parse_channel
-from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
+from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
 from tests.live_sources.heard import DEADLINE_S, Heard
 
@@ -224,7 +224,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ],
 )
 def test_an_address_that_is_none_is_refused_with_the_cure(url: str, words: str) -> None:
-    with pytest.raises(SourceError, match=r"wss?://") as caught:
+    with pytest.raises(UsageError, match=r"wss?://") as caught:
         FoxgloveSource(url).start(Heard())
     assert words in str(caught.value)
     assert str(caught.value).isprintable()
@@ -563,6 +563,11 @@ def test_nonsense_is_told_in_a_line_and_the_rest_goes_on(sent: bytes, words: str
     assert heard.said_of(words), heard.said
     assert all(line.startswith(server.url) and line.isprintable() for line in heard.said)
     assert all(len(line) < 400 for line in heard.said)
+    # What may have been a message is a row, too.
+    is_binary = sent[0] & 15 == Opcode.BINARY
+    rows = [(loss.topic, loss.cause, loss.count) for loss in heard.losses]
+    assert rows == ([("", Cause.UNREADABLE, 1)] if is_binary else [])
+    assert source.was_reached
 
 
 def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> None:

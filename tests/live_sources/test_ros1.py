@@ -14,9 +14,10 @@ from contextlib import ExitStack, contextmanager
 import psutil
 import pytest
 
+from hybridlog.live_sources import ros1_troubles
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1 import Ros1Source
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import UsageError
 from tests.live_sources.ros1_peers import (
     Collector,
     FakeMaster,
@@ -32,6 +33,7 @@ Script = Callable[[socket.socket], None]
 
 @pytest.fixture(autouse=True)
 def _quiet_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros1_troubles, "_QUIET_S", 0.1)
     for name in ("ROS_MASTER_URI", "ROS_HOSTNAME", "ROS_IP", "ROS_IPV6"):
         monkeypatch.delenv(name, raising=False)
 
@@ -369,7 +371,7 @@ def _raw_server(script: Script) -> Iterator[int]:
 )
 def test_an_address_that_is_none(uri: str) -> None:
     with Ros1Source(uri) as source:
-        with pytest.raises(SourceError, match=r"no address.*ROS_MASTER_URI") as caught:
+        with pytest.raises(UsageError, match=r"no address.*ROS_MASTER_URI") as caught:
             source.start(Collector())
     assert str(caught.value).isprintable()
 
@@ -490,6 +492,41 @@ def test_a_publisher_that_is_not_there() -> None:
         sink.wait_said("/topic", "no address")
         sink.wait(lambda: sink.topics[-1] == ("/topic", "std_msgs/String", 1))
     assert all(line.isprintable() for line in sink.said)
+
+
+def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The master in Python lets some of many callers wait for a second.
+    monkeypatch.setattr(ros1_troubles, "_QUIET_S", 1.5)
+    with FakeMaster() as master, Ros1Source(master.uri, poll_s=0.05) as source:
+        assert not source.was_reached
+        uri = f"http://127.0.0.1:{_free_port()}/"
+        for number in range(11):
+            master.add(f"/dead/{number:02}", "std_msgs/String", "/dead", uri)
+        sink = Collector()
+        source.start(sink)
+        sink.wait_said("11 topics (/dead/00, /dead/01, /dead/02, …)", uri, "rosnode cleanup")
+        master.add("/dead/late", "std_msgs/String", "/dead", uri)
+        calls = master.calls.count("getSystemState")
+        eventually(lambda: master.calls.count("getSystemState") > calls + 30)
+        assert source.was_reached
+    assert len(sink.said) == 1
+    assert sink.topics == []
+
+
+def test_what_a_publisher_does_wrong_is_told_once_however_it_is_worded() -> None:
+    def script(connection: socket.socket) -> None:
+        connection.sendall(struct.pack("<I", (1 << 31) + publisher.connections))
+        connection.shutdown(socket.SHUT_RDWR)
+
+    publisher = FakePublisher(script, greets=False)
+    with _system(publisher) as (_, sink):
+        sink.wait_said("/topic", publisher.uri, "a connection header of 214748")
+        eventually(lambda: publisher.connections >= 3)
+    assert len(sink.said) == 1
+    assert "dead" not in sink.said[0]
+    assert sink.topics == []
 
 
 @pytest.mark.parametrize(

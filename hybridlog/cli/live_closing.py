@@ -1,0 +1,182 @@
+"""How recording a robot went: tables, remarks, and the exit code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from hybridlog.cli import output
+from hybridlog.cli.coverage import line_of
+from hybridlog.cli.live_table import closing_rows
+from hybridlog.losses import Cause
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    SourceDamagedError,
+    SourceError,
+)
+
+if TYPE_CHECKING:
+    from hybridlog.live.policy import Rule
+    from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
+    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.recorder import RecordReport
+
+_MOST_ROWS = 10  # of the ledger that are told at the end; `losses` has all
+
+
+class Closing:
+    """What there is to say when everything is stored.
+
+    Args:
+        reports: How each recording went.
+        recorder: It has been stopped.
+        sources: What was recorded.
+        options: What was asked for.
+    """
+
+    def __init__(
+        self,
+        reports: Sequence[RecordReport],
+        recorder: Recorder,
+        sources: Sequence[LiveSource],
+        options: RecorderOptions,
+    ) -> None:
+        self._reports = reports
+        self._recorder = recorder
+        self._options = options
+        self._state = recorder.look()
+        self._unreached = [source.address for source in sources if not source.was_reached]
+        self._is_all_unreached = len(self._unreached) == len(sources)
+
+    def tell(self, *, as_json: bool, quiet: bool) -> None:
+        """Print it; leaves with the code of what went wrong."""
+        recorder, state = self._recorder, self._state
+        if as_json:
+            summary = _summary(self._reports, state, recorder.reason)
+            print(json.dumps({"report": summary}), flush=True)  # noqa: T201
+        elif not quiet:
+            self._print()
+        if not quiet:
+            for line in self._remarks():
+                output.note(line)
+        for line in self._errors(is_reason_shown=not (as_json or quiet)):
+            output.note(f"hybridlog: {line}")
+        code = self._exit_code()
+        if code:
+            raise typer.Exit(code)
+
+    def _print(self) -> None:
+        reports, state = self._reports, self._state
+        if state.snapshots is None:
+            rows = closing_rows(reports[0], state, self._unreached)
+            if self._recorder.reason:
+                rows.append(("ended", self._recorder.reason))
+            output.print_table([("recording", "left"), (reports[0].entry.id, "left")], rows)
+        elif reports:
+            _print_snapshots(reports)
+        else:
+            output.note("Nothing was triggered, so nothing is kept.")
+
+    def _remarks(self) -> Iterator[str]:
+        silent = self._recorder.silent()
+        for topic in silent:
+            yield f"{topic}: has a publisher, and never said anything"
+        topics = {*silent, *(topic.topic for topic in self._state.topics)}
+        matcher = self._options.matcher
+        unused = [] if matcher is None else matcher.unused()
+        for pattern in unused:
+            yield f"no topic fits {output.quoted(pattern)}"
+        if matcher is not None and not unused and not topics:
+            yield "no topic is left: --exclude takes away all that --topics names"
+        for option, rules in (
+            ("--throttle", self._options.throttles),
+            ("--priority", self._options.priorities),
+        ):
+            yield from _idle(option, rules, topics)
+
+    def _errors(self, *, is_reason_shown: bool) -> Iterator[str]:
+        """What a script that wants nothing but errors must hear, too."""
+        if self._recorder.stopped_for_disk and not is_reason_shown:
+            yield self._recorder.reason
+        for address in self._unreached:
+            yield f"{address} was never reached, so nothing of it is recorded."
+        rows = [
+            row
+            for report in self._reports
+            for row in report.entry.end.get("losses", [])
+            if row["cause"] == Cause.UNREADABLE
+        ]
+        for row in rows[:_MOST_ROWS]:
+            yield line_of(row)
+        if len(rows) > _MOST_ROWS:
+            more = output.counted(len(rows) - _MOST_ROWS, "more place")
+            yield f"and {more} that could not be read; `hybridlog losses` lists them"
+        for report in self._reports:
+            if report.failure is not None:
+                yield (
+                    f"{report.failure} {output.stored(report.missed)} but not in the index; the "
+                    "next command that opens the store catches up."
+                )
+
+    def _exit_code(self) -> int:
+        state = self._state
+        if self._recorder.stopped_for_disk or Cause.DISK in state.lost:
+            return DiskFullError.exit_code
+        if any(report.failure is not None for report in self._reports):
+            return DatabaseError.exit_code
+        if self._is_all_unreached and not state.messages:
+            return SourceError.exit_code
+        return SourceDamagedError.exit_code if Cause.UNREADABLE in state.lost else 0
+
+
+def _idle(option: str, rules: Sequence[Rule], topics: set[str]) -> Iterator[str]:
+    """Rules that were for no topic."""
+    for rule in rules:
+        if not any(map(rule.fits, topics)):
+            yield f"no topic fits {output.quoted(rule.pattern)} of {option}"
+
+
+def _print_snapshots(reports: Sequence[RecordReport]) -> None:
+    output.print_table(
+        [("snapshot", "left"), ("because of", "left"), ("messages", "right"), ("stored", "right")],
+        [
+            (
+                report.entry.id,
+                report.entry.tags.get("trigger", ""),
+                str(report.entry.messages),
+                output.size(report.entry.stored_bytes),
+            )
+            for report in reports
+        ],
+    )
+
+
+def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
+    recordings = [
+        {
+            "recording": report.entry.id,
+            "status": report.entry.status,
+            "tags": report.entry.tags,
+            "messages": report.entry.messages,
+            "messages_indexed": report.indexed,
+            "losses": report.entry.end.get("losses", []),
+            "bytes_stored": report.entry.stored_bytes,
+            "seconds": round(report.elapsed_s, 3),
+        }
+        for report in reports
+    ]
+    return {
+        "ended": reason,
+        "recordings": recordings,
+        "messages_received": state.messages,
+        "bytes": state.stored_bytes,
+        # A cause that is there without a number stands for an unknown one.
+        "lost": {cause: count or None for cause, count in state.lost.items()},
+        "topics": {
+            topic.topic: {"received": topic.messages, "lost": topic.lost} for topic in state.topics
+        },
+    }
