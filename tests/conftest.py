@@ -13,6 +13,22 @@ os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
     os.environ.pop(name, None)
 
+LONGEST = (
+    "test_model",
+    "test_smoke",
+    "test_docs",
+    "test_faults",
+    "test_real_logs",
+    "test_fetch",
+    "test_stopping",
+    "test_queries",
+    "test_record_live",
+    "test_backends",
+    "test_ros2_live",
+    "test_recording",
+)
+"""Files that take long: they begin first, or one processor would wait for them at the end."""
+
 # Whoever runs the tests in the background may have had signals ignored; programs that the
 # tests start would inherit that, and Ctrl-C would do nothing.
 for number, handler in (
@@ -32,3 +48,5 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     real_peers.mark(items)
+    rank = {name: at for at, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
