@@ -111,19 +111,19 @@ def _row(name: str, recorder: str, recorded: _Recorded) -> Row:
         "dropped_by_talker": did["dropped"],
         "talker_late_ms": did["late_ms"],
         "stored": kept.stored,
+        "reduced": kept.reduced,
         "told": kept.told,
         "missing": missing,
-        "stored_share": round(kept.stored / did["sent"], 5),
+        "whole_share": round((kept.stored - kept.reduced) / did["sent"], 5),
         "cpu_s": round(kept.cpu_s, 1),
         "stolen_s": round(stolen_s, 1),
     }
     told = ", ".join(f"{cause} {count:,}" for cause, count in kept.causes.items())
+    whole = kept.stored - kept.reduced
     text = (
-        f"{kept.stored:,} of {did['sent']:,.0f} stored ({_share(kept.stored, did['sent'])}), "
+        f"{whole:,} of {did['sent']:,.0f} stored whole ({_share(whole, did['sent'])}), "
         f"{told or 'nothing'} in the ledger, {missing:,.0f} missing without a word"
     )
-    if did["dropped"]:
-        text += f"; the talker's queue dropped {did['dropped']:,.0f}"
     return Row(name, recorder, values, text, missing == 0 and not_indexed == 0)
 
 

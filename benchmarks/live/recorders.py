@@ -31,7 +31,8 @@ class Kept:
 
     Attributes:
         stored: Messages in its files.
-        told: Messages that it says were lost or left out.
+        told: Messages that it says were lost.
+        reduced: Messages stored without their payload: their fields, size and hash.
         indexed: Documents in the database; None where there is none.
         causes: Of those it tells, by cause.
         cpu_s: Processor seconds, all its processes together.
@@ -39,6 +40,7 @@ class Kept:
 
     stored: int
     told: int
+    reduced: int
     indexed: int | None
     causes: dict[str, int]
     cpu_s: float
@@ -97,9 +99,11 @@ class Ours:
         report = last["report"]
         (recording,) = report["recordings"]
         causes = {cause: count for cause, count in report["lost"].items() if count}
+        reduced = causes.get("degrade", 0)
         return Kept(
             recording["messages"],
-            sum(causes.values()),
+            sum(causes.values()) - reduced,
+            reduced,
             recording["messages_indexed"],
             causes,
             used,
@@ -152,7 +156,7 @@ class Rosbag:
         _end(self.process)
         with Reader(self._bag) as reader:
             stored = reader.message_count
-        return Kept(stored, 0, None, {}, used)
+        return Kept(stored, 0, 0, None, {}, used)
 
     def close(self) -> None:
         """Ends it when it still runs."""

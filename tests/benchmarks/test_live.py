@@ -17,7 +17,7 @@ def test_a_load_is_counted_to_the_last_message(tmp_path: Path) -> None:
     row = _recorded("tiny", Load(3, 700, 200, 1.0, burst=2), tmp_path / "work", "hybridlog")
     assert row.values["sent"] == row.values["stored"] == 600
     assert row.holds
-    assert "600 of 600 stored (100 %), nothing in the ledger, 0 missing" in row.text
+    assert "600 of 600 stored whole (100 %), nothing in the ledger, 0 missing" in row.text
     assert not (tmp_path / "work").exists()
 
 
@@ -28,13 +28,14 @@ def test_a_load_is_counted_to_the_last_message(tmp_path: Path) -> None:
 def test_what_is_missing_without_a_word_is_found(
     stored: int, told: int, indexed: int, *, holds: bool
 ) -> None:
-    kept = Kept(stored, told, indexed, {"transport": told} if told else {}, 1.0)
+    kept = Kept(stored, told, 7, indexed, {"transport": told, "degrade": 7}, 1.0)
     did = {"sent": 100, "dropped": 3, "late_ms": 0.1, "seconds": 1.0}
     recorded = cases._Recorded(Load(1, 500, 100, 1.0), did, kept, 0.0)
     row = cases._row("x", "hybridlog", recorded)
     assert row.holds is holds
     assert row.values["missing"] == 100 - stored - told
-    assert row.text.endswith("; the talker's queue dropped 3")
+    assert row.values["dropped_by_talker"] == 3
+    assert row.text.startswith(f"{stored - 7} of 100 stored whole")
 
 
 def test_messages_are_counted_in_whole_bursts() -> None:
