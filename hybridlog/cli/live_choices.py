@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
-from hybridlog_storage.errors import SourceError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.live.recorder import RecorderOptions
@@ -219,7 +219,6 @@ def sources_of(live: LiveChoices) -> list[LiveSource]:
     if live.ros2:
         from hybridlog.live_sources.ros2 import Ros2Source
 
-        _check_overrides(live.qos)
         found.append(Ros2Source(qos_overrides=live.qos))
     if live.foxglove is not None:
         from hybridlog.live_sources.foxglove import FoxgloveSource
@@ -230,15 +229,3 @@ def sources_of(live: LiveChoices) -> list[LiveSource]:
 
         found.append(ReplaySource(live.replay, speed=live.speed))
     return found
-
-
-def _check_overrides(path: Path | None) -> None:
-    """A file of options that is wrong is a wrong option, and no robot that is not there."""
-    from hybridlog.live_sources.ros2_overrides import read_overrides
-
-    if path is None:
-        return
-    try:
-        read_overrides(path)
-    except SourceError as error:
-        raise UsageError(f"--qos: {error}") from error

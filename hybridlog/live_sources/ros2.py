@@ -16,7 +16,7 @@ from hybridlog.live_sources.ros2_overrides import read_overrides
 from hybridlog.live_sources.ros2_process import ChildError, Process, launch
 from hybridlog.live_sources.ros2_receiver import Receiver, report_outage
 from hybridlog.live_sources.ros2_wire import WireError, one_line
-from hybridlog_storage.errors import MissingDependencyError, SourceError
+from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,8 +67,8 @@ class Ros2Source(LiveSource):
         """Start the child, which says nothing of any message before `start`.
 
         Raises:
-            SourceError: A domain that is none, overrides that cannot be read, or ROS that
-                does not come up.
+            UsageError: A domain that is none, overrides that cannot be read.
+            SourceError: ROS that does not come up.
             MissingDependencyError: No Python that has rclpy.
         """
         if self._child is None:
@@ -78,6 +78,7 @@ class Ros2Source(LiveSource):
         """Begin to listen.
 
         Raises:
+            UsageError: As `check`.
             SourceError: As `check`.
             MissingDependencyError: As `check`.
         """
@@ -91,7 +92,7 @@ class Ros2Source(LiveSource):
         """A child, and what it was told."""
         domain = self.address.partition(" ")[2]
         if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
-            raise SourceError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, and no {domain[:40]!r}")
+            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, and no {domain[:40]!r}")
         overrides = {} if self._overrides is None else read_overrides(self._overrides)
         settings: dict[str, object] = {"overrides": overrides}
         try:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live_sources.ros2_qos import DURATIONS, FOREVER, Profile
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +36,7 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
         path: The YAML file.
 
     Raises:
-        SourceError: No such file, no YAML, or a policy that does not exist.
+        UsageError: No such file, no YAML, or a policy that does not exist.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -45,23 +45,23 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be opened: {error.strerror}") from error
+        raise UsageError(f"{path}: cannot be opened: {error.strerror}") from error
     if len(data) > MAX_BYTES:
-        raise SourceError(f"{path}: more than {MAX_BYTES >> 10} KiB are no QoS overrides")
+        raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are no QoS overrides")
     try:
         # Hostile YAML may nest deeply; the safe loader makes nothing but plain values.
         root: object = YAML(typ="safe", pure=True).load(data)
     except (YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise SourceError(f"{path}: no YAML that can be read: {reason}") from error
+        raise UsageError(f"{path}: no YAML that can be read: {reason}") from error
     if root is None:
         return {}
     if not isinstance(root, dict):
-        raise SourceError(f"{path}: topics with their policies below them are expected")
+        raise UsageError(f"{path}: topics with their policies below them are expected")
     found = {}
     for topic, policies in root.items():
         if not isinstance(topic, str) or not isinstance(policies, dict):
-            raise SourceError(f"{path}: {topic!r}: a topic with policies below it is expected")
+            raise UsageError(f"{path}: {topic!r}: a topic with policies below it is expected")
         name = topic if topic.startswith("/") else f"/{topic}"
         found[name] = {
             str(key): _policy(key, value, f"{path}: {topic}") for key, value in policies.items()
@@ -73,25 +73,25 @@ def _policy(name: object, value: object, where: str) -> int:
     """The number of a policy.
 
     Raises:
-        SourceError: There is no such policy, or it has no such value.
+        UsageError: There is no such policy, or it has no such value.
     """
     if name in DURATIONS:
         return _duration(value, f"{where}: {name}")
     if name == "depth":
         if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
-            raise SourceError(f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {value!r}")
+            raise UsageError(f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {value!r}")
         return value
     if name == "avoid_ros_namespace_conventions":
         if not isinstance(value, bool):
-            raise SourceError(f"{where}: {name} is true or false, not {value!r}")
+            raise UsageError(f"{where}: {name} is true or false, not {value!r}")
         return value
     words = _POLICIES.get(name) if isinstance(name, str) else None
     if words is None:
         known = ", ".join(Profile._fields)
-        raise SourceError(f"{where}: there is no policy {name!r}; there are {known}")
+        raise UsageError(f"{where}: there is no policy {name!r}; there are {known}")
     number = words.get(value.lower()) if isinstance(value, str) else None
     if number is None:
-        raise SourceError(f"{where}: {name} is one of {', '.join(words)}, not {value!r}")
+        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {value!r}")
     return number
 
 
@@ -99,10 +99,10 @@ def _duration(value: object, where: str) -> int:
     """A duration in ns.
 
     Raises:
-        SourceError: It is none.
+        UsageError: It is none.
     """
     if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
         sec, nsec = value["sec"], value["nsec"]
         if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
             return int(min(sec * 1_000_000_000 + nsec, FOREVER))
-    raise SourceError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {value!r}")
+    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {value!r}")

@@ -277,7 +277,7 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
         ("--ros1 '' --duration 1s", "looks like http://host:11311"),
         ("--ros1 {bag}", "looks like http://host:11311"),
         ("--foxglove http://robot", "does not begin with ws://"),
-        ("--ros2 --qos /nowhere/qos.yaml", "--qos: /nowhere/qos.yaml: cannot be opened"),
+        ("--ros2 --qos /nowhere/qos.yaml", "/nowhere/qos.yaml: cannot be opened"),
     ],
 )
 def test_options_that_make_no_sense_leave_no_store(

@@ -17,7 +17,7 @@ from hybridlog.live_sources.ros2 import Ros2Source
 from hybridlog.live_sources.ros2_overrides import read_overrides
 from hybridlog.live_sources.ros2_process import PYTHON_VARIABLE, candidates, environment_for
 from hybridlog.live_sources.ros2_wire import one_line
-from hybridlog_storage.errors import MissingDependencyError, SourceError
+from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.live_sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until
 
 
@@ -355,13 +355,13 @@ def test_a_child_that_never_greets(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("domain", [-1, 233, 10**9])
 def test_a_domain_that_is_none(domain: int) -> None:
-    with pytest.raises(SourceError, match="domains from 0 to 232"):
+    with pytest.raises(UsageError, match="domains from 0 to 232"):
         Ros2Source(domain_id=domain).start(Memory())
 
 
 def test_a_domain_of_the_environment_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "x")
-    with pytest.raises(SourceError, match="no 'x'"):
+    with pytest.raises(UsageError, match="no 'x'"):
         Ros2Source().start(Memory())
 
 
@@ -451,16 +451,16 @@ def test_overrides_as_rosbag2_has_them(tmp_path: Path) -> None:
 def test_overrides_that_are_none(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "qos.yaml"
     path.write_text(text)
-    with pytest.raises(SourceError, match=reason):
+    with pytest.raises(UsageError, match=reason):
         Ros2Source(qos_overrides=path).start(Memory())
 
 
 def test_overrides_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="No such file"):
+    with pytest.raises(UsageError, match="No such file"):
         read_overrides(tmp_path / "none.yaml")
     large = tmp_path / "large.yaml"
     large.write_bytes(b"#" * ((1 << 20) + 1))
-    with pytest.raises(SourceError, match="more than 256 KiB"):
+    with pytest.raises(UsageError, match="more than 256 KiB"):
         read_overrides(large)
 
 
