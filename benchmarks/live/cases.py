@@ -242,11 +242,10 @@ def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
                     servers = working_below(work / "store", "mongod")
                     database.append(sum(map(_resident, servers)))
                 did = talker.ended()
-            ended.set()
-            sweeper.join()
-            kept = running.stop()
+            kept = running.seen()
         finally:
             ended.set()
+            sweeper.join()
             running.close()
     row = _row("memory", "hybridlog", _Recorded(load, did, kept, stolen[0]))
     tenth = max(len(recorder) // 10, 1)
