@@ -109,23 +109,6 @@ class Ours:
             used,
         )
 
-    def seen(self) -> Kept:
-        """What it says while it runs, of a recording that cannot be read afterwards.
-
-        Raises:
-            SideError: It says nothing.
-        """
-        used = cpu_s(with_children([self.process.pid]))
-        time.sleep(2)  # it says so once a second
-        self._said.seek(0)
-        lines = [line for line in self._said.read().splitlines() if line.endswith("}")]
-        if not lines or "state" not in (last := json.loads(lines[-1])):
-            raise SideError("hybridlog record says nothing")
-        state = last["state"]
-        causes = {cause: count for cause, count in state["lost"].items() if count}
-        reduced = causes.get("degrade", 0)
-        return Kept(state["stored"], sum(causes.values()) - reduced, reduced, None, causes, used)
-
     def kill(self) -> int:
         """Ends it without a word.
 

@@ -46,6 +46,8 @@ class Load(NamedTuple):
         seconds: How long; 0 until standard input ends.
         burst: So many come at once.
         queue: Messages a connection may have waiting.
+        period: Bytes after which the data repeats, so that it can be compressed; 0 for
+            data that does not.
     """
 
     topics: int
@@ -54,6 +56,7 @@ class Load(NamedTuple):
     seconds: float
     burst: int = 1
     queue: int = 10
+    period: int = 0
 
     @property
     def megabytes_per_s(self) -> float:
@@ -70,12 +73,14 @@ class Data:
     """Random bytes, other ones in each message: a part of one long row of them.
 
     Args:
-        size: Bytes of a message, its head included.
+        load: Of which size, and how random.
     """
 
-    def __init__(self, size: int) -> None:
-        self._row = memoryview(random.Random(1).randbytes(_ROW + size))
-        self._size = max(size - _HEAD.size, 0)
+    def __init__(self, load: Load) -> None:
+        total = _ROW + load.size
+        once = random.Random(1).randbytes(load.period or total)
+        self._row = memoryview(once * -(-total // len(once)))
+        self._size = max(load.size - _HEAD.size, 0)
 
     def of(self, sequence: int) -> memoryview:
         """What stands in a message."""
@@ -180,7 +185,7 @@ class Talker:
 
     def _speak(self) -> dict[str, float]:
         load = self._load
-        data = Data(load.size)
+        data = Data(load)
         total = load.messages // load.topics if load.seconds else sys.maxsize
         if not load.seconds:
             threading.Thread(target=self._watch_input, daemon=True).start()
