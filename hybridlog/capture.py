@@ -121,7 +121,7 @@ class Capture:
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
-        self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries)
+        self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries())
         failure = self.index.failure
         if failure is None:
             self.catalog = Catalog(self.index.database)

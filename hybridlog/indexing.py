@@ -40,6 +40,7 @@ _LAG_PAUSE_S = 0.002
 _RETRY_S = 2.0  # after the database has failed
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
+_MOST_LATEST = 4096  # chunks: far more than a server that is killed has not in its journal
 
 
 class Documents(NamedTuple):
@@ -247,7 +248,7 @@ class IndexWriter:
         """Messages whose index documents are in the database."""
         self.missed = 0
         """Messages that were skipped because the database had failed."""
-        self.entries: list[ChunkEntry] = []
+        self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
         self._indexer = indexer
         self._lag = lag
         self._forgotten: deque[_Forgotten] = deque()
@@ -269,6 +270,18 @@ class IndexWriter:
     def database(self) -> Database:
         """Where documents go now."""
         return self._database
+
+    def entries(self) -> list[ChunkEntry]:
+        """Entries of the recording's chunks: of all as long as the database has not failed.
+
+        They are read back: a recording of a day has too many to keep them meanwhile.
+        """
+        if self.failure is None:
+            try:
+                return self._catalog.chunks(self._indexer.recording)
+            except DatabaseError as error:
+                self.failure = error
+        return list(self._latest)
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Index a chunk that is in its segment; waits while the backlog is full."""
@@ -362,10 +375,10 @@ class IndexWriter:
             self._database, self._catalog = database, catalog
             self._collections.clear()
             # A server that was killed has lost what it had not yet in its journal.
-            entries, self.entries = self.entries, []
-            for entry in entries:
+            latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
+            for entry in latest:
                 if (entry.segment, entry.offset) in there:
-                    self.entries.append(entry)
+                    self._latest.append(entry)
                 else:
                     self.indexed -= self._put_back(entry)
             self.failure = None
@@ -425,7 +438,7 @@ class IndexWriter:
         with self._lock:
             if failure is None:
                 self.indexed += parcel.messages
-                self.entries.extend(parcel.entries)
+                self._latest.extend(parcel.entries)
                 return
             self.failure = failure
             self._retry_at = time.monotonic() + _RETRY_S

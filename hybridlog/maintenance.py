@@ -149,7 +149,8 @@ def catch_up(
     index.close()
     if index.failure is not None:
         raise index.failure
-    whole = build_entry(directory, indexer, recording_id, [*entries, *index.entries], summaries)
+    chunks = catalog.chunks(recording_id)
+    whole = build_entry(directory, indexer, recording_id, chunks, summaries)
     for channel in channels_of(summaries.values()).values():
         if channel.schema is not None:
             catalog.put_schema(channel.schema)

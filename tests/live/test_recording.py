@@ -293,3 +293,20 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
             os.kill(pid, signal.SIGCONT)
         wait_for(lambda: recording.lag == 0)
     assert store.topic("/speech").count() == 199
+
+
+def test_a_recording_of_more_chunks_than_are_kept_is_counted_whole(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hybridlog.indexing._MOST_LATEST", 2)
+    settings = SegmentSettings(chunk_size=1 << 12)
+    recording = store.start("many", settings=settings)
+    own = channel("/talk")
+    for number in range(100):
+        recording.write(own, text(b"x" * 2000), log_time=10**18 + number)
+    report = recording.close()
+    (found,) = report.entry.channels
+    assert report.entry.chunks > 20
+    assert (found.stats.messages, found.stats.first, found.stats.last) == (100, 10**18, 10**18 + 99)
+    assert store.recordings()[0].channels == report.entry.channels
+    assert store.verify().findings == []
