@@ -422,7 +422,7 @@ def test_visitors(store: hl.Store) -> None:
     for bad in ({"text": 1, "tags": {}}, {"text": "a", "tags": {"a": 1}}, {"text": "a"}):
         with pytest.raises(UsageError, match="tags"):
             visit(here, name, "mark", **bad)
-    with pytest.raises(UsageError, match="mark, state, stop, trigger"):
+    with pytest.raises(UsageError, match="mark, numbers, state, stop, trigger"):
         visit(here, name, "dance")
     # Who says nothing, or nonsense, or does not stop, is let go, and keeps nobody out.
     path = json.loads((here / "recorders" / f"{name}.json").read_text())["socket"]

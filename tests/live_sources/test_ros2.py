@@ -267,7 +267,7 @@ def test_an_outage_that_never_ends_is_told_at_the_end(tmp_path: Path) -> None:
             channel()
             event(event="say", text="dying")
             os._exit(1)
-        print("not again")
+        print("not again", flush=True)
         os._exit(4)
         """,
     )
