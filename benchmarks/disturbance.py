@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import Any
+
+from benchmarks.machine import cores
 
 TAKEN_SHARE = 0.05
 """A host that takes more of the processors' time away than this disturbs a run."""
@@ -21,7 +22,7 @@ def share_taken(values: Mapping[str, Any]) -> float:
     taken, wall = values.get("steal_s"), values.get("wall_s")
     if not isinstance(taken, int | float) or not isinstance(wall, int | float) or wall <= 0:
         return 0.0
-    return taken / (wall * _cores())
+    return taken / (wall * cores())
 
 
 def is_disturbed(values: Mapping[str, Any]) -> bool:
@@ -31,9 +32,3 @@ def is_disturbed(values: Mapping[str, Any]) -> bool:
     """
     lost = values.get("published") != values.get("persisted")
     return lost and share_taken(values) > TAKEN_SHARE
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

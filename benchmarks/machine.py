@@ -37,9 +37,7 @@ def describe(work: Path | None = None) -> dict[str, object]:
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "cpu": _cpu(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cores": cores(),
         "memory_gib": round(_memory_bytes() / 2**30, 1),
         "disk": _disk(work or Path(tempfile.gettempdir())),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -51,6 +49,13 @@ def describe(work: Path | None = None) -> dict[str, object]:
         "revision": _revision(),
         "load_1min": round(os.getloadavg()[0], 2),
     }
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _cpu() -> str:

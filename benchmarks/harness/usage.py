@@ -67,15 +67,16 @@ def peak_rss(pids: Iterable[int]) -> int:
     """Most bytes of memory that processes have had, one by one; what they share counts once."""
     own = shared = 0
     for pid in pids:
-        try:
-            text = (_PROC / str(pid) / "status").read_text()
-        except OSError:
-            continue
-        kilobytes = {n: int(v) for n, v in re.findall(r"^(\w+):\s+(\d+) kB", text, re.MULTILINE)}
+        kilobytes = _kilobytes(pid)
         both = kilobytes.get("RssShmem", 0) + kilobytes.get("RssFile", 0)
         own += max(kilobytes.get("VmHWM", 0) - both, 0)
         shared = max(shared, both)
     return (own + shared) * 1024
+
+
+def rss(pids: Iterable[int]) -> int:
+    """Bytes of memory that processes have now; what they share counts for each."""
+    return 1024 * sum(_kilobytes(pid).get("VmRSS", 0) for pid in pids)
 
 
 def mapped_rss(path: Path) -> int:
@@ -137,6 +138,15 @@ def _pids() -> Iterator[int]:
         for entry in os.listdir(_PROC):  # noqa: PTH208 - thousands of names, no paths
             if entry.isdigit():
                 yield int(entry)
+
+
+def _kilobytes(pid: int) -> dict[str, int]:
+    """What a process's status gives in kB, by name; nothing when there is no such process."""
+    try:
+        text = (_PROC / str(pid) / "status").read_text()
+    except OSError:
+        return {}
+    return {n: int(v) for n, v in re.findall(r"^(\w+):\s+(\d+) kB", text, re.MULTILINE)}
 
 
 def _stat(pid: int) -> list[str] | None:

@@ -9,13 +9,13 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from os import kill
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.backends.processes import working_below
-from benchmarks.harness.usage import machine, with_children
+from benchmarks.harness.usage import machine, rss, with_children
 from benchmarks.live.master import Master
 from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
 from benchmarks.live.talker import Data, Load
@@ -81,13 +81,11 @@ def _recorded(name: str, load: Load, work: Path, recorder: str) -> Row:
             running = Ours(work / "store", master.uri, "--reserve", "0")
         else:
             running = Rosbag(work / "it.bag", master.uri)
-        try:
+        with closing(running):
             with speech(load, master.uri) as talker:
                 did = talker.ended()
             time.sleep(1)
             kept = running.stop()
-        finally:
-            running.close()
     return _row(name, recorder, _Recorded(load, did, kept, stolen[0]))
 
 
@@ -131,17 +129,18 @@ def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     pause = 3.0 if quick else 20.0
     load = Load(20, 40_000, 50, 2 * pause + 4)
     for how in ("halted", "killed"):
-        with _clean(work), Master() as master, _steal() as stolen:
-            running = Ours(work / "store", master.uri, "--reserve", "0")
-            try:
-                with speech(load, master.uri) as talker:
-                    talker.began()
-                    time.sleep(2)
-                    _disturb(work / "store", how, pause)
-                    did = talker.ended()
-                kept = running.stop()
-            finally:
-                running.close()
+        with (
+            _clean(work),
+            Master() as master,
+            _steal() as stolen,
+            closing(Ours(work / "store", master.uri, "--reserve", "0")) as running,
+        ):
+            with speech(load, master.uri) as talker:
+                talker.began()
+                time.sleep(2)
+                _disturb(work / "store", how, pause)
+                did = talker.ended()
+            kept = running.stop()
         case = f"mongod {how} for {pause:g} s" if how == "halted" else "mongod killed"
         yield _row(case, "hybridlog", _Recorded(load, did, kept, stolen[0]))
 
@@ -166,14 +165,13 @@ def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     count = 3 if quick else 50
     for _ in range(count):
         with _clean(work), Master() as master:
-            running = Ours(work / "store", master.uri, "--reserve", "0")
-            try:
-                with speech(load, master.uri) as talker:
-                    talker.began()
-                    time.sleep(moments.uniform(0, 6))
-                    killed_ns = running.kill()
-            finally:
-                running.close()
+            with (
+                closing(Ours(work / "store", master.uri, "--reserve", "0")) as running,
+                speech(load, master.uri) as talker,
+            ):
+                talker.began()
+                time.sleep(moments.uniform(0, 6))
+                killed_ns = running.kill()
             behind, messages, faults = _recovered(work / "store", load, killed_ns)
             if messages:
                 lost_s.append(behind)
@@ -225,21 +223,22 @@ def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     load = Load(20, 100_000, 100, seconds, period=4096)
     recorder: list[int] = []
     database: list[int] = []
-    with _clean(work), Master() as master, _steal() as stolen:
-        running = Ours(work / "store", master.uri)
-        try:
-            with speech(load, master.uri) as talker:
-                talker.began()
-                begin = time.monotonic()
-                while time.monotonic() - begin < seconds - 1:
-                    time.sleep(1)
-                    recorder.append(_resident(running.process.pid))
-                    servers = working_below(work / "store", "mongod")
-                    database.append(sum(map(_resident, servers)))
-                did = talker.ended()
-            kept = running.stop()
-        finally:
-            running.close()
+    with (
+        _clean(work),
+        Master() as master,
+        _steal() as stolen,
+        closing(Ours(work / "store", master.uri)) as running,
+    ):
+        with speech(load, master.uri) as talker:
+            talker.began()
+            begin = time.monotonic()
+            while time.monotonic() - begin < seconds - 1:
+                time.sleep(1)
+                recorder.append(rss(with_children([running.process.pid])))
+                servers = working_below(work / "store", "mongod")
+                database.append(rss(with_children(servers)))
+            did = talker.ended()
+        kept = running.stop()
     row = _row("memory", "hybridlog", _Recorded(load, did, kept, stolen[0]))
     fifth = max(len(recorder) // 5, 1)
     early, late = (
@@ -258,19 +257,6 @@ def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
         f"fifth, {late:.0f} MB in the last, {values['rss_mb_peak']} MB at most; {row.text}"
     )
     yield Row("memory", "hybridlog", values, text, row.holds and late < 1.1 * early + 20)
-
-
-def _resident(pid: int) -> int:
-    """Bytes of memory that a process and its children hold."""
-    total = 0
-    for each in with_children([pid]):
-        try:
-            status = Path(f"/proc/{each}/status").read_text()
-        except OSError:
-            continue  # it has just ended
-        line = next((line for line in status.splitlines() if line.startswith("VmRSS")), "0 0")
-        total += int(line.split()[1]) * 1024
-    return total
 
 
 @contextmanager

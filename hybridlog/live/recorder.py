@@ -265,10 +265,8 @@ class Recorder:
             reports = [self._target.close()]
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
-            with self._lock:
-                for topic, count in self._target.cut_off.items():
-                    key = topic, Cause.DISK
-                    self._lost[key] = self._lost.get(key, 0) + count
+            for topic, count in self._target.cut_off.items():
+                self._count_lost(topic, Cause.DISK, count)
         return reports
 
     @property
@@ -592,9 +590,12 @@ class Recorder:
     def _note(
         self, topic: str, cause: Cause, count: int | None, *, first: int, last: int, detail: str
     ) -> None:
-        with self._lock:
-            self._lost[topic, cause] = self._lost.get((topic, cause), 0) + (count or 0)
+        self._count_lost(topic, cause, count or 0)
         self._target.ledger.note(topic, cause, count, first=first, last=last, detail=detail)
+
+    def _count_lost(self, topic: str, cause: Cause, count: int) -> None:
+        with self._lock:
+            self._lost[topic, cause] = self._lost.get((topic, cause), 0) + count
 
     def _refuse(self, cause: Cause, reason: str) -> None:
         """Nothing more can be stored; what still comes is counted."""

@@ -289,11 +289,6 @@ class Snapshots:
             for number in numbers_at(codec_for(held.channel).fields(held.payload), path)
         ]
 
-    @property
-    def unmet(self) -> list[str]:
-        """Triggers whose topic never came."""
-        return list(self._unmet)
-
     def _fitting(self, channel: Channel) -> Iterator[Trigger]:
         """The triggers for a channel; says which of them can never fire."""
         for trigger in self._options.triggers:

@@ -492,6 +492,8 @@ class RecordingWriter:
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
         """Messages that are in the files, by channel id."""
+        self.last_log_time = 0
+        """Log time of the latest message in the files, ns; 0 without any."""
         self._directory = directory
         self._recording = recording
         self._on_chunk = on_chunk
@@ -506,7 +508,6 @@ class RecordingWriter:
         self._broken: BaseException | None = None
         self._next_seq = 0
         self._stored_seq = 0
-        self._last_log_time = 0
         self._segment: SegmentFile | None = None
         self._number = 0
         self._opened = 0.0
@@ -633,11 +634,6 @@ class RecordingWriter:
             segment.add_metadata(extra)
         self._seal()
 
-    @property
-    def last_log_time(self) -> int:
-        """Log time of the latest message in the files, ns; 0 without any."""
-        return self._last_log_time
-
     def written_of(self, channel: Channel) -> int:
         """Messages of a channel that are in the files."""
         known = self._known.get(channel)
@@ -749,7 +745,7 @@ class RecordingWriter:
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
-        self._last_log_time = max(self._last_log_time, chunk.last)
+        self.last_log_time = max(self.last_log_time, chunk.last)
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         span = self.settings.segment_span_s

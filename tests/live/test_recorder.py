@@ -68,6 +68,19 @@ class Running:
         return found
 
 
+def block_writing(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Nothing is laid into chunks until the event is set."""
+    blocked = threading.Event()
+    lay_down = LiveRecording._lay_down
+
+    def slow(self: LiveRecording, group: object) -> int:
+        blocked.wait()
+        return lay_down(self, group)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    return blocked
+
+
 def in_segments(store: hl.Store, recording: str) -> Counter[tuple[str, str]]:
     """Messages by topic and encoding, as the official reader finds them."""
     found: Counter[tuple[str, str]] = Counter()
@@ -179,14 +192,7 @@ def test_a_reduced_message_says_what_it_was(
 def test_when_the_budget_is_spent_the_rest_is_counted(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    blocked = threading.Event()
-    lay_down = LiveRecording._lay_down
-
-    def slow(self: LiveRecording, group: object) -> int:
-        blocked.wait()
-        return lay_down(self, group)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    blocked = block_writing(monkeypatch)
     robot = Running(store, RecorderOptions(reserve_bytes=0, budget_bytes=1 << 20))
     channel = text_channel()
     for number in range(1000):
@@ -482,14 +488,7 @@ def test_fields_land_when_no_payload_finds_room(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever their priority: three large messages are more than the budget."""
-    blocked = threading.Event()
-    lay_down = LiveRecording._lay_down
-
-    def slow(self: LiveRecording, group: object) -> int:
-        blocked.wait()
-        return lay_down(self, group)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    blocked = block_writing(monkeypatch)
     rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
     options = RecorderOptions(reserve_bytes=0, budget_bytes=4 << 20, priorities=rules)
     robot = Running(store, options)
