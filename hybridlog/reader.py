@@ -19,12 +19,14 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from hybridlog.indexing import STAMP
+from hybridlog.query.chunk_counts import count_in_chunks
 from hybridlog.query.plan import (
     Chosen,
     Clock,
@@ -46,7 +48,7 @@ from hybridlog.query.times import (
     parse_time,
 )
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.errors import SegmentError, TimeError, TopicError, UsageError
 from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
@@ -60,6 +62,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 _BATCH = 10_000  # index documents that come at a time
+_FEW = 50
+"""So many index documents are counted in the time in which a chunk's entry is fetched."""
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
@@ -971,44 +975,75 @@ class Query:
         return parts[::-1] if self._reverse else parts
 
     def _count(self) -> int:
-        lanes: list[Lane] = []
         self._reset()
-        has_index = self.store.database is not None
-        if self._filters and not has_index:
-            self.store.database_for("A predicate")
-        is_known = self.is_unbounded and not self._filters
-        targets = self._targets(lanes, with_chunks=not has_index and not is_known)
-        if is_known:
+        lanes: list[Lane] = []
+        database = self.store.database
+        if self._filters:
+            database = self.store.database_for("A predicate")
+        is_plain = not self._filters and (self._bounds is None or self._clock == "log")
+        targets = self._targets(lanes, with_chunks=database is None and not is_plain)
+        if is_plain and self.is_unbounded:
             return sum(
                 channel.stats.messages
                 for target in targets
                 for channel in target.recording.channels
                 if channel.id in target.lanes
             )
-        if self.store.database is None:
+        if is_plain:
+            return sum(map(self._count_between, targets))
+        if database is None:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
-        of_topic: dict[str, list[Target]] = {}
-        for target in targets:
-            for topic in sorted({lanes[i].channel.topic for i in target.lanes.values()}):
-                of_topic.setdefault(topic, []).append(target)
         if self.is_unbounded:
             from hybridlog.counting import in_all_times
 
+            of_topic: dict[str, list[RecordingEntry]] = {}
+            for target in targets:
+                for topic in _topics_of(target):
+                    of_topic.setdefault(topic, []).append(target.recording)
             return sum(
-                in_all_times(self.store, topic, [t.recording for t in mine], self.filter)
-                for topic, mine in of_topic.items()
+                in_all_times(self.store, topic, recordings, self.filter)
+                for topic, recordings in sorted(of_topic.items())
             )
-        return sum(
-            self.store.database.count_each(
-                [
-                    (collection_of(topic), self._filter(part))
-                    for topic, mine in of_topic.items()
-                    for target in mine
-                    for part in self._parts([target])
-                ]
-            )
+        return self._count_documents(
+            [(topic, target) for target in targets for topic in _topics_of(target)]
         )
+
+    def _count_between(self, target: Target) -> int:
+        """Messages of one recording in the range of log time, whatever is in them."""
+        has_index = self.store.database is not None
+        topics = _topics_of(target)
+        if has_index:
+            topics = [t for t in topics if _has_full_chunks(target.recording, t)]
+        channels = [c.id for c in target.recording.channels if c.topic in topics]
+        total = 0
+        if channels:
+            span = target.bounds or (0, TIME_LIMIT - 1)
+            windows = self._windows_in(target.recording, span)
+            chunks = self._chunks(target.recording, channels, target.bounds, target.windows)
+            try:
+                total = count_in_chunks(
+                    chunks,
+                    set(channels),
+                    np.array(windows, np.int64).reshape(-1, 2),
+                    partial(self.store.segment, target.recording.id),
+                    self.counters,
+                )
+            except SegmentError:
+                if not has_index:
+                    raise
+                topics = []  # the index knows it without the segment
+        left = [(t, target) for t in _topics_of(target) if t not in topics]
+        return total + self._count_documents(left) if left else total
+
+    def _count_documents(self, wanted: Sequence[tuple[str, Target]]) -> int:
+        """What the index has of topics of recordings in the range, where the predicate holds."""
+        filters = [
+            (collection_of(topic), self._filter(part))
+            for topic, target in wanted
+            for part in self._parts([target])
+        ]
+        return sum(self.store.database_for("An index").count_each(filters))
 
     def thinned_documents(
         self, topic: str, projection: Mapping[str, object] | None
@@ -1064,6 +1099,21 @@ class Query:
     @staticmethod
     def _has(target: Target, lanes: list[Lane], topic: str) -> bool:
         return any(lanes[i].channel.topic == topic for i in target.lanes.values())
+
+
+def _topics_of(target: Target) -> list[str]:
+    return sorted({c.topic for c in target.recording.channels if c.id in target.lanes})
+
+
+def _has_full_chunks(recording: RecordingEntry, topic: str) -> bool:
+    """Whether entries of chunks are much fewer than the messages of a topic, and all there."""
+    if recording.status == "open":
+        return False
+    stats = [c.stats for c in recording.channels if c.topic == topic]
+    first = min((s.first for s in stats if s.first is not None), default=0)
+    last = max((s.last for s in stats if s.last is not None), default=0)
+    chunks = (last - first) / max(1, *(s.longest for s in stats)) + 1
+    return sum(s.messages for s in stats) > _FEW * chunks
 
 
 def _any_of(filters: list[dict[str, object]]) -> dict[str, object]:

@@ -6,12 +6,19 @@ import os
 import signal
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests import real_peers
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
     os.environ.pop(name, None)
+
+# A machine that is busy is no defect of what is tested, however long an example takes.
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 LONGEST = (
     "test_model",
@@ -26,6 +33,7 @@ LONGEST = (
     "test_backends",
     "test_ros2_live",
     "test_recording",
+    "test_chunk_counts",
 )
 """Files that take long: they begin first, or one processor would wait for them at the end."""
 

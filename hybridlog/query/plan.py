@@ -60,6 +60,13 @@ class Counters:
     elapsed_s: float = 0.0
 
 
+def place_of(chunk: ChunkEntry) -> ChunkPlace:
+    """Where a chunk lies, as its segment's reader wants to know it."""
+    return ChunkPlace(
+        chunk.offset, chunk.length, chunk.trailer, chunk.first, chunk.last, tuple(chunk.stats)
+    )
+
+
 def count_given(counters: Counters, batch: Batch) -> None:
     """Messages were given out."""
     counters.messages += len(batch)
@@ -280,15 +287,7 @@ class Sweep:
     def _load(self, task: Task, offsets: NDArray[np.int64] | None) -> tuple[Piece, int]:
         entry = task.chunk
         reader = self._reader_of(task.target.recording.id, entry.segment)
-        place = ChunkPlace(
-            entry.offset,
-            entry.length,
-            entry.trailer,
-            entry.first,
-            entry.last,
-            tuple(entry.stats),
-        )
-        chunk = reader.read_chunk(place)
+        chunk = reader.read_chunk(place_of(entry))
         return self._wanted(task, chunk, offsets), chunk.length + chunk.trailer
 
     def _wanted(self, task: Task, chunk: StoredChunk, offsets: NDArray[np.int64] | None) -> Piece:

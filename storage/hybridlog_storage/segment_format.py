@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import struct
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -220,20 +220,35 @@ def message_starts(trailer: Buffer) -> NDArray[np.int64]:
     Returns:
         int64[n]; unchecked: an index has no checksum of its own.
     """
+    found = [entries["offset"].astype(np.int64) for _, entries in _index_entries(trailer)]
+    return np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
+
+
+def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
+    """Log times of the messages of a chunk, by channel, by its message indexes.
+
+    Args:
+        trailer: The message index records, and the record of arrival numbers.
+
+    Returns:
+        int64[n], ns, in the order of the index; unchecked, like the starts.
+    """
+    return {c: entries["log_time"].astype(np.int64) for c, entries in _index_entries(trailer)}
+
+
+def _index_entries(trailer: Buffer) -> Iterator[tuple[int, NDArray[np.void]]]:
+    """Channel id and entries of each message index record, up to the first other record."""
     view = memoryview(trailer)
-    found: list[NDArray[np.int64]] = []
     at = 0
     while at + INDEX_HEAD.size <= len(view):
-        opcode, length, _, size = INDEX_HEAD.unpack_from(view, at)
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(view, at)
         if opcode != Opcode.MESSAGE_INDEX or size + 6 != length or size % _INDEX_ENTRY.itemsize:
             break
         start = at + INDEX_HEAD.size
         if start + size > len(view):
             break
-        entries = np.frombuffer(view[start : start + size], _INDEX_ENTRY)
-        found.append(entries["offset"].astype(np.int64))
+        yield channel, np.frombuffer(view[start : start + size], _INDEX_ENTRY)
         at = start + size
-    return np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
 
 
 def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:

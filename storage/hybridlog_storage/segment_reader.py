@@ -43,6 +43,7 @@ from hybridlog_storage.segment_format import (
     channel_of,
     json_of,
     message_starts,
+    message_times,
     messages_at,
 )
 from hybridlog_storage.segment_writer import StoredChunk
@@ -218,12 +219,29 @@ class SegmentReader:
                 batch = parse_content(content).batch
             seq = _arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
-            raise SegmentError(
-                f"Chunk at byte {place.offset} of {self.path} is damaged: {error}"
-            ) from error
+            raise self._damaged(place, error) from error
         return StoredChunk(
             self.number, place.offset, place.length, len(trailer), batch, seq, compressed
         )
+
+    def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
+        return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
+
+    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        """Log times of a chunk's messages by channel, from its message indexes alone.
+
+        Returns:
+            int64[n], ns, by channel id; unchecked: an index has no checksum of its own.
+
+        Raises:
+            SegmentError: they are not there; names file and offset.
+        """
+        if place.trailer >= 0:
+            return message_times(self._read(place.offset + place.length, place.trailer))
+        try:
+            return message_times(self._trailer(place))
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
 
     def _read(self, offset: int, length: int) -> memoryview:
         if offset + length > self.size:

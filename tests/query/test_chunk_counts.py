@@ -1,0 +1,139 @@
+"""Counts by time alone, against loops: what chunks are known to hold, and their indexes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog import reader
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import SegmentError
+from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
+
+AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
+PADDING = "a" * 60  # about ten messages fill a chunk
+
+rows = st.lists(
+    st.tuples(
+        st.integers(0, 60),
+        st.sampled_from(["/state", "/state", "/other"]),
+        st.just({"s": 0, "name": PADDING}),
+    ),
+    min_size=1,
+    max_size=80,
+)
+times = st.integers(-2, 63)
+WAYS = {"by chunks": -1, "as usual": reader._FEW, "by documents": 10**9}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    place = tmp_path_factory.mktemp("chunk-counts") / "store"
+    with hl.open(place, create=True, require_database=True) as opened:
+        yield opened
+
+
+def looped(model: Model, topics: set[str], windows: Intervals) -> int:
+    return sum(
+        m.topic in topics
+        and any(w.begin_ns <= m.time < w.end_ns for w in windows if w.recording == name)
+        for name, messages in model.logs.items()
+        for m in messages
+    )
+
+
+@several
+@given(
+    logs=st.fixed_dictionaries({"a": rows, "b": rows}),
+    spans=st.lists(st.tuples(st.sampled_from("ab"), times, st.integers(1, 30)), max_size=6),
+    edges=st.tuples(times, st.integers(1, 40)),
+)
+def test_a_count_by_time_is_what_a_loop_counts(
+    store: hl.Store,
+    logs: dict[str, list[tuple[int, str, dict[str, object]]]],
+    spans: list[tuple[str, int, int]],
+    edges: tuple[int, int],
+) -> None:
+    model = recorded(store, logs)
+    windows = intervals(*((n, BASE + b * SECOND, BASE + (b + s) * SECOND) for n, b, s in spans))
+    begin, end = (BASE + edges[0] * SECOND, BASE + (edges[0] + edges[1]) * SECOND)
+    both = intervals(("a", begin, end), ("b", begin, end))
+    with hl.open(store.directory.path, mongo=AWAY) as alone:
+        for asked in (store, alone):
+            for topics in ({"/state"}, set(store.topics())):
+                if not topics <= set(store.topics()):
+                    continue
+                query = asked.topic(*topics)
+                for way in WAYS.values():
+                    with pytest.MonkeyPatch.context() as patch:
+                        patch.setattr(reader, "_FEW", way)
+                        assert query.during(windows).count() == looped(model, topics, windows)
+                        between = query.between(f"{begin}ns", f"{end}ns")
+                        if any(begin <= m.time < end for _, ms in model.logs.items() for m in ms):
+                            assert between.count() == looped(model, topics, both)
+                            common = windows.common(both)
+                            assert between.during(windows).count() == looped(model, topics, common)
+
+
+@pytest.fixture
+def many(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+    """200 messages, a second apart, in about twenty chunks; counted by chunks."""
+    recorded(store, {"a": [(n, "/state", {"s": 0, "name": PADDING}) for n in range(200)]})
+    monkeypatch.setattr(reader, "_FEW", -1)
+    return store
+
+
+def segment_of(store: hl.Store) -> Path:
+    return store.directory.recording("a") / "000000.mcap"
+
+
+def test_a_count_by_time_reads_indexes_at_its_ends_only(many: hl.Store) -> None:
+    query = many.topic("/state").between("+5s", "+165s")
+    assert query.count() == 160
+    assert query.counters.documents_read == query.counters.chunks_read == 0
+    assert 0 < query.counters.bytes_read < 1000
+
+
+def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
+    path = segment_of(many)
+    whole = path.read_bytes()
+    chunk = many.chunks(many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log")[0]
+    length = chunk.length + chunk.trailer
+    with (
+        hl.open(many.directory.path, require_database=True) as opened,
+        hl.open(many.directory.path, mongo=AWAY) as alone,
+    ):
+        path.write_bytes(whole[: chunk.offset] + bytes(length) + whole[chunk.offset + length :])
+        try:
+            assert opened.topic("/state").between("+5s", "+165s").count() == 160  # by the index
+            with pytest.raises(SegmentError, match=path.name):
+                alone.topic("/state").between("+5s", "+165s").count()
+        finally:
+            path.write_bytes(whole)
+        assert alone.topic("/state").between("+5s", "+165s").count() == 160
+
+
+@pytest.mark.parametrize("damage", ["time", "length", "opcode"])
+def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) -> None:
+    """An index has no checksum: what it says is held against the entry of its chunk."""
+    path = segment_of(many)
+    whole = path.read_bytes()
+    chunk = many.chunks(many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log")[0]
+    index = chunk.offset + chunk.length
+    at = {"opcode": 0, "length": 2, "time": 9 + 6 + 16 + 5}[damage]
+    damaged = bytearray(whole)
+    damaged[index + at] ^= 0x10
+    path.write_bytes(damaged)
+    try:
+        with hl.open(many.directory.path, require_database=True) as opened:
+            query = opened.topic("/state").between("+5s", "+165s")
+            assert query.count() == 160
+            # With another length nothing of the chunk is found, and the index of MongoDB tells.
+            assert query.counters.chunks_read == (damage != "length")
+    finally:
+        path.write_bytes(whole)
