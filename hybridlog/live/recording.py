@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and is not copied first
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
-_TICK_S = 0.02  # the writing thread looks so often when little comes
+_TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
 _BEHIND = 8 << 20  # bytes not yet written from which all that can wait does
 _CALM_S = 1.0  # and for so long afterwards, or it would be the cause of the next delay
 _MOST_NS = 1 << 63
@@ -339,9 +339,10 @@ class LiveRecording:
         """What the writing thread does."""
         flushed = time.monotonic()
         interval = self._options.flush_interval_s
+        tick = min(_TICK_S, interval / 8)
         try:
             while True:
-                self._wake.wait(_TICK_S)
+                self._wake.wait(tick)
                 self._wake.clear()
                 ended = self._ended
                 self._take()
@@ -349,7 +350,8 @@ class LiveRecording:
                     self._write_losses(everything=True)
                     return
                 if time.monotonic() - flushed >= interval / 4:
-                    self._capture.writer.flush_older(interval * 3 / 4)
+                    # What is laid down now may have waited for a tick already.
+                    self._capture.writer.flush_older(interval * 3 / 4 - tick)
                     self._write_losses()
                     self._capture.index.nudge()
                     flushed = time.monotonic()

@@ -69,6 +69,7 @@ OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
 _MAX_CHANNELS = 65535
 _SHARED = -1
+_SPARSE = 4  # times the usual span, for a chunk that holds little
 _SYNC_STRIDE = 32 << 20  # bytes
 
 
@@ -79,6 +80,8 @@ class SegmentSettings:
     Attributes:
         chunk_size: Bytes of uncompressed content at which a chunk closes.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
+        span_size: Bytes of content below which it may span four times as much: what is read too
+            much for a short slice is little then, and what a chunk costs is not.
         large_payload: Mean payload bytes from which a channel gets chunks of its own.
         compression: Codec of chunks that can be compressed.
         level: zstd level.
@@ -90,6 +93,7 @@ class SegmentSettings:
 
     chunk_size: int = 2 << 20
     chunk_span_ns: int = 250_000_000
+    span_size: int = 16 << 10
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 1
@@ -104,6 +108,10 @@ class SegmentSettings:
             raise UsageError("the zstd level must lie between 1 and 19")
         if self.segment_span_s is not None and not self.segment_span_s > 0:
             raise UsageError("a segment must last longer than no time")
+
+    def span_of(self, held: int) -> int:
+        """Most log time, ns, of a chunk of its own that holds so many bytes."""
+        return self.chunk_span_ns * (1 if held >= self.span_size else _SPARSE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -568,8 +576,8 @@ class RecordingWriter:
         if len(builder):
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
-            is_far = key != _SHARED and away >= self.settings.chunk_span_ns
-            if is_far or size > self.settings.chunk_size:
+            is_far = away >= self.settings.span_of(len(builder))
+            if (key != _SHARED and is_far) or size > self.settings.chunk_size:
                 self._close_chunk(key)
         builder.append_one(
             payload,
@@ -683,7 +691,7 @@ class RecordingWriter:
             if not len(builder):
                 end = max(end, start + 1)  # a message larger than a chunk is a chunk
             if key != _SHARED:
-                end = min(end, self._span_end(builder, batch.log_time, start))
+                end = min(end, self._span_end(builder, batch, start))
             if end > start:
                 rows = slice(start, end)
                 builder.append(batch.take(rows), seq[rows])
@@ -691,11 +699,18 @@ class RecordingWriter:
             if start < total or len(builder) >= self.settings.chunk_size:
                 self._close_chunk(key)
 
-    def _span_end(self, builder: ChunkBuilder, log_time: NDArray[np.int64], start: int) -> int:
+    def _span_end(self, builder: ChunkBuilder, batch: Batch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
-        first = builder.first_log_time if len(builder) else int(log_time[start])
-        far = np.abs(log_time[start:] - first) >= self.settings.chunk_span_ns
-        return start + int(far.argmax()) if far.any() else len(log_time)
+        log_time = batch.log_time[start:]
+        first = builder.first_log_time if len(builder) else int(log_time[0])
+        away = np.abs(log_time - first)
+        if int(away.max()) < self.settings.chunk_span_ns:
+            return len(batch)
+        sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
+        held = np.cumsum(sizes) - sizes + len(builder)
+        is_sparse = held < self.settings.span_size
+        far = away >= np.where(is_sparse, self.settings.span_of(0), self.settings.chunk_span_ns)
+        return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:
         builder = self._clusters[key]

@@ -156,6 +156,25 @@ def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
             assert span < SegmentSettings().chunk_span_ns
 
 
+@pytest.mark.parametrize("at_once", [1, 7, 100])
+def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> None:
+    setup = SegmentSettings()
+    for place, size, hz in (("sparse", 2000, 8), ("usual", 5000, 16), ("rare", 5000, 1)):
+        step = 10**9 // hz
+        rows = many(100, size=size, step=step)
+        batches = [rows[at : at + at_once] for at in range(0, len(rows), at_once)]
+        _, chunks = write(tmp_path / place, batches)
+        counts = [len(chunk.batch) for chunk in chunks]
+        assert sum(counts) == 100
+        for chunk in chunks:
+            span = int(chunk.batch.log_time.max() - chunk.batch.log_time.min())
+            assert span < 4 * setup.chunk_span_ns
+            before = (len(chunk.batch) - 1) * (size + 31)
+            assert span - step < setup.chunk_span_ns or before - size < setup.span_size
+        want = {"sparse": 8, "usual": 4, "rare": 1}[place]
+        assert set(counts[:-1]) == {want}, place
+
+
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.5, 0.8, 0.95, 0.999, 1.0])
 def test_a_cut_segment_is_recovered(tmp_path: Path, keep: float) -> None:
     setup = SegmentSettings(chunk_size=4096)
