@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -358,43 +359,33 @@ def write_report(out: OutOption = Path("benchmark-results"), as_json: JsonOption
     raise typer.Exit(campaign.draw(out, as_json=as_json))
 
 
-@app.command(
-    add_help_option=False,
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+def _forward(name: str, module: str, about: str) -> None:
+    """A command that reads its own arguments."""
+
+    def command(
+        arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
+    ) -> None:
+        raise typer.Exit(import_module(module).main(arguments or []))
+
+    app.command(
+        name,
+        help=about,
+        add_help_option=False,
+        context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    )(command)
+
+
+_forward("speed", "benchmarks.speed.command", "Hybridlog against its own speed targets.")
+_forward(
+    "live",
+    "benchmarks.live.command",
+    "Recording a running robot under load, beside rosbag record.",
 )
-def speed(
-    arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
-) -> None:
-    """Hybridlog against its own speed targets."""
-    from benchmarks.speed.command import main as command
-
-    raise typer.Exit(command(arguments or []))
-
-
-@app.command(
-    add_help_option=False,
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+_forward(
+    "micro",
+    "benchmarks.micro.command",
+    "The hot paths, one at a time, and against another revision.",
 )
-def live(
-    arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
-) -> None:
-    """Recording a running robot under load, beside rosbag record."""
-    from benchmarks.live.command import main as command
-
-    raise typer.Exit(command(arguments or []))
-
-
-@app.command(
-    add_help_option=False,
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
-)
-def micro(
-    arguments: Annotated[list[str] | None, typer.Argument(metavar="ARGUMENT")] = None,
-) -> None:
-    """The hot paths, one at a time, and against another revision."""
-    from benchmarks.micro.command import main as command
-
-    raise typer.Exit(command(arguments or []))
 
 
 def _go(choices: object, *, only_list: bool) -> None:

@@ -6,13 +6,14 @@ and unpacked there, which needs apt but neither root nor an installation.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import subprocess
 import textwrap
 from pathlib import Path
 from typing import NamedTuple
+
+from tests.live_sources.peer_cache import made_once
 
 PACKAGES = (
     "python3-rosmaster",
@@ -47,21 +48,21 @@ def ros1() -> Ros1 | str:
         return installed
     if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
         return "it is not installed, and there is no apt to fetch it with"
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hybridlog-tests"
-    place = cache / "ros1-debian"
-    cache.mkdir(parents=True, exist_ok=True)
-    with (cache / "ros1.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (place / "ready").exists():
-            shutil.rmtree(place, ignore_errors=True)
-            try:
-                _fetch(place)
-            except subprocess.SubprocessError as error:
-                said = getattr(error, "stderr", None) or str(error)
-                return f"apt cannot fetch it: {(said.strip().splitlines() or [''])[-1]}"
-            (place / "ready").touch()
+    place = made_once("ros1-debian", _made)
+    if isinstance(place, str):
+        return place
     fetched = _in(place / "tree")
     return _failure(fetched) or fetched
+
+
+def _made(place: Path) -> str:
+    """Fetch everything; returns why it could not."""
+    try:
+        _fetch(place)
+    except subprocess.SubprocessError as error:
+        said = getattr(error, "stderr", None) or str(error)
+        return f"apt cannot fetch it: {(said.strip().splitlines() or [''])[-1]}"
+    return ""
 
 
 def _in(root: Path) -> Ros1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import random
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tests.live_sources.heard import Heard
+from tests.live_sources.peer_cache import made_once
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -55,25 +55,23 @@ def ros2_python() -> str | None:
     named = os.environ.get("HYBRIDLOG_TEST_ROS2_PYTHON")
     if named:
         return named
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hybridlog-tests"
     version = f"{sys.version_info.major}{sys.version_info.minor}"
-    place = cache / f"ros2-{WHEELS[0].partition('==')[2]}-cp{version}"
-    python, ready = place / "bin" / "python", place / "ready"
-    cache.mkdir(parents=True, exist_ok=True)
-    with (cache / "ros2.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not ready.exists():
-            commands = (
-                [sys.executable, "-m", "venv", "--clear", str(place)],
-                [str(python), "-m", "pip", "install", "--quiet", *WHEELS],
-            )
-            try:
-                for command in commands:
-                    subprocess.run(command, capture_output=True, check=True, timeout=200)
-            except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
-                return None
-            ready.touch()
-    return str(python)
+    place = made_once(f"ros2-{WHEELS[0].partition('==')[2]}-cp{version}", _make_ros2)
+    return None if isinstance(place, str) else str(place / "bin" / "python")
+
+
+def _make_ros2(place: Path) -> str:
+    """An environment with the wheels; returns why it could not be made."""
+    commands = (
+        [sys.executable, "-m", "venv", str(place)],
+        [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", *WHEELS],
+    )
+    try:
+        for command in commands:
+            subprocess.run(command, capture_output=True, check=True, timeout=200)
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    return ""
 
 
 ROBOT = """
