@@ -337,7 +337,7 @@ class LiveRecording:
 
     def _run(self) -> None:
         """What the writing thread does."""
-        flushed = time.monotonic()
+        flushed = told = time.monotonic()
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 8)
         try:
@@ -349,12 +349,15 @@ class LiveRecording:
                 if ended:
                     self._write_losses(everything=True)
                     return
-                if time.monotonic() - flushed >= interval / 4:
-                    # What is laid down now may have waited for a tick already.
+                now = time.monotonic()
+                if now - flushed >= tick:
+                    # What is laid down may have waited for a tick already.
                     self._capture.writer.flush_older(interval * 3 / 4 - tick)
+                    flushed = now
+                if now - told >= interval / 4:
                     self._write_losses()
                     self._capture.index.nudge()
-                    flushed = time.monotonic()
+                    told = now
         except BaseException as error:
             # Whatever it is: those who write and close must hear of it, or wait for ever.
             with self._lock:

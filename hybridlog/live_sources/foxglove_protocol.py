@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol, TypeGuard
 from urllib.parse import urlsplit
 
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -143,8 +144,7 @@ def parse_address(url: str) -> Address:
 
 def without_user(url: str) -> str:
     """An address as it may be shown: no password, nothing that a terminal acts on."""
-    shown = re.sub(r"//[^/]*@", "//", url[:_LONGEST])
-    return "".join(char if char.isprintable() else "?" for char in shown)
+    return one_line(re.sub(r"//[^/]*@", "//", url), _LONGEST)
 
 
 def parse_text(data: bytes) -> Mapping[str, object]:

@@ -21,13 +21,13 @@ from hybridlog.live_sources.foxglove_protocol import (
     unsubscribe,
 )
 from hybridlog.live_sources.ros1_header import is_numbered
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.messages import Channel
 
 _MOST_CHANNELS: Final = 1 << 16
 _MOST_RETIRED: Final = 1 << 12
 _MOST_NS: Final = 1 << 63
 _MOST_QUOTED: Final = 100
-_LONGEST: Final = 300
 _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
@@ -50,10 +50,7 @@ class Voice:
 
     def say(self, text: str) -> None:
         """Say something that may hold words of the server."""
-        if len(text) > _LONGEST:
-            text = text[:_LONGEST] + "..."
-        text = "".join(char if char.isprintable() else "?" for char in text)
-        self._sink.say(f"{self._name}: {text}")
+        self._sink.say(f"{self._name}: {one_line(text)}")
 
     def complain(self, text: str) -> None:
         """Say what the server may give reason for as often as it likes: not too often."""

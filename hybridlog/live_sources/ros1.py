@@ -22,7 +22,7 @@ from hybridlog.live_sources.ros1_rpc import RpcServer
 from hybridlog.live_sources.ros1_slave import listen, methods, uri_of
 from hybridlog.live_sources.ros1_subscription import Context
 from hybridlog.live_sources.ros1_troubles import Troubles
-from hybridlog.live_sources.ros1_wire import shown
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Ros1Source(LiveSource):
         try:
             asyncio.run(self._main(sink, uri))
         except BaseException as error:
-            sink.ended(f"the ROS 1 source failed: {shown(repr(error))}")
+            sink.ended(f"the ROS 1 source failed: {one_line(repr(error))}")
             raise
 
     async def _main(self, sink: Sink, uri: str) -> None:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from hybridlog.live_sources.ros1_network import PeerError
 from hybridlog.live_sources.ros1_rpc import RefusedError
 from hybridlog.live_sources.ros1_subscription import Subscription
-from hybridlog.live_sources.ros1_wire import ANY, shown
+from hybridlog.live_sources.ros1_wire import ANY
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -80,7 +81,7 @@ class Graph:
                 await self._look(context)
             except PeerError as error:
                 context.sink.say(
-                    f"no ROS master at {shown(self._uri)} ({error}); waiting for it. Start "
+                    f"no ROS master at {one_line(self._uri)} ({error}); waiting for it. Start "
                     "roscore, or say with --ros1 or ROS_MASTER_URI where it is"
                 )
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
@@ -152,7 +153,9 @@ class Graph:
         try:
             uris = await self._master.subscribe(topic)
         except RefusedError as error:
-            context.sink.say(f"{shown(topic)}: the ROS master does not let us subscribe: {error}")
+            context.sink.say(
+                f"{one_line(topic)}: the ROS master does not let us subscribe: {error}"
+            )
             return
         subscription.nodes = state.publishers.get(topic, frozenset())
         type_name, is_wanted = self._asked.get(topic, ("", True))

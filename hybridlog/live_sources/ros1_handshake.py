@@ -21,9 +21,9 @@ from hybridlog.live_sources.ros1_wire import (
     WireError,
     decode_header,
     encode_header,
-    shown,
     u32,
 )
+from hybridlog.live_sources.words import one_line
 
 # A computer that was switched off is noticed after some 25 s of silence.
 _KEEPALIVE: Final = (
@@ -59,7 +59,7 @@ async def subscribe(
     try:
         connected = await network.connect(place)
     except OSError as error:
-        raise UnreachedError(f"{shown(str(place))}: {reason_of(error)}") from error
+        raise UnreachedError(f"{one_line(str(place))}: {reason_of(error)}") from error
     try:
         for option in _KEEPALIVE:
             connected.setsockopt(*option)
@@ -107,7 +107,7 @@ async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -
     except WireError as error:
         raise PeerError(str(error)) from error
     if "error" in fields:
-        raise PeerError(f"it refuses: {shown(fields['error'])}")
+        raise PeerError(f"it refuses: {one_line(fields['error'])}")
     return fields
 
 

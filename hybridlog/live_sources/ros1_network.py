@@ -10,7 +10,7 @@ import threading
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
-from hybridlog.live_sources.ros1_wire import shown
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +55,7 @@ def endpoint_of(uri: str, default_port: int | None = None) -> Endpoint:
     Raises:
         PeerError: It is no such address.
     """
-    wrong = PeerError(f"{shown(uri)!r} is no address of the form http://host:port")
+    wrong = PeerError(f"{one_line(uri)!r} is no address of the form http://host:port")
     try:
         parts = urlsplit(uri)
     except ValueError as error:
@@ -81,7 +81,7 @@ def reason_of(error: Exception) -> str:
         return "no answer in time"
     if isinstance(error, OSError) and error.errno and not isinstance(error, socket.gaierror):
         return os.strerror(error.errno)
-    return shown(getattr(error, "strerror", None) or str(error))
+    return one_line(getattr(error, "strerror", None) or str(error))
 
 
 class Network:
@@ -101,7 +101,7 @@ class Network:
             OSError: Nobody listens there, the name is not known, or nobody answers.
         """
         loop = asyncio.get_running_loop()
-        failure: OSError = OSError(f"{shown(endpoint.host)} has no address")
+        failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
         addresses = await self.addresses_of(endpoint.host)
         for family, (host, _, *scope) in addresses[:_MOST_ADDRESSES]:
             made = socket.socket(family, socket.SOCK_STREAM)
@@ -145,7 +145,7 @@ def _look_up(host: str, flags: int = 0) -> Addresses:
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM, flags=flags)
     except ValueError as error:
-        raise OSError(f"{shown(host)} is no host name") from error
+        raise OSError(f"{one_line(host)} is no host name") from error
     return [(int(family), address) for family, _, _, _, address in found]
 
 

@@ -24,7 +24,7 @@ from hybridlog.live_sources.ros1_network import (
     endpoint_of,
     reason_of,
 )
-from hybridlog.live_sources.ros1_wire import shown
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     import socket
@@ -101,7 +101,7 @@ async def _exchange(connected: socket.socket, request: bytes) -> bytes:
     if len(status) < 2 or not status[0].startswith(b"HTTP/"):
         raise PeerError("it does not speak HTTP")
     if status[1] != b"200":
-        raise PeerError(f"it answers {shown(b' '.join(status[1:]))}")
+        raise PeerError(f"it answers {one_line(b' '.join(status[1:]))}")
     return bytes(got[body:total])
 
 
@@ -127,7 +127,7 @@ def _parsed(body: bytes) -> tuple[tuple[object, ...], str | None]:
     try:
         return xmlrpc.client.loads(body)
     except xmlrpc.client.Fault as fault:
-        raise PeerError(f"it answers: {shown(str(fault.faultString))}") from fault
+        raise PeerError(f"it answers: {one_line(str(fault.faultString))}") from fault
     except (
         ExpatError,
         xmlrpc.client.ResponseError,
@@ -146,7 +146,7 @@ def _value_of(answer: object) -> object:
     if not isinstance(answer, list) or len(answer) != 3 or not isinstance(answer[0], int):
         raise PeerError("its answer is none that a ROS node gives")
     if answer[0] != 1:
-        raise RefusedError(f"it refuses: {shown(str(answer[1]))}")
+        raise RefusedError(f"it refuses: {one_line(str(answer[1]))}")
     value: object = answer[2]
     return value
 
@@ -226,7 +226,7 @@ class RpcServer:
     def _result(self, method: str | None, values: tuple[object, ...]) -> str:
         known = self._methods.get(method or "")
         if known is None:
-            fault = xmlrpc.client.Fault(1, f"there is no method {shown(method or '')}")
+            fault = xmlrpc.client.Fault(1, f"there is no method {one_line(method or '')}")
             return xmlrpc.client.dumps(fault, methodresponse=True)
         return xmlrpc.client.dumps((known(values),), methodresponse=True)
 

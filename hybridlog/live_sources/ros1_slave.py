@@ -7,7 +7,7 @@ import socket
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live_sources.ros1_network import Endpoint, reason_of
-from hybridlog.live_sources.ros1_wire import shown
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -47,7 +47,7 @@ async def listen(
         if host == loopback:
             raise
         say(
-            f"{variable}={shown(host)} is no address of this computer ({reason_of(error)}); "
+            f"{variable}={one_line(host)} is no address of this computer ({reason_of(error)}); "
             "the ROS master cannot tell of new publishers, they are found by asking it"
         )
     return _bound(await network.addresses_of(loopback), is_ipv6=is_ipv6), loopback
@@ -95,7 +95,7 @@ def methods(
         return [-1, "publisherUpdate takes a caller, a topic and its publishers", 0]
 
     def shutdown(arguments: tuple[object, ...]) -> list[object]:
-        caller = shown(str(arguments[0])) if arguments else "somebody"
+        caller = one_line(str(arguments[0])) if arguments else "somebody"
         say(f"{caller} asks this node to end; recordings are ended where they were begun")
         return [-1, "a recorder is ended by who started it", 0]
 

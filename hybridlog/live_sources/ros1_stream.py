@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1_counting import Counting
 from hybridlog.live_sources.ros1_header import is_numbered
-from hybridlog.live_sources.ros1_wire import shown, u32
+from hybridlog.live_sources.ros1_wire import u32
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,7 +62,7 @@ class Stream:
         self._block = self._shortest = min(_BLOCK, max_message_bytes + 4)
         self._longest = min(_PIECE, max_message_bytes + 4)
         self._counting = Counting() if is_numbered(channel) else None
-        self._publisher = f"publisher {shown(channel.metadata.get('callerid', '') or 'unknown')}"
+        self._publisher = f"publisher {one_line(channel.metadata.get('callerid', '') or 'unknown')}"
         # Of the message that is not whole yet: its first bytes and how many are missing;
         # without a length yet, what there is of the length.
         self._parts: list[bytes] = []

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.live_sources.ros1_handshake import subscribe
 from hybridlog.live_sources.ros1_network import PeerError
 from hybridlog.live_sources.ros1_stream import Stream
-from hybridlog.live_sources.ros1_wire import ANY, channel_of, shown
+from hybridlog.live_sources.ros1_wire import ANY, channel_of
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     import socket
@@ -127,10 +128,11 @@ class Subscription:
         if not self._type:
             self._type = type_name
         elif type_name != self._type:
-            publisher = shown(fields.get("callerid", "a node without a name"))
+            publisher = one_line(fields.get("callerid", "a node without a name"))
             self._context.sink.say(
-                f"{shown(self.topic)}: publishers do not agree on its type, {shown(self._type)} "
-                f"or {shown(type_name)} (from {publisher}); each is recorded as it comes"
+                f"{one_line(self.topic)}: publishers do not agree on its type, "
+                f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
+                "each is recorded as it comes"
             )
         wanted = self._types.get(type_name)
         if wanted is None:
@@ -226,8 +228,8 @@ class _Link:
             self._has_told = True
             name = channel.metadata.get("callerid", "a node without a name")
             context.sink.say(
-                f"{shown(self._subscription.topic)}: lost the connection to {shown(name)} at "
-                f"{shown(self._uri)}: {failure}; connecting again"
+                f"{one_line(self._subscription.topic)}: lost the connection to {one_line(name)} at "
+                f"{one_line(self._uri)}: {failure}; connecting again"
             )
 
     def _set_up(self, *, is_up: bool) -> None:

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live_sources.ros1_network import UnreachedError, reason_of
-from hybridlog.live_sources.ros1_wire import shown
+from hybridlog.live_sources.words import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,11 +71,11 @@ class Troubles:
         """Say what has been gathered."""
         new, self._new = self._new, {}
         for (uri, is_away), (reason, topics) in new.items():
-            self._say(_line(shown(uri), reason, sorted(topics), is_away=is_away))
+            self._say(_line(one_line(uri), reason, sorted(topics), is_away=is_away))
 
 
 def _line(uri: str, reason: str, topics: list[str], *, is_away: bool) -> str:
-    named = ", ".join(map(shown, topics[:_NAMED])) + (", …" if len(topics) > _NAMED else "")
+    named = ", ".join(map(one_line, topics[:_NAMED])) + (", …" if len(topics) > _NAMED else "")
     its = "its"
     if len(topics) > 1:
         named, its = f"{len(topics)} topics ({named})", "their"

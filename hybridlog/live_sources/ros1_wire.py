@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from
 """Reads the number at a place of a buffer, in a tuple."""
 
 _MAX_FIELDS = 1000
-_LINE_LENGTH = 300
 
 
 class WireError(Exception):
@@ -55,7 +55,7 @@ def decode_header(body: bytes) -> dict[str, str]:
             raise WireError(f"a field of its header is {end - len(body)} bytes longer than it")
         key, equals, value = body[pos + 4 : end].partition(b"=")
         if not equals:
-            raise WireError(f"a field of its header has no '=': {shown(key)}")
+            raise WireError(f"a field of its header has no '=': {one_line(key)}")
         if len(fields) == _MAX_FIELDS:
             raise WireError(f"its header has more than {_MAX_FIELDS} fields")
         fields[key.decode(errors="replace").strip()] = value.decode(errors="replace")
@@ -79,13 +79,3 @@ def channel_of(topic: str, fields: Mapping[str, str]) -> Channel:
         encoding = "" if definition is None else "ros1msg"
         schema = Schema(name, encoding, (definition or "").encode())
     return Channel(topic, "ros1", schema, metadata, has_publish_time=False)
-
-
-def shown(text: str | bytes, limit: int = _LINE_LENGTH) -> str:
-    """What a peer said, for people: in one line, not too long, harmless for a terminal."""
-    if isinstance(text, bytes):
-        text = text[: limit * 4].decode(errors="replace")
-    short = text if len(text) <= limit else f"{text[:limit]}..."
-    if short.isprintable():
-        return short
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in short)

@@ -15,7 +15,8 @@ from hybridlog.live_sources.base import LiveSource
 from hybridlog.live_sources.ros2_overrides import read_overrides
 from hybridlog.live_sources.ros2_process import ChildError, Process, launch
 from hybridlog.live_sources.ros2_receiver import Receiver, report_outage
-from hybridlog.live_sources.ros2_wire import WireError, one_line
+from hybridlog.live_sources.ros2_wire import WireError
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 
 if TYPE_CHECKING:

@@ -25,9 +25,9 @@ from hybridlog.live_sources.ros2_wire import (
     HEADER,
     WireError,
     check_frame,
-    one_line,
     parse_object,
 )
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:

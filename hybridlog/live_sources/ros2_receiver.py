@@ -16,9 +16,9 @@ from hybridlog.live_sources.ros2_wire import (
     MESSAGES,
     WireError,
     check_frame,
-    one_line,
     parse_object,
 )
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:

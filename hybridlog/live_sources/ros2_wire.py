@@ -44,18 +44,9 @@ MAX_BATCH = 16 << 20
 LARGE = 32 << 10
 """Payloads from this many bytes on travel alone."""
 
-_MAX_TEXT = 400
-
 
 class WireError(Exception):
     """The other end says what it must not."""
-
-
-def one_line(text: str) -> str:
-    """Text from elsewhere as one line that does nothing to a terminal."""
-    words = " ".join(text.split())
-    shown = "".join(char if char.isprintable() else "?" for char in words)
-    return shown if len(shown) <= _MAX_TEXT else f"{shown[:_MAX_TEXT]}..."
 
 
 def event_frame(event: dict[str, Any]) -> bytes:

@@ -109,10 +109,6 @@ class SegmentSettings:
         if self.segment_span_s is not None and not self.segment_span_s > 0:
             raise UsageError("a segment must last longer than no time")
 
-    def span_of(self, held: int) -> int:
-        """Most log time, ns, of a chunk of its own that holds so many bytes."""
-        return self.chunk_span_ns * (1 if held >= self.span_size else _SPARSE)
-
 
 @dataclass(frozen=True, slots=True)
 class StoredChunk:
@@ -576,7 +572,7 @@ class RecordingWriter:
         if len(builder):
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
-            is_far = away >= self.settings.span_of(len(builder))
+            is_far = away >= self._span_of(len(builder))
             if (key != _SHARED and is_far) or size > self.settings.chunk_size:
                 self._close_chunk(key)
         builder.append_one(
@@ -699,6 +695,11 @@ class RecordingWriter:
             if start < total or len(builder) >= self.settings.chunk_size:
                 self._close_chunk(key)
 
+    def _span_of(self, held: int) -> int:
+        """Most log time, ns, of a chunk of its own that holds so many bytes."""
+        settings = self.settings
+        return settings.chunk_span_ns * (1 if held >= settings.span_size else _SPARSE)
+
     def _span_end(self, builder: ChunkBuilder, batch: Batch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
         log_time = batch.log_time[start:]
@@ -709,7 +710,7 @@ class RecordingWriter:
         sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
         held = np.cumsum(sizes) - sizes + len(builder)
         is_sparse = held < self.settings.span_size
-        far = away >= np.where(is_sparse, self.settings.span_of(0), self.settings.chunk_span_ns)
+        far = away >= np.where(is_sparse, self._span_of(0), self.settings.chunk_span_ns)
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:

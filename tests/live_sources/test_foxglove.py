@@ -542,7 +542,7 @@ def test_a_channel_that_is_offered_and_never_sent_is_told(monkeypatch: pytest.Mo
         (text({"op": "advertise"}), "no list of channels"),
         (text({"op": "unadvertise", "channelIds": 5}), "no list of channels"),
         (advertise(5, channel(2, "")), "without a topic"),
-        (text({"op": "status", "level": 2, "message": "\x1b[31mbad\nnews"}), "says: ?[31mbad?news"),
+        (text({"op": "status", "level": 2, "message": "\x1b[31mbad\nnews"}), "says: ?[31mbad news"),
         (message(4711, 0, b"x"), "subscription that we do not have"),
         (frame(Opcode.BINARY, b""), "empty binary message"),
         (frame(Opcode.BINARY, b"\x01abc"), "shorter than its header"),

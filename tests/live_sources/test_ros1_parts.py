@@ -20,8 +20,8 @@ from hybridlog.live_sources.ros1_wire import (
     channel_of,
     decode_header,
     encode_header,
-    shown,
 )
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.messages import Channel, Schema
 from tests.live_sources.ros1_peers import Collector, framed
 
@@ -116,10 +116,10 @@ def test_types_that_publishers_number(definition: str, numbered: bool) -> None:
 
 @pytest.mark.parametrize("text", ["\x1b[2J", "a\nb", "\x9b1m", "\u202eabc", "x" * 5000, "\ud800"])
 def test_what_peers_say_is_shown_harmlessly(text: str) -> None:
-    line = shown(text)
+    line = one_line(text)
     assert line.isprintable()
     assert len(line) < 1000
-    assert shown(text.encode(errors="replace")).isprintable()
+    assert one_line(text.encode(errors="replace")).isprintable()
 
 
 # Addresses

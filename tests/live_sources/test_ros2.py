@@ -16,7 +16,7 @@ from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros2 import Ros2Source
 from hybridlog.live_sources.ros2_overrides import read_overrides
 from hybridlog.live_sources.ros2_process import PYTHON_VARIABLE, candidates, environment_for
-from hybridlog.live_sources.ros2_wire import one_line
+from hybridlog.live_sources.words import one_line
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.live_sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until
 
