@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from benchmarks.disturbance import is_disturbed
 from benchmarks.report import numbers
 from benchmarks.report.look import ordered
 from benchmarks.report.model import Cell, Value
@@ -127,10 +128,30 @@ def persisted(sample: Sample) -> float | None:
     return None if found is None else 100 * found
 
 
+DISTURBED = "†"
+MEANING = (
+    f"{DISTURBED} The host of this machine took more than a twentieth of the processors' time "
+    "during the run, the least disturbed of several: on a quiet one more may have been kept."
+)
+"""What the mark says to whoever reads a table."""
+
+
 def percents(samples: Iterable[Sample]) -> Cell:
-    """The persisted share of some repetitions, as text that never rounds up to 100."""
-    found = value(samples, persisted)
-    return None if found is None else numbers.percents(found)
+    """The persisted share of some repetitions, as text that never rounds up to 100.
+
+    Where the machine may be why something was lost, it carries the mark `DISTURBED`.
+    """
+    of = list(samples)
+    found = value(of, persisted)
+    if found is None:
+        return None
+    mark = DISTURBED if any(is_disturbed(one.values) for one in of) else ""
+    return f"{numbers.percents(found)}{mark}"
+
+
+def with_meaning(note: str, samples: Iterable[Sample]) -> str:
+    """A note under shares that were kept; it explains the mark where one of them has it."""
+    return f"{note} {MEANING}" if any(is_disturbed(one.values) for one in samples) else note
 
 
 def is_whole(samples: Sequence[Sample]) -> bool:

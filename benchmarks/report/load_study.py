@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.report.book import (
+    DISTURBED,
+    MEANING,
     Book,
     by_backend,
     by_case,
@@ -16,6 +18,7 @@ from benchmarks.report.book import (
     persisted,
     repetitions,
     value,
+    with_meaning,
 )
 from benchmarks.report.look import FLOORS, OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
@@ -120,6 +123,8 @@ def findings(book: Book) -> list[str]:
         )
     if kept_by_all:
         found.append(f"Of {listed(kept_by_all)}, every backend kept everything.")
+    if any(DISTURBED in text for text in found):
+        found.append(MEANING)
     for (log,), group in _logs(_trials(book)).items():
         bounds = [
             f"{title(name)} {_bound(of)}"
@@ -228,7 +233,7 @@ def _persisted(samples: Sequence[Sample]) -> Table:
         "Persisted, % of the messages",
         ("backend", *(log for (log,) in logs)),
         rows,
-        f"Median (least…greatest) of {repetitions(samples)}.",
+        with_meaning(f"Median (least…greatest) of {repetitions(samples)}.", samples),
         title(OURS),
     )
 

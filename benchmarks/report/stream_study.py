@@ -17,6 +17,7 @@ from benchmarks.report.book import (
     repetitions,
     throughput,
     value,
+    with_meaning,
 )
 from benchmarks.report.look import OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table
@@ -252,4 +253,6 @@ def _table(
         rows.append((title(name), *cells))
     columns = ("backend", *(size(bytes_) for (bytes_,) in cases))
     note = f"Median (least…greatest) of {repetitions(samples)}."
+    if measure is percents:
+        note = with_meaning(note, samples)
     return Table(heading, columns, tuple(rows), note, title(OURS))

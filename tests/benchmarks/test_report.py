@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.machine import cores
 from benchmarks.report import figures, numbers
 from benchmarks.report.book import Book
 from benchmarks.report.build import report
@@ -81,8 +82,8 @@ def stream(backend: str, share: float, repetition: int = 0, **more: float) -> Sa
     return Sample("throughput", case, backend, repetition, "ok", run_values(share, **more))
 
 
-def whole_log(log: str, backend: str, share: float) -> Sample:
-    return Sample("persistence", {"log": log}, backend, 0, "ok", run_values(share))
+def whole_log(log: str, backend: str, share: float, **more: float) -> Sample:
+    return Sample("persistence", {"log": log}, backend, 0, "ok", run_values(share, **more))
 
 
 def question(name: str, backend: str, ms: float, answer: Any = 3) -> Sample:
@@ -335,6 +336,32 @@ def test_quick_runs_are_marked_everywhere(tmp_path: Path) -> None:
     assert "quick run" in found.warnings[0]
     html = page(found, {})
     assert html.count('<span class="quick">') == len(found.sections) + len(found.graphs)
+
+
+def test_a_share_that_the_machine_may_have_cost_is_marked(tmp_path: Path) -> None:
+    taken = 5.0 * cores()  # half of the processors' time
+    found = report(
+        journal(
+            tmp_path,
+            whole_log("mit1", "hybridlog", 1.0, steal_s=taken),
+            whole_log("mit1", "mongo_json", 0.9, steal_s=taken),
+            whole_log("mit1", "mcap", 0.9),
+            stream("hybridlog", 1.0, steal_s=taken),
+            stream("mongo_json", 0.5, steal_s=taken),
+        )
+    )
+    for name in ("Persisted, % of the messages", "Persisted at 64 Hz"):
+        shares = table(found, name)
+        rows = {row[0]: row[1] for row in shares.rows}
+        assert rows["hybridlog"] == "100"
+        assert rows["MongoDB"] in {"90†", "50†"}
+        assert rows.get("plain MCAP", "90") == "90"
+        assert "† The host" in shares.note
+    text = " ".join(found.findings)
+    assert "MongoDB 90† % and plain MCAP 90 %" in text
+    assert text.count("† The host") == 1
+    quiet = report(journal(tmp_path / "quiet", whole_log("mit1", "mongo_json", 0.9)))
+    assert "†" not in all_text(quiet)
 
 
 def test_missing_failed_and_lost_are_all_named(tmp_path: Path) -> None:
