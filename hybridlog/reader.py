@@ -64,6 +64,8 @@ if TYPE_CHECKING:
 _BATCH = 10_000  # index documents that come at a time
 _FEW = 50
 """So many index documents are counted in the time in which a chunk's entry is fetched."""
+_BACK_NS = 1_000_000_000
+_FURTHER = 64
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
@@ -411,14 +413,17 @@ class Query:
         for latest, now, recording in sorted(moments, key=lambda m: m[0], reverse=True):
             if best is not None and latest < best[0][0]:
                 break
-            query = self._with(
-                recording_ids=(recording.id,),
-                _bounds=("0ns", f"{now + 1}ns"),
-                _clock="log",
-                _reverse=True,
-                _limit=1,
-            )
-            found = query.first()
+            for begin in _earlier_and_earlier(latest, _span(recording)[0]):
+                query = self._with(
+                    recording_ids=(recording.id,),
+                    _bounds=(f"{begin}ns", f"{now + 1}ns"),
+                    _clock="log",
+                    _reverse=True,
+                    _limit=1,
+                )
+                found = query.first()
+                if found is not None:
+                    break
             if found is not None:
                 place = found.log_time_ns, recording.key, found.seq
                 if best is None or place > best[0]:
@@ -1099,6 +1104,18 @@ class Query:
     @staticmethod
     def _has(target: Target, lanes: list[Lane], topic: str) -> bool:
         return any(lanes[i].channel.topic == topic for i in target.lanes.values())
+
+
+def _earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
+    """Where to begin to look for the last message by a time, ns: close to it first.
+
+    All chunks before it are many in a long recording, and mostly the last one has it.
+    """
+    back = _BACK_NS
+    while latest - back > start:
+        yield latest - back
+        back *= _FURTHER
+    yield 0
 
 
 def _topics_of(target: Target) -> list[str]:
