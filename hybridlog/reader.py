@@ -64,8 +64,9 @@ if TYPE_CHECKING:
 _BATCH = 10_000  # index documents that come at a time
 _FEW = 50
 """So many index documents are counted in the time in which a chunk's entry is fetched."""
-_BACK_NS = 1_000_000_000
-_FURTHER = 64
+_HANDFUL = 50  # messages for which nothing is read ahead
+_BACK_NS = 1_000_000_000  # a message at a time is looked for so far back first,
+_FURTHER = 64  # and then so many times as far
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
@@ -878,7 +879,8 @@ class Query:
         """The plan's messages, thinned out and limited."""
         if self._limit == 0:
             return
-        pieces = Sweep(plan, self.store.segment).pieces()
+        is_long = self._limit is None or self._limit > _HANDFUL
+        pieces = Sweep(plan, self.store.segment, ahead=is_long).pieces()
         if self.is_unthinned:
             for piece in pieces:
                 count_given(plan.counters, piece.batch)

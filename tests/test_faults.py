@@ -83,7 +83,7 @@ def path(tmp_path: Path) -> Iterator[Path]:
 def store(path: Path, short: Path) -> Iterator[hl.Store]:
     """A store with the recording `short`, in several segments."""
     with hl.open(path, require_database=True) as opened:
-        settings = SegmentSettings(chunk_size=16 << 10, segment_size=60_000)
+        settings = SegmentSettings(chunk_size=16 << 10, segment_size=60_000, span_size=0)
         report = opened.record(short, settings=settings)
         assert report.entry.id == "short"
         assert report.entry.segments > 2

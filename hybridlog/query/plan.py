@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
@@ -205,11 +206,19 @@ class Sweep:
     Args:
         plan: What to read.
         reader_of: Gives the reader of a segment, by recording id and number.
+        ahead: Whether to read ahead; not worth it for who takes a few messages and leaves.
     """
 
-    def __init__(self, plan: Plan, reader_of: Callable[[str, int], SegmentReader]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        reader_of: Callable[[str, int], SegmentReader],
+        *,
+        ahead: bool = True,
+    ) -> None:
         self._plan = plan
         self._reader_of = reader_of
+        self._reads_ahead = ahead
 
     def pieces(self) -> Iterator[Piece]:
         """All messages, in order; whoever gives them out counts them."""
@@ -252,10 +261,11 @@ class Sweep:
                     yield task, offsets
 
     def _loaded(self) -> Iterator[tuple[Piece, Task | None]]:
-        """The wanted messages of each chunk, read a little ahead, and the chunk after it."""
+        """The wanted messages of each chunk, and the chunk after it."""
         tasks = self._plan.tasks()
-        if sum(task.chunk.length for task in tasks) < _WORTH_THREADS:
-            yield from self._ahead(tasks, lambda *item: _Done(self._load(*item)))
+        size = sum(task.chunk.length for task in tasks)
+        if size < _WORTH_THREADS or not self._reads_ahead:
+            yield from self._ahead(tasks, lambda *item: _Later(partial(self._load, *item)))
             return
         with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
             try:
@@ -370,13 +380,13 @@ class _Loading(Protocol):
 
 
 @dataclass(slots=True)
-class _Done:
-    """A chunk that is there."""
+class _Later:
+    """A chunk that is read when it is asked for."""
 
-    loaded: tuple[Piece, int]
+    load: Callable[[], tuple[Piece, int]]
 
     def result(self) -> tuple[Piece, int]:
-        return self.loaded
+        return self.load()
 
 
 def _rows(piece: Piece, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Piece:
