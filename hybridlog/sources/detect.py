@@ -16,6 +16,7 @@ from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
     from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 
 _BAG = b"#ROSBAG V"
 _OLD_BAG = b"#ROSRECORD V"
@@ -49,14 +50,14 @@ def open_source(path: Path) -> Source:
             without a log. The message says which and what to do.
     """
     try:
-        if path.is_dir():
+        mode = path.stat().st_mode
+        if S_ISDIR(mode):
             return _open_directory(path)
-        path.stat()
     except OSError as error:
         raise cannot_open(path, error) from error
     if path.name == NAME:
         return _open_directory(path.parent)
-    if not path.is_file():
+    if not S_ISREG(mode):
         raise SourceError(f"{path}: neither a file nor a directory; give the path of a log")
     metadata = read_metadata(path.parent)
     if isinstance(metadata, BagMetadata) and path.name in metadata.files:

@@ -195,7 +195,7 @@ def test_publishers_of_different_types() -> None:
             master.add("/topic", "", "/int", other.uri)
             sink.wait_for(b"text", b"7")
             eventually(lambda: bool(bools.asked))
-            sink.wait_said("/topic", "std_msgs/String", "std_msgs/Int8", r"/int\x1b[31m")
+            sink.wait_said("/topic", "std_msgs/String", "std_msgs/Int8", "/int?[31m")
     assert bools.connections <= 1
     schemas = [taken.channel.schema for taken in sink.taken]
     assert [schema.name for schema in schemas if schema] == ["std_msgs/String", "std_msgs/Int8"]
@@ -307,7 +307,7 @@ def _xml(value: object) -> bytes:
     [
         (b"", "does not speak HTTP"),
         (b"SSH-2.0-x\r\n\r\n", "does not speak HTTP"),
-        (b"HTTP/1.0 404 \x1b[2JNo\r\n\r\n", r"404 \x1b[2JNo"),
+        (b"HTTP/1.0 404 \x1b[2JNo\r\n\r\n", "404 ?[2JNo"),
         (_http(b"<html>"), "no XML-RPC"),
         (_http(b"", length="99999999999"), "longer than"),
         (_http(b"", length="-1"), "gives a length that is none"),
@@ -316,7 +316,7 @@ def _xml(value: object) -> bytes:
         (_xml([1, "", [[["/a", "b"]], [], []]]), "none that a ROS master gives"),
         (_xml([1, "", 5]), "none that a ROS master gives"),
         (_xml({"a": 1}), "none that a ROS node gives"),
-        (_xml([-1, "go \x9b away", 0]), r"it refuses: go \x9b away"),
+        (_xml([-1, "go \x9b away", 0]), "it refuses: go ? away"),
         (_http(xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no")).encode()), "it answers: no"),
         (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", "in chunks"),
     ],
@@ -450,7 +450,7 @@ def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:
         (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "no '='"),
         (b"\x20\0\0\0abc", "hangs up before its connection header is complete"),
         (b"", "hangs up before its connection header is complete"),
-        (framed(framed(b"error=you \x1b[31m may not")), r"it refuses: you \x1b[31m may not"),
+        (framed(framed(b"error=you \x1b[31m may not")), "it refuses: you ?[31m may not"),
     ],
 )
 def test_a_broken_header(greeting: bytes, words: str) -> None:
@@ -570,7 +570,7 @@ def test_what_other_programs_may_ask() -> None:
             assert node.shutdown("/me\x9b", "because")[0] == -1
             with pytest.raises(xmlrpc.client.Fault, match="no method"):
                 node.system.listMethods()
-        sink.wait_said(r"/me\x9b asks this node to end")
+        sink.wait_said("/me? asks this node to end")
         place = ("127.0.0.1", int(api.rstrip("/").rpartition(":")[2]))
         for request in (
             b"GET / HTTP/1.0\r\n\r\n",
