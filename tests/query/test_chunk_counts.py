@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -52,32 +53,35 @@ def looped(model: Model, topics: set[str], windows: Intervals) -> int:
     logs=st.fixed_dictionaries({"a": rows, "b": rows}),
     spans=st.lists(st.tuples(st.sampled_from("ab"), times, st.integers(1, 30)), max_size=6),
     edges=st.tuples(times, st.integers(1, 40)),
+    is_away=st.booleans(),
 )
 def test_a_count_by_time_is_what_a_loop_counts(
     store: hl.Store,
     logs: dict[str, list[tuple[int, str, dict[str, object]]]],
     spans: list[tuple[str, int, int]],
     edges: tuple[int, int],
+    is_away: bool,
 ) -> None:
     model = recorded(store, logs)
     windows = intervals(*((n, BASE + b * SECOND, BASE + (b + s) * SECOND) for n, b, s in spans))
     begin, end = (BASE + edges[0] * SECOND, BASE + (edges[0] + edges[1]) * SECOND)
     both = intervals(("a", begin, end), ("b", begin, end))
-    with hl.open(store.directory.path, mongo=AWAY) as alone:
-        for asked in (store, alone):
-            for topics in ({"/state"}, set(store.topics())):
-                if not topics <= set(store.topics()):
-                    continue
-                query = asked.topic(*topics)
-                for way in WAYS.values():
-                    with pytest.MonkeyPatch.context() as patch:
-                        patch.setattr(reader, "_FEW", way)
-                        assert query.during(windows).count() == looped(model, topics, windows)
-                        between = query.between(f"{begin}ns", f"{end}ns")
-                        if any(begin <= m.time < end for _, ms in model.logs.items() for m in ms):
-                            assert between.count() == looped(model, topics, both)
-                            common = windows.common(both)
-                            assert between.during(windows).count() == looped(model, topics, common)
+    with (
+        hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        for topics in ({"/state"}, set(store.topics())):
+            if not topics <= set(store.topics()):
+                continue
+            query = asked.topic(*topics)
+            for way in WAYS.values():
+                patch.setattr(reader, "_FEW", way)
+                assert query.during(windows).count() == looped(model, topics, windows)
+                between = query.between(f"{begin}ns", f"{end}ns")
+                if any(begin <= m.time < end for _, ms in model.logs.items() for m in ms):
+                    assert between.count() == looped(model, topics, both)
+                    common = windows.common(both)
+                    assert between.during(windows).count() == looped(model, topics, common)
 
 
 @pytest.fixture
