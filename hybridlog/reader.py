@@ -1020,9 +1020,8 @@ class Query:
         """Messages of one recording in the range of log time, whatever is in them."""
         has_index = self.store.database is not None
         topics = _topics_of(target)
-        if has_index:
-            topics = [t for t in topics if _has_full_chunks(target.recording, t)]
-        channels = [c.id for c in target.recording.channels if c.topic in topics]
+        counted = {t for t in topics if not has_index or _has_full_chunks(target.recording, t)}
+        channels = [c.id for c in target.recording.channels if c.topic in counted]
         total = 0
         if channels:
             span = target.bounds or (0, TIME_LIMIT - 1)
@@ -1039,8 +1038,8 @@ class Query:
             except SegmentError:
                 if not has_index:
                     raise
-                topics = []  # the index knows it without the segment
-        left = [(t, target) for t in _topics_of(target) if t not in topics]
+                counted = set()  # the index knows it without the segment
+        left = [(topic, target) for topic in topics if topic not in counted]
         return total + self._count_documents(left) if left else total
 
     def _count_documents(self, wanted: Sequence[tuple[str, Target]]) -> int:
@@ -1067,7 +1066,7 @@ class Query:
         lanes: list[Lane] = []
         self._reset()
         found = self._targets(lanes, with_chunks=False)
-        targets = [t for t in found if self._has(t, lanes, topic)]
+        targets = [t for t in found if topic in _topics_of(t)]
         started = time.monotonic()
         taken = given = 0
         collection, order = collection_of(topic), -1 if self._reverse else 1
@@ -1102,10 +1101,6 @@ class Query:
                 taken += count
                 if self._limit is not None and given >= self._limit:
                     return
-
-    @staticmethod
-    def _has(target: Target, lanes: list[Lane], topic: str) -> bool:
-        return any(lanes[i].channel.topic == topic for i in target.lanes.values())
 
 
 def _earlier_and_earlier(latest: int, start: int) -> Iterator[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from enum import Enum
+from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
 
 from hybridlog.sources import spool
@@ -16,7 +17,6 @@ from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
     from pathlib import Path
-from stat import S_ISDIR, S_ISREG
 
 _BAG = b"#ROSBAG V"
 _OLD_BAG = b"#ROSRECORD V"
