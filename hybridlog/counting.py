@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.column_answers import chosen
+from hybridlog.kept_columns import cost_s
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.catalog import RECORDINGS
@@ -86,6 +88,8 @@ def any_in_each(query: Query, recording: str, spans: NDArray[np.int64]) -> NDArr
     if recording not in query.recording_ids or not len(spans):
         return found
     part = query.in_recording(recording)
+    if _in_columns(part, spans, found):
+        return found
     entry = part.store.select([recording])[0]
     rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
     covered = joined(rows[np.argsort(rows[:, 0], kind="stable")])
@@ -98,6 +102,20 @@ def any_in_each(query: Query, recording: str, spans: NDArray[np.int64]) -> NDArr
     first, after = np.searchsorted(times, spans[:, 0]), np.searchsorted(times, spans[:, 1])
     found[:] = first < after
     return found
+
+
+def _in_columns(query: Query, spans: NDArray[np.int64], found: NDArray[np.bool_]) -> bool:
+    """Mark the spans in which a message lies, if columns tell it; whether they do."""
+    instead_s = cost_s(_SEVERAL * len(spans), windows=len(spans)) / len(query.topics)
+    for topic in query.topics:
+        parts = chosen(query, topic, instead_s=instead_s)
+        if parts is None:
+            return False
+        for part, rows in parts:
+            times = part.columns.log_time[rows]
+            first, after = np.searchsorted(times, spans.T)
+            found |= first < after
+    return True
 
 
 def _asked_each(query: Query, entry: RecordingEntry, spans: NDArray[np.int64]) -> NDArray[np.bool_]:

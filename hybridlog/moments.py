@@ -6,12 +6,14 @@ windows, the fields in question for changes. No payload is read.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.column_answers import Judged, chosen, judged
 from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
+from hybridlog.kept_columns import cost_s
 from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.query.unequal import unequal
@@ -39,6 +41,13 @@ def states(query: Query, max_gap: DurationLike | None) -> Intervals:
     gap = None if max_gap is None else parse_duration(max_gap)
     if gap == 0:
         raise UsageError("A message that is believed for no time makes no interval.")
+    found = _judged(query, ())
+    if found is not None:
+        return Intervals.of(
+            (entry.id, rows)
+            for entry, span in query.spans()
+            for rows in _states_kept(found[entry.id], span, gap)
+        )
     return Intervals.of(
         (entry.id, rows)
         for entry, span in query.spans()
@@ -54,6 +63,14 @@ def changes(
     if not tolerance >= 0 or tolerance == np.inf:
         raise UsageError(f"A tolerance is a number from 0 on, not {tolerance}.")
     quiet = parse_duration(pause)
+    leaves = _leaves(query, fields)
+    found = None if leaves is None else _judged(query, leaves)
+    if found is not None and leaves is not None:
+        return Intervals.of(
+            (entry.id, rows)
+            for entry, span in query.spans()
+            for rows in _changes_kept(found[entry.id], leaves, span, tolerance, Changing(quiet))
+        )
     projection = {**_KEY, **dict.fromkeys(_outermost(fields), 1)}
     return Intervals.of(
         (entry.id, rows)
@@ -74,14 +91,21 @@ def windows(query: Query, before: DurationLike, after: DurationLike) -> Interval
     if parse_duration(before) == parse_duration(after) == 0:
         raise UsageError("How long before or after? A window needs one of them.")
     names = {entry.key: entry for entry in query.store.recordings()}
-    parts: list[tuple[str, NDArray[np.int64]]] = []
+    parts: list[tuple[int, NDArray[np.int64]]] = []
     for topic in query.topics:
+        found = chosen(query, topic, as_rows=True) if query.is_unthinned else None
+        if found is not None:
+            parts.extend((part.recording.key, part.columns.log_time[rows]) for part, rows in found)
+            continue
         for raw, rows, _ in query.thinned_documents(topic, _KEY):
             keys = key_columns(raw).take(rows)
-            for number in np.unique(keys.recording).tolist():
-                time = keys.time[keys.recording == number]
-                parts.append((names[number].id, np.stack([time, time, np.ones_like(time)], axis=1)))
-    wide = Intervals.of(parts).widened(before, after)
+            numbers = np.unique(keys.recording).tolist()
+            parts.extend((number, keys.time[keys.recording == number]) for number in numbers)
+    wide = Intervals.of(
+        # Where windows begin together, those of the recording with the least key are first.
+        (names[number].id, np.stack([time, time, np.ones_like(time)], axis=1))
+        for number, time in sorted(parts, key=lambda part: part[0])
+    ).widened(before, after)
     return wide.within({entry.id: _extent(entry) for entry in names.values()})
 
 
@@ -100,6 +124,63 @@ def _check(query: Query, what: str) -> None:
         )
     if not query.is_unthinned or query.is_reversed:
         raise UsageError(f"{what} is found in all messages: limit, every and reverse do not fit.")
+
+
+def _judged(query: Query, fields: Collection[str]) -> dict[str, Judged] | None:
+    """What columns say of all messages, by recording; None if they say nothing."""
+    if not query.is_by_log_time:
+        return None
+    messages = sum(
+        c.stats.messages
+        for entry in query.store.recordings()
+        if entry.id in query.recording_ids
+        for c in entry.channels
+        if c.topic == query.topics[0]
+    )
+    instead_s = cost_s(messages, as_rows=True)
+    found = judged(query, query.topics[0], fields, instead_s=instead_s)
+    return None if found is None else {part.recording.id: part for part in found}
+
+
+def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDArray[np.int64]]:
+    assert part.recording.span is not None
+    time = part.columns.log_time
+    holds = np.ones(len(time), np.bool_) if part.holds is None else part.holds
+    low, high = np.searchsorted(time, span)
+    holding = Holding(max_gap)
+    if low:
+        # What was said last before the range still holds when it begins.
+        before = slice(low - 1, low)
+        yield clipped(holding.add(time[before], holds[before], counted=False), span)
+    yield clipped(holding.add(time[low:high], holds[low:high]), span)
+    yield clipped(holding.finish(part.recording.span[1] + 1), span)
+
+
+def _changes_kept(
+    part: Judged, leaves: Collection[str], span: Span, tolerance: float, changing: Changing
+) -> Iterator[NDArray[np.int64]]:
+    rows = part.rows()
+    low, high = np.searchsorted(part.columns.log_time[rows], span)
+    rows = rows[max(low - 1, 0) : high]
+    differs = np.zeros(max(len(rows) - 1, 0), np.bool_)
+    for path in leaves:
+        differs |= unequal(part.columns.fields[path], rows[1:], rows[:-1], tolerance)
+    yield changing.add(part.columns.log_time[rows[1:][differs]])
+    yield changing.finish()
+
+
+def _leaves(query: Query, fields: Sequence[str]) -> set[str] | None:
+    """Single values that fields are made of; None if there are others among them."""
+    known = query.field_types() or {}
+    messages = {path.rpartition(".")[0] for path in known}
+    found: set[str] = set()
+    for field in fields:
+        inner = f"{field}.", f"{field}["
+        below = {path for path in known if path == field or path.startswith(inner)} - messages
+        if not below:
+            return None
+        found |= below
+    return found
 
 
 def _states_in(

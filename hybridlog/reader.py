@@ -645,6 +645,11 @@ class Query:
         return self._bounds is None and self._windows is None
 
     @property
+    def is_by_log_time(self) -> bool:
+        """Whether its time range, if it has one, is of log time."""
+        return self._bounds is None or self._clock == "log"
+
+    @property
     def is_reversed(self) -> bool:
         """Whether the latest message comes first."""
         return self._reverse
@@ -661,7 +666,7 @@ class Query:
             TimeError: The range is empty, or outside of all recordings.
             UsageError: The range is by another clock.
         """
-        if self._bounds is not None and self._clock != "log":
+        if not self.is_by_log_time:
             raise UsageError(f"Intervals are of log time; a range by {self._clock} does not fit.")
         found: list[tuple[RecordingEntry, tuple[int, int]]] = []
         outside: list[tuple[RecordingEntry, tuple[int, int]]] = []
@@ -987,7 +992,7 @@ class Query:
         database = self.store.database
         if self._filters:
             database = self.store.database_for("A predicate")
-        is_plain = not self._filters and (self._bounds is None or self._clock == "log")
+        is_plain = not self._filters and self.is_by_log_time
         targets = self._targets(lanes, with_chunks=database is None and not is_plain)
         if is_plain and self.is_unbounded:
             return sum(
@@ -1001,19 +1006,26 @@ class Query:
         if database is None:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
-        if self.is_unbounded:
-            from hybridlog.counting import in_all_times
+        from hybridlog import column_answers
 
-            of_topic: dict[str, list[RecordingEntry]] = {}
-            for target in targets:
-                for topic in _topics_of(target):
-                    of_topic.setdefault(topic, []).append(target.recording)
-            return sum(
-                in_all_times(self.store, topic, recordings, self.filter)
-                for topic, recordings in sorted(of_topic.items())
-            )
-        return self._count_documents(
-            [(topic, target) for target in targets for topic in _topics_of(target)]
+        total = 0
+        left: list[tuple[str, Target]] = []
+        for topic in sorted({topic for target in targets for topic in _topics_of(target)}):
+            found = column_answers.count(self, topic)
+            if found is None:
+                left.extend((topic, t) for t in targets if topic in _topics_of(t))
+            else:
+                total += found
+        if not self.is_unbounded:
+            return total + self._count_documents(left)
+        from hybridlog.counting import in_all_times
+
+        of_topic: dict[str, list[RecordingEntry]] = {}
+        for topic, target in left:
+            of_topic.setdefault(topic, []).append(target.recording)
+        return total + sum(
+            in_all_times(self.store, topic, recordings, self.filter)
+            for topic, recordings in of_topic.items()
         )
 
     def _count_between(self, target: Target) -> int:

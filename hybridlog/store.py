@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog import field_indexes, maintenance
 from hybridlog.field_indexes import FieldIndex
+from hybridlog.kept_columns import KeptColumns
 from hybridlog.query.chunk_lists import ChunkLists
 from hybridlog.query.topics import resolve
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
@@ -102,6 +103,7 @@ class Store:
         database: The index; None while MongoDB is away.
         without_database: Why it is away.
         tended: What had to be mended when it was opened.
+        kept: Columns of what is asked for again and again.
     """
 
     def __init__(self, directory: StoreDirectory) -> None:
@@ -116,6 +118,7 @@ class Store:
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._chunk_lists = ChunkLists()
+        self.kept = KeptColumns(self)
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -214,6 +217,7 @@ class Store:
         self._recordings = None
         self._lanes.clear()
         self._chunk_lists.clear()
+        self.kept.clear()
 
     def select(self, names: Sequence[str]) -> list[RecordingEntry]:
         """Recordings by id, by name, or by the beginning of an id when it is unambiguous.

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hybridlog.column_answers import chosen
 from hybridlog.frames import TableBuilder
 from hybridlog.indexing import rows_by_channel
 from hybridlog.query.plan import Lane, Piece, Plan, Sweep
-from hybridlog.schema.column import Records, Strings, take
+from hybridlog.schema.column import Records, Strings, concatenate, take
 from hybridlog_storage.errors import DefinitionError, UsageError
 from hybridlog_storage.messages import Batch
 
@@ -54,7 +55,11 @@ def collect(query: Query) -> TableBuilder:
     types = scalar_types(query)
     if types is not None:
         builder = TableBuilder()
-        for block in chain.from_iterable(_from_index(query, types)):
+        for block in _empty(query.empty_plan(), query):
+            _append(builder, block, several=False)
+        kept = _from_columns(query, types)
+        blocks = chain.from_iterable(_from_index(query, types)) if kept is None else kept
+        for block in blocks:
             builder.append(block.log_time, block.seq, block.records)
         return builder
     plan = query.plan()
@@ -74,7 +79,10 @@ def stream(query: Query) -> Iterator[pa.Table]:
     several = len(query.topics) > 1
     types = scalar_types(query)
     groups: Iterator[Iterable[Block]]
-    if types is not None:
+    kept = None if types is None else _from_columns(query, types)
+    if kept is not None:
+        groups = _in_order(kept, reverse=query.is_reversed)
+    elif types is not None:
         groups = _from_index(query, types)
     else:
         plan = query.plan()
@@ -229,6 +237,37 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
             "single values only, while MongoDB is there."
         )
     return types if indexed else None
+
+
+def _from_columns(query: Query, types: Mapping[str, str]) -> list[Block] | None:
+    """Blocks of the fields asked for out of kept columns; None when they do not have them."""
+    topic = query.topics[0]
+    found = chosen(query, topic, types, as_rows=True) if query.is_unthinned else None
+    if found is None:
+        return None
+    blocks = []
+    for rank, (part, rows) in enumerate(sorted(found, key=lambda item: item[0].recording.key)):
+        columns = part.columns
+        records = Records({path: take(columns.fields[path], rows) for path in types}, len(rows))
+        seq = columns.seq[rows] + (rank << _SEQ_BITS)
+        blocks.append(Block(topic, columns.log_time[rows], seq, records, 0))
+        query.counters.messages += len(rows)
+    return blocks
+
+
+def _in_order(blocks: Sequence[Block], *, reverse: bool) -> Iterator[list[Block]]:
+    """Blocks of one topic as one of each time, in order, none of them large."""
+    if not blocks:
+        return
+    log_time = np.concatenate([block.log_time for block in blocks])
+    seq = np.concatenate([block.seq for block in blocks])
+    records = concatenate([block.records for block in blocks])
+    order = np.lexsort((seq, log_time))
+    if reverse:
+        order = order[::-1]
+    for begin in range(0, len(order), _BLOCK_ROWS):
+        rows = order[begin : begin + _BLOCK_ROWS]
+        yield [Block(blocks[0].topic, log_time[rows], seq[rows], take(records, rows), 0)]
 
 
 def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:

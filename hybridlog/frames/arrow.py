@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from operator import eq, ge, gt, le, lt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from hybridlog.frames.text import repaired
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -104,6 +105,28 @@ def large_text(rows: Ragged) -> pa.ChunkedArray[Any]:
         [_validity(rows.missing), pa.py_buffer(offset), _buffer(data)],
     )
     return pa.chunked_array([array], type=pa.large_string())
+
+
+def compared(column: Strings, order: Callable[[Any, Any], Any], value: str) -> Any:
+    """Which strings stand in an order to a value, byte by byte.
+
+    Args:
+        column: Valid UTF-8.
+        order: One of the five of the module `operator`, `ne` apart.
+        value: What they are compared with.
+
+    Returns:
+        bool[n].
+    """
+    compare = {
+        eq: pc.equal,
+        lt: pc.less,
+        le: pc.less_equal,
+        gt: pc.greater,
+        ge: pc.greater_equal,
+    }[order]
+    text = large_text(Ragged.from_offsets(column.data, column.offset))
+    return compare(text, pa.scalar(value, pa.large_string())).to_numpy()
 
 
 def _buffer(values: NDArray[Any]) -> pa.Buffer:

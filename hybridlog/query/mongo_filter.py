@@ -10,6 +10,7 @@ import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Literal
 
 from hybridlog.query.tokens import error_at
@@ -82,7 +83,8 @@ def to_filter(expression: Expression, field_types: Mapping[str, str] | None) -> 
     Raises:
         WhereError: A field that does not exist, or a value that does not fit its type.
     """
-    return _Compiler(expression.text, _Types.of(field_types)).node(expression.root)
+    types = None if field_types is None else tuple(field_types.items())
+    return _Compiler(expression.text, _Types.of(types)).node(expression.root)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +104,11 @@ class _Types:
     inner: set[str] = field(default_factory=set)
 
     @staticmethod
-    def of(field_types: Mapping[str, str] | None) -> _Types:
+    @lru_cache(maxsize=64)
+    def of(field_types: tuple[tuple[str, str], ...] | None) -> _Types:
+        """Of paths and their types, None when they are not known."""
         found = _Types(field_types is not None, dict(_META))
-        for written, kind in {**(field_types or {}), **_META}.items():
+        for written, kind in {**dict(field_types or ()), **_META}.items():
             parts = written.split(".")
             for count in range(1, len(parts) + 1):
                 path = _ANY_ELEMENT.sub("", ".".join(parts[:count]))

@@ -66,13 +66,14 @@ class RosCodec:
         self._wire: Literal["ros1", "cdr"] = wire
         self._limit = array_limit
         self._type = parse_definition(schema)
+        self._paths = paths(self._type)
         self._reader = WireReader(self._type, wire)
         self._selecting = lru_cache(maxsize=64)(self._reader_of)
         self._objects: RosObjects | None = None
 
     def paths(self) -> list[FieldPath]:
         """Every field, in the order of the definition."""
-        return paths(self._type)
+        return self._paths
 
     def bodies(
         self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]

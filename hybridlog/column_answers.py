@@ -1,0 +1,168 @@
+"""What kept columns answer of a question: which messages of a topic it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.kept_columns import TopicColumns, cost_s
+from hybridlog.query.column_filter import column_filter
+from hybridlog.schema.column import ranges
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.intervals import Span
+    from hybridlog.reader import Query
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """All messages of a topic in a recording, and of which the predicate holds.
+
+    Attributes:
+        recording: The recording.
+        columns: The messages, in order.
+        holds: bool[n]; None without a predicate.
+    """
+
+    recording: RecordingEntry
+    columns: TopicColumns
+    holds: NDArray[np.bool_] | None
+
+    def rows(self, spans: Sequence[Span] | None = None) -> NDArray[np.intp]:
+        """Messages of which it holds, in order.
+
+        Args:
+            spans: Only those in one of these ranges of log time, which are apart and in
+                order; None for all.
+        """
+        if spans is None:
+            if self.holds is None:
+                return np.arange(len(self.columns))
+            return np.flatnonzero(self.holds)
+        low, high = np.searchsorted(
+            self.columns.log_time, np.array(spans, np.int64).reshape(-1, 2)
+        ).T
+        rows = ranges(low, high - low)
+        return rows if self.holds is None else rows[self.holds[rows]]
+
+    def count(self, spans: Sequence[Span] | None = None) -> int:
+        """Number of messages of which it holds."""
+        if spans is None and self.holds is not None:
+            return int(np.count_nonzero(self.holds))
+        return len(self.rows(spans))
+
+
+def judged(
+    query: Query, topic: str, fields: Collection[str] = (), *, instead_s: float
+) -> list[Judged] | None:
+    """What columns say of one of a question's topics, whatever its time range.
+
+    Args:
+        query: The question; only its predicate and recordings count.
+        topic: One of its topics.
+        fields: Paths of fields that are needed besides those of the predicate.
+        instead_s: What the answer costs without columns.
+
+    Returns:
+        One of each recording that has the topic; None if columns do not have it all, or
+        are not worth getting.
+    """
+    store = query.store
+    if store.database is None or not store.kept.most_bytes:
+        return None
+    filters, wanted, recordings = [], set(fields), []
+    for recording in store.recordings():
+        if recording.id not in query.recording_ids:
+            continue
+        if not any(c.topic == topic for c in recording.channels):
+            continue
+        types = store.kept.types(recording, topic)
+        if types is None or not types.keys() >= set(fields):
+            return None
+        found = column_filter(query.filter, types)
+        if found is None:
+            return None
+        filters.append(found)
+        wanted |= found.fields
+        recordings.append(recording)
+    columns = store.kept.find(
+        topic, recordings, wanted, instead_s=instead_s, counters=query.counters
+    )
+    if columns is None:
+        return None
+    return [
+        Judged(recording, own, part.mask(own.fields, len(own)) if query.filter else None)
+        for recording, own, part in zip(recordings, columns, filters, strict=True)
+    ]
+
+
+def chosen(
+    query: Query,
+    topic: str,
+    fields: Collection[str] = (),
+    *,
+    as_rows: bool = False,
+    instead_s: float | None = None,
+) -> list[tuple[Judged, NDArray[np.intp]]] | None:
+    """Messages of a topic that a question is about, of `limit` and `every` apart.
+
+    Args:
+        query: The question.
+        topic: One of its topics.
+        fields: Paths of fields that are needed besides those of the predicate.
+        as_rows: Whether the messages themselves are wanted, not only their number.
+        instead_s: What the answer costs without columns, if the caller knows it.
+
+    Returns:
+        Of each recording its columns and rows, ascending; None as in `judged`.
+    """
+    if not query.is_by_log_time:
+        return None
+    spans = None if query.is_unbounded else _spans(query)
+    if instead_s is None:
+        instead_s = _instead_s(query, topic, spans, as_rows=as_rows)
+    found = judged(query, topic, fields, instead_s=instead_s)
+    if found is None:
+        return None
+    return [
+        (part, part.rows(None if spans is None else spans.get(part.recording.id, [])))
+        for part in found
+    ]
+
+
+def count(query: Query, topic: str) -> int | None:
+    """Number of messages of a topic that a question is about; None as in `judged`."""
+    found = chosen(query, topic)
+    return None if found is None else sum(len(rows) for _, rows in found)
+
+
+def _spans(query: Query) -> dict[str, list[Span]]:
+    spans: dict[str, list[Span]] = {}
+    for recording, span in query.spans():
+        spans.setdefault(recording.id, []).append(span)
+    return spans
+
+
+def _instead_s(
+    query: Query, topic: str, spans: dict[str, list[Span]] | None, *, as_rows: bool
+) -> float:
+    """What MongoDB takes for the same."""
+    messages, windows = 0.0, 1
+    for recording in query.store.recordings():
+        if recording.id not in query.recording_ids or recording.span is None:
+            continue
+        share = 1.0
+        if spans is not None:
+            own = spans.get(recording.id, [])
+            windows += len(own)
+            share = sum(end - begin for begin, end in own) / (
+                recording.span[1] - recording.span[0] + 1
+            )
+        messages += share * sum(c.stats.messages for c in recording.channels if c.topic == topic)
+    return cost_s(messages, windows=windows, as_rows=as_rows)

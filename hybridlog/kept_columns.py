@@ -1,0 +1,355 @@
+"""Fields of whole topics as columns in memory, for who asks about them again and again.
+
+A recording that has ended does not change. So a field of all its messages can be kept as
+an array, and what is asked of it next takes a pass over numbers. Getting it costs as much
+as some questions to MongoDB do; it is got when as much has been spent on such questions,
+so that nobody pays for columns that are never looked at again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.frames.accumulate import flatten
+from hybridlog.frames.bson import records_from_bson
+from hybridlog.frames.text import repaired
+from hybridlog.indexing import rows_by_channel
+from hybridlog.query.column_filter import Single, is_single
+from hybridlog.query.plan import Sweep
+from hybridlog.schema.column import Records, Scalars, Strings, concatenate, take
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.segment_writer import SegmentSettings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.plan import Counters, Lane
+    from hybridlog.reader import Query
+    from hybridlog.store import Store
+    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+
+MOST_BYTES = 256 << 20
+"""Most memory that the columns of a store take."""
+_SINGLE_READ = {"ros1", "cdr"}
+"""Encodings of which every message has every field, so that payloads tell what the index does."""
+_SMALL = SegmentSettings().large_payload
+_RECORD_BYTES = 40  # that a message takes in a chunk besides its payload, about
+# What things cost, in seconds, on a small machine; only their ratios matter.
+_QUESTION_S = 1e-3
+_LOOK_S = 0.6e-6  # at a document, by MongoDB
+_DOCUMENT_S = 4e-6  # sent by MongoDB and made a row
+_BYTE_S = 1.3e-9  # of a chunk, uncompressed, read
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicColumns:
+    """Fields of all messages of a topic in a recording, by log time and arrival.
+
+    Attributes:
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers.
+        fields: Columns of n rows by dotted path.
+    """
+
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    fields: Mapping[str, Single]
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.log_time)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that they take."""
+        return self.log_time.nbytes + self.seq.nbytes + sum(map(_nbytes, self.fields.values()))
+
+
+class _UnfitError(Exception):
+    """These messages cannot be kept as columns."""
+
+
+class KeptColumns:
+    """The columns of a store. Thread safe.
+
+    Args:
+        store: With its database.
+
+    Attributes:
+        most_bytes: Most memory they take; 0 for none at all.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.most_bytes = MOST_BYTES
+        self._store = store
+        self._kept: OrderedDict[tuple[str, str], TopicColumns] = OrderedDict()
+        self._types: dict[tuple[str, str], dict[str, str] | None] = {}
+        self._unfit: set[tuple[str, str]] = set()
+        self._spent: defaultdict[str, float] = defaultdict(float)
+        self._lock = threading.Lock()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._kept.clear()
+            self._types.clear()
+            self._unfit.clear()
+            self._spent.clear()
+
+    def types(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
+        """Fields that can be kept of a topic in a recording, and their types; None if none can.
+
+        Messages that could not be read have no fields, and those of which little is left
+        are documents already.
+        """
+        key = recording.id, topic
+        if key not in self._types:
+            self._types[key] = self._types_of(recording, topic)
+        return self._types[key]
+
+    def _types_of(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
+        lanes = self._lanes(recording, topic)
+        stats = _stats(recording, topic)
+        one_codec = len({id(lane.codec) for lane in lanes}) == 1
+        if (
+            recording.status == "open"
+            or recording.span is None
+            or not one_codec
+            or any(s.unreadable for s in stats)
+        ):
+            return None
+        if lanes[0].is_reduced or not lanes[0].codec.indexed:
+            return None
+        paths = lanes[0].codec.paths()
+        return {p.path: p.type for p in paths if not p.array and is_single(p.type)}
+
+    def find(
+        self,
+        topic: str,
+        recordings: Sequence[RecordingEntry],
+        fields: Collection[str],
+        *,
+        instead_s: float,
+        counters: Counters,
+    ) -> list[TopicColumns] | None:
+        """Columns of fields of a topic, of each recording; None when they are not worth it.
+
+        Args:
+            topic: Full name.
+            recordings: Those wanted, all of which `types` knows the fields of.
+            fields: Paths.
+            instead_s: What the answer costs without them, see `cost_s`.
+            counters: Get what is read.
+        """
+        wanted = frozenset(fields)
+        keys = [(recording.id, topic) for recording in recordings]
+        with self._lock:
+            found = {key: self._kept[key] for key in keys if key in self._kept}
+            missing = [
+                recording
+                for recording, key in zip(recordings, keys, strict=True)
+                if key not in found or not wanted <= found[key].fields.keys()
+            ]
+            if missing and not self._is_worth(topic, recordings, missing, wanted, instead_s):
+                return None
+        for recording in missing:
+            key = recording.id, topic
+            kept = found.get(key)
+            lacking = wanted if kept is None else wanted - kept.fields.keys()
+            try:
+                loaded = self._load(recording, topic, lacking, counters)
+            except _UnfitError:
+                with self._lock:
+                    self._unfit.add(key)
+                return None
+            if kept is not None:
+                fresh = {**kept.fields, **loaded.fields}
+                loaded = TopicColumns(kept.log_time, kept.seq, fresh)
+            found[key] = loaded
+        self._keep(found)
+        return [found[key] for key in keys]
+
+    def _is_worth(
+        self,
+        topic: str,
+        recordings: Sequence[RecordingEntry],
+        missing: Sequence[RecordingEntry],
+        fields: Collection[str],
+        instead_s: float,
+    ) -> bool:
+        """Whether to get columns now: enough was spent, and all of them have room together."""
+        if any((recording.id, topic) in self._unfit for recording in recordings):
+            return False
+        if sum(self._size(r, topic, fields) for r in recordings) > self.most_bytes:
+            return False
+        price = sum(min(self._prices(recording, topic)) for recording in missing)
+        # An answer that alone costs twice as much as the columns is worth them at once.
+        if self._spent[topic] + instead_s / 2 < price:
+            self._spent[topic] += instead_s
+            return False
+        self._spent[topic] = 0.0
+        return True
+
+    def _size(self, recording: RecordingEntry, topic: str, fields: Collection[str]) -> int:
+        """Most memory that columns take."""
+        types = self.types(recording, topic) or {}
+        has_text = any(types[path] == "string" for path in fields)
+        text = sum(s.payload_bytes for s in _stats(recording, topic)) if has_text else 0
+        return _messages(recording, topic) * 8 * (2 + len(fields)) + text
+
+    def _prices(self, recording: RecordingEntry, topic: str) -> tuple[float, float]:
+        """What columns cost out of the segments, and out of the index, seconds."""
+        from_index = _QUESTION_S + _DOCUMENT_S * _messages(recording, topic)
+        encodings = {lane.channel.message_encoding for lane in self._lanes(recording, topic)}
+        if not encodings <= _SINGLE_READ:
+            return np.inf, from_index
+        # Small messages of all topics share chunks, large ones have their own.
+        is_own = any(_is_large(stats) for stats in _stats(recording, topic))
+        read = [
+            c.stats
+            for c in recording.channels
+            if c.topic == topic or not (is_own or _is_large(c.stats))
+        ]
+        size = sum(s.payload_bytes + _RECORD_BYTES * s.messages for s in read)
+        return _QUESTION_S + _BYTE_S * size, from_index
+
+    def _load(
+        self,
+        recording: RecordingEntry,
+        topic: str,
+        fields: frozenset[str],
+        counters: Counters,
+    ) -> TopicColumns:
+        from_segments, from_index = self._prices(recording, topic)
+        load = _from_segments if from_segments < from_index else _from_index
+        known = self.types(recording, topic) or {}
+        assert recording.span is not None
+        first, last = recording.span
+        query = self._store.query([topic], [recording.id]).between(f"{first}ns", f"{last + 1}ns")
+        columns = load(query, {path: known[path] for path in fields})
+        counters.bytes_read += query.counters.bytes_read
+        counters.chunks_read += query.counters.chunks_read
+        counters.documents_read += query.counters.documents_read
+        if len(columns) != _messages(recording, topic) or columns.fields.keys() != fields:
+            raise _UnfitError
+        return columns
+
+    def _keep(self, found: Mapping[tuple[str, str], TopicColumns]) -> None:
+        """Keep these, and of the others those that were used last, as many as have room."""
+        with self._lock:
+            for key, columns in found.items():
+                self._kept[key] = columns
+                self._kept.move_to_end(key)
+            size = sum(columns.nbytes for columns in self._kept.values())
+            while size > self.most_bytes:
+                size -= self._kept.popitem(last=False)[1].nbytes
+
+    def _lanes(self, recording: RecordingEntry, topic: str) -> list[Lane]:
+        return [lane for lane in self._store.lanes(recording) if lane.channel.topic == topic]
+
+
+def cost_s(messages: float, *, windows: int = 1, as_rows: bool = False) -> float:
+    """What asking MongoDB costs, about, seconds.
+
+    Args:
+        messages: Index documents that it looks at.
+        windows: Ranges of time that it is asked about.
+        as_rows: Whether the documents are sent, not counted.
+    """
+    return _QUESTION_S * (1 + windows / 14) + messages * (_DOCUMENT_S if as_rows else _LOOK_S)
+
+
+def _from_segments(query: Query, types: Mapping[str, str]) -> TopicColumns:
+    """Columns out of payloads."""
+    plan = query.plan()
+    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Single]]] = []
+    try:
+        for piece in Sweep(plan, query.store.segment).unordered():
+            for lane, rows in rows_by_channel(piece.batch.channel):
+                batch, seq = piece.batch.take(rows), piece.seq[rows]
+                decoded = plan.lanes[lane].codec.columns(
+                    batch.buffer, batch.offset, batch.length, types.keys()
+                )
+                if decoded.unreadable:
+                    raise _UnfitError
+                parts.append((batch.log_time, seq, _singles(decoded.records, types)))
+    except SegmentError as error:
+        raise _UnfitError from error  # the index has what is damaged here
+    return _joined(parts)
+
+
+def _from_index(query: Query, types: Mapping[str, str]) -> TopicColumns:
+    """Columns out of index documents."""
+    projection = {"_id": 1, **dict.fromkeys(types, 1)}
+    (topic,) = query.topics
+    parts = []
+    try:
+        for raw, _, _ in query.thinned_documents(topic, projection):
+            found = records_from_bson(raw, types)
+            if len(found) > 1:
+                raise _UnfitError  # some messages lack a field
+            for part in found:
+                singles = _singles(part.records, types)
+                parts.append((part.reference.t, part.reference.seq, singles))
+    except StoreError as error:
+        raise _UnfitError from error
+    return _joined(parts)
+
+
+def _singles(records: Records, paths: Collection[str]) -> dict[str, Single]:
+    leaves = flatten(records)
+    found: dict[str, Single] = {}
+    for path in paths:
+        leaf = leaves.get(path)
+        if not isinstance(leaf, Single):
+            raise _UnfitError
+        found[path] = leaf
+    return found
+
+
+def _joined(
+    parts: Sequence[tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Single]]],
+) -> TopicColumns:
+    if not parts:
+        raise _UnfitError
+    times, seqs, columns = zip(*parts, strict=True)
+    log_time, seq = np.concatenate(times), np.concatenate(seqs)
+    fields = {path: _own(concatenate([part[path] for part in columns])) for path in columns[0]}
+    order = np.lexsort((seq, log_time))
+    if (order[1:] < order[:-1]).any():
+        log_time, seq = log_time[order], seq[order]
+        fields = {path: take(column, order) for path, column in fields.items()}
+    return TopicColumns(log_time, seq, fields)
+
+
+def _own(column: Single) -> Single:
+    """A column as the index has it: text that is UTF-8, and booleans of two bytes only."""
+    if isinstance(column, Strings):
+        return repaired(column)
+    if column.values.dtype == np.bool_:
+        return Scalars(column.values.view(np.uint8) != 0)
+    return column
+
+
+def _nbytes(column: Single) -> int:
+    if isinstance(column, Strings):
+        return column.data.nbytes + column.offset.nbytes
+    return column.values.nbytes
+
+
+def _stats(recording: RecordingEntry, topic: str) -> list[ChannelStats]:
+    return [c.stats for c in recording.channels if c.topic == topic]
+
+
+def _messages(recording: RecordingEntry, topic: str) -> int:
+    return sum(stats.messages for stats in _stats(recording, topic))
+
+
+def _is_large(stats: ChannelStats) -> bool:
+    return stats.payload_bytes >= _SMALL * max(stats.messages, 1)

@@ -1,0 +1,400 @@
+"""Answers out of kept columns, against those that MongoDB gives to the same questions."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog import column_answers, kept_columns, tables
+from hybridlog.kept_columns import MOST_BYTES
+from hybridlog.query.column_filter import column_filter
+from hybridlog.reader import Query
+from hybridlog_storage.errors import TimeError
+from hybridlog_storage.segment_writer import SegmentSettings
+
+Filter = dict[str, Any]
+
+SECOND = 1_000_000_000
+BASE = 1_700_000_000 * SECOND
+DEFINITION = b"""\
+float64 f64
+float32 f32
+int64 i64
+uint32 u32
+int8 i8
+bool yes
+time at
+duration took
+string name
+uint64 u64
+float32[] many
+Inner inner
+================================================================================
+MSG: test/Inner
+float64 x
+"""
+NAN, INF = math.nan, math.inf
+FLOATS = [NAN, INF, -INF, 0.0, -0.0, 1.0, 1.5, 0.1, 2.0**53, 2.0**53 + 2, -3.0, 1e300, 5e-324]
+INTEGERS = [0, 1, -1, 2, 2**31, 2**53, 2**53 + 1, 2**63 - 1, -(2**63), -(2**53) - 1, 3]
+NAMES = ["", "a", "ab", "b", "ä", "\U0001d11e", "\uffff", "a\0b", "laser"]
+POOLS: dict[str, list[Any]] = {
+    "f64": FLOATS,
+    "f32": [v for v in FLOATS if abs(v) < 1e30 or not math.isfinite(v)],
+    "i64": INTEGERS,
+    "u32": [0, 1, 2**31, 2**32 - 1],
+    "i8": [0, 1, -1, 127, -128],
+    "yes": [True, False],
+    "at": [0, 1, BASE, BASE + 5],
+    "took": [0, -1, -SECOND - 1, 7 * SECOND],
+    "name": NAMES,
+    "u64": [0, 1, 2**63, 2**64 - 1],
+    "inner.x": [0.0, 1.5, NAN],
+}
+
+
+def message(values: dict[str, Any]) -> bytes:
+    """A message as ROS 1 writes it."""
+    name = values["name"].encode()
+    return b"".join(
+        (
+            struct.pack("<dfqIb?", *(values[k] for k in ("f64", "f32", "i64", "u32", "i8", "yes"))),
+            struct.pack("<II", *divmod(values["at"], SECOND)),
+            struct.pack("<ii", *divmod(values["took"], SECOND)),
+            struct.pack("<I", len(name)) + name,
+            struct.pack("<QI2fd", values["u64"], 2, 0.5, 1.5, values["inner.x"]),
+        )
+    )
+
+
+def usual(**values: Any) -> dict[str, Any]:
+    return {name: pool[1] for name, pool in POOLS.items()} | values
+
+
+def write_log(path: Path, said: Sequence[tuple[int, str, bytes]], mark: str = "") -> None:
+    """A log of messages (log time, topic, payload); `/state` has two publishers."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("test/State", "ros1msg", DEFINITION)
+        channels = {
+            (topic, place): writer.register_channel(
+                topic, "ros1", schema, {"mark": mark, "publisher": str(place)}
+            )
+            for topic in ("/state", "/other")
+            for place in range(2)
+        }
+        for place, (time, topic, payload) in enumerate(said):
+            writer.add_message(channels[topic, place % 2], time, payload, time)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    place = tmp_path_factory.mktemp("columns") / "store"
+    with hl.open(place, create=True, require_database=True) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """A store with one message of every value, and many of mixed ones."""
+    place = tmp_path_factory.mktemp("mixed")
+    dice = random.Random(5)
+    said = [usual(**{name: value}) for name, pool in POOLS.items() for value in pool]
+    said += [{n: dice.choice(pool) for n, pool in POOLS.items()} for _ in range(100)]
+    path = place / "mixed.mcap"
+    write_log(path, [(BASE + n, "/state", message(v)) for n, v in enumerate(said)])
+    with hl.open(place / "store", create=True, require_database=True) as opened:
+        opened.record(path)
+        yield opened
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let columns cost nothing, so that they are got at the first question."""
+    monkeypatch.setattr(kept_columns.KeptColumns, "_prices", lambda *_: (0.0, 1.0))
+
+
+# --- filters --------------------------------------------------------------------------
+
+values = st.sampled_from([*FLOATS, *INTEGERS, *NAMES, True, False, None, BASE, 0.5, -0.5])
+orders = st.sampled_from(["$eq", "$ne", "$lt", "$lte", "$gt", "$gte"])
+operations = st.one_of(
+    st.dictionaries(orders, values, min_size=1, max_size=2),
+    st.fixed_dictionaries({"$in": st.lists(values, max_size=3)}),
+    st.fixed_dictionaries({"$nin": st.lists(values, max_size=3)}),
+    st.fixed_dictionaries({"$exists": st.booleans()}),
+    st.just({"$type": "null"}),
+    st.just({"$type": "string"}),
+    st.just({"$regex": "a"}),
+)
+conditions = st.one_of(
+    values, operations, st.fixed_dictionaries({"$not": operations.filter(lambda o: o)})
+)
+fields = st.sampled_from([*POOLS, "many", "many.0", "inner", "missing"])
+leaves = st.dictionaries(fields, conditions, min_size=1, max_size=2)
+filters = st.recursive(
+    leaves,
+    lambda inner: st.dictionaries(
+        st.sampled_from(["$and", "$or", "$nor"]),
+        st.lists(inner, min_size=1, max_size=3),
+        min_size=1,
+        max_size=2,
+    ),
+    max_leaves=5,
+)
+
+
+def _seqs(parts: list[tuple[column_answers.Judged, Any]]) -> list[int]:
+    return [seq for part, rows in parts for seq in part.columns.seq[rows].tolist()]
+
+
+@settings(
+    max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(query=filters)
+@example(query={"i64": {"$gt": 2.0**53}})
+@example(query={"i64": {"$lt": 2**53 + 1}})
+@example(query={"i64": {"$gte": 2.0**63}})
+@example(query={"f32": 0.1})
+@example(query={"f32": {"$lte": NAN}})
+@example(query={"name": {"$lt": "\U0001d11e"}})
+@example(query={"yes": {"$gt": False}})
+def test_columns_satisfy_what_documents_do(mixed: hl.Store, at_once: None, query: Filter) -> None:
+    asked = mixed.topic("/state").where(query)
+    found = column_answers.chosen(asked, "/state")
+    if found is not None:
+        assert _seqs(found) == [d["_meta"]["seq"] for d in asked.documents()]
+
+
+@pytest.mark.parametrize(
+    ("query", "is_answered"),
+    [
+        ({"f64": {"$lt": 1, "$gte": -3}}, True),
+        ({"$or": [{"name": "a"}, {"$nor": [{"yes": True}]}]}, True),
+        ({"i8": {"$not": {"$in": [1, 2]}}}, True),
+        ({"inner.x": {"$exists": True}}, True),
+        ({"at": {"$gte": BASE}, "took": {"$lt": 0}}, True),
+        ({"u64": 1}, False),  # beyond int64 the index has floats
+        ({"many": 0.5}, False),
+        ({"many.0": 0.5}, False),
+        ({"name": {"$regex": "^a"}}, False),
+        ({"$expr": {"$gt": ["$f64", "$f32"]}}, False),
+        ({"_meta.seq": 1}, False),
+        ({"f64": 2**53 + 1}, False),
+    ],
+)
+def test_which_filters_columns_answer(mixed: hl.Store, query: Filter, *, is_answered: bool) -> None:
+    types = mixed.kept.types(mixed.recordings()[0], "/state")
+    assert types is not None
+    assert (column_filter(query, types) is not None) is is_answered
+
+
+# --- whole questions ------------------------------------------------------------------
+
+moments = st.integers(0, 12)
+said = st.tuples(
+    moments,
+    st.sampled_from(["/state", "/state", "/other"]),
+    st.fixed_dictionaries(
+        {
+            "f64": st.sampled_from([0.0, 1.0, 2.5, NAN]),
+            "i8": st.integers(0, 2),
+            "name": st.sampled_from(["a", "b"]),
+        }
+    ),
+)
+logs = st.fixed_dictionaries(
+    {name: st.lists(said, min_size=1, max_size=20) for name in ("one", "two")}
+)
+_marks = iter(range(10**6))
+
+
+def recorded(store: hl.Store, content: dict[str, Any]) -> None:
+    """Put logs in the place of what the store has."""
+    for entry in store.recordings():
+        store.remove(entry.id)
+    for name, rows in content.items():
+        path = store.directory.path / f"{name}.mcap"
+        messages = [(BASE + t * SECOND, topic, message(usual(**v))) for t, topic, v in rows]
+        write_log(path, messages, str(next(_marks)))
+        store.record(path, name=name, settings=SegmentSettings(chunk_size=1024))
+
+
+def answers(store: hl.Store, where: str, bounds: tuple[int, int] | None) -> dict[str, Any]:
+    """What a store answers to one of each kind of question."""
+    query = store.topic("/state").where(where)
+    other = store.topic("/state")
+    if bounds is not None:
+        query, other = (
+            q.between(BASE + bounds[0] * SECOND, BASE + bounds[1] * SECOND) for q in (query, other)
+        )
+
+    def rows(found: Any) -> list[tuple[Any, ...]]:
+        return [(i.recording, i.begin_ns, i.end_ns, i.messages) for i in found]
+
+    def streamed(asked: Query) -> dict[str, Any]:
+        parts = list(tables.stream(asked))
+        assert all(len(part) for part in parts[1:])
+        return pa.concat_tables(parts).to_pydict()
+
+    events = store.topic("/state").where("i8 == 1").windows("1s", "1500ms")
+    kinds = {
+        "count": query.count,
+        "every": query.every(2).limit(3).count,
+        "all": store.all_topics().where(where).count,
+        "windows": lambda: rows(query.windows("1s")),
+        "states": lambda: rows(query.intervals(max_gap="2s")),
+        "changes": lambda: rows(query.changes("f64", "name", "inner", pause="1s")),
+        "near": lambda: rows(other.changes("f64", pause="1s", tolerance=1)),
+        "containing": lambda: rows(events.containing(query)),
+        "during": query.during(events).count,
+        "frame": lambda: query.fields("f64", "name", "at").to_pandas(),
+        "reversed": lambda: query.reverse().fields("i8").to_pandas(),
+        "arrow": lambda: query.fields("name").to_arrow().to_pydict(),
+        "stream": lambda: streamed(query.fields("i8", "name")),
+        "backwards": lambda: streamed(query.reverse().fields("at")),
+    }
+    found: dict[str, Any] = {}
+    for name, ask in kinds.items():
+        try:
+            found[name] = ask()  # type: ignore[operator]
+        except TimeError as error:
+            found[name] = str(error)
+    return found
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    content=logs,
+    where=st.sampled_from(
+        ["i8 == 1", "f64 >= 1 and name == 'a'", "not (f64 < 2)", "name in ['b']", "i8 > 5"]
+    ),
+    bounds=st.none() | st.tuples(st.integers(-1, 12), st.integers(1, 9)),
+    rows=st.sampled_from([3, 65_536]),
+)
+def test_questions_have_the_answers_of_mongodb(
+    store: hl.Store,
+    at_once: None,
+    monkeypatch: pytest.MonkeyPatch,
+    content: dict[str, Any],
+    where: str,
+    bounds: tuple[int, int] | None,
+    rows: int,
+) -> None:
+    if not all(any(topic == "/state" for _, topic, _ in rows) for rows in content.values()):
+        content = {name: [*rows, (3, "/state", {})] for name, rows in content.items()}
+    recorded(store, content)
+    monkeypatch.setattr(tables, "_BLOCK_ROWS", rows)
+    if bounds is not None:
+        bounds = bounds[0], bounds[0] + bounds[1]
+    kept = answers(store, where, bounds)
+    assert store.kept._kept
+    store.kept.most_bytes = 0
+    try:
+        asked = answers(store, where, bounds)
+    finally:
+        store.kept.most_bytes = MOST_BYTES
+    for name, answer in asked.items():
+        if isinstance(answer, pd.DataFrame):
+            pd.testing.assert_frame_equal(kept[name], answer)
+            assert kept[name].dtypes.equals(answer.dtypes)
+        else:
+            assert kept[name] == answer, name
+
+
+# --- when -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plain(store: hl.Store) -> hl.Store:
+    rows = [(n % 12, "/state", {"i8": n % 3, "f64": float(n)}) for n in range(60)]
+    recorded(store, {"one": rows})
+    return store
+
+
+def test_columns_come_when_asking_has_cost_as_much(plain: hl.Store) -> None:
+    query = plain.topic("/state").where("i8 == 1")
+    looks = []
+    for _ in range(6):
+        assert query.count() == 20
+        looks.append(query.counters.chunks_read + query.counters.documents_read)
+    first = next(n for n, look in enumerate(looks) if look)
+    assert 0 < first < 5
+    assert looks[first + 1 :] == [0] * (5 - first)
+    # Another field is asked for anew, what is kept of the first one is not lost.
+    other = plain.topic("/state").where("f64 < 10 and i8 == 1")
+    assert [other.count() for _ in range(6)] == [3] * 6
+    query.count()
+    assert query.counters.chunks_read + query.counters.documents_read == 0
+
+
+def test_what_is_recorded_or_removed_meanwhile_is_seen(
+    plain: hl.Store, at_once: None, tmp_path: Path
+) -> None:
+    query = "i8 == 1"
+    assert plain.topic("/state").where(query).count() == 20
+    write_log(tmp_path / "more.mcap", [(BASE, "/state", message(usual(i8=1)))], "more")
+    report = plain.record(tmp_path / "more.mcap", name="more")
+    assert plain.topic("/state").where(query).count() == 21
+    plain.remove(report.entry.id)
+    assert plain.topic("/state").where(query).count() == 20
+
+
+def test_columns_take_no_more_memory_than_they_may(
+    plain: hl.Store, at_once: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plain.kept, "most_bytes", 60 * 8 * 3 + 100)
+    one = plain.topic("/state").where("i8 == 1")
+    two = plain.topic("/state").where("i8 == 1 and f64 > 3 and f64 < 50 and u32 == 1")
+    for _ in range(3):
+        assert one.count() == 20
+        assert two.count() == 16
+    assert sum(c.nbytes for c in plain.kept._kept.values()) <= plain.kept.most_bytes
+
+
+def test_payloads_that_cannot_be_read_are_left_to_mongodb(store: hl.Store, at_once: None) -> None:
+    recorded(store, {})
+    path = store.directory.path / "torn.mcap"
+    rows = [(BASE + n, "/state", message(usual(i8=1))) for n in range(4)]
+    write_log(path, [*rows, (BASE + 9, "/state", b"torn")], "torn")
+    store.record(path)
+    assert store.topic("/state").where({"i8": {"$ne": 1}}).count() == 1
+    assert store.topic("/state").where({"i8": 1}).count() == 4
+
+
+def test_strings_that_are_no_text_are_those_of_the_index(store: hl.Store, at_once: None) -> None:
+    recorded(store, {})
+    path = store.directory.path / "odd.mcap"
+    good, odd = message(usual(name="abc")), message(usual(name="abc")).replace(b"abc", b"a\xffc")
+    write_log(path, [(BASE, "/state", good), (BASE + 1, "/state", odd)], "odd")
+    store.record(path)
+    query = store.topic("/state").where({"name": "a\ufffdc"})
+    assert query.count() == 1
+    assert query.fields("name").to_pandas()["name"].tolist() == ["a\ufffdc"]
+    assert query.counters.documents_read == 0
+
+
+def test_a_damaged_segment_leaves_the_answer_to_mongodb(store: hl.Store, at_once: None) -> None:
+    rows = [(n % 12, "/state", {"i8": n % 3, "f64": float(n)}) for n in range(60)]
+    recorded(store, {"one": rows})
+    (segment,) = store.directory.path.glob("**/000000.mcap")
+    content = bytearray(segment.read_bytes())
+    for place in range(300, len(content) // 2, 50):
+        content[place] ^= 0xFF
+    segment.write_bytes(content)
+    assert store.topic("/state").where("i8 == 1").count() == 20
