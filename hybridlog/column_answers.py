@@ -76,6 +76,7 @@ def judged(
     store = query.store
     if store.database is None or not store.kept.most_bytes:
         return None
+    predicate = query.filter
     filters, wanted, recordings = [], set(fields), []
     for recording in store.recordings():
         if recording.id not in query.recording_ids:
@@ -85,7 +86,7 @@ def judged(
         types = store.kept.types(recording, topic)
         if types is None or not types.keys() >= set(fields):
             return None
-        found = column_filter(query.filter, types)
+        found = column_filter(predicate, types)
         if found is None:
             return None
         filters.append(found)
@@ -97,7 +98,7 @@ def judged(
     if columns is None:
         return None
     return [
-        Judged(recording, own, part.mask(own.fields, len(own)) if query.filter else None)
+        Judged(recording, own, part.mask(own.fields, len(own)) if predicate else None)
         for recording, own, part in zip(recordings, columns, filters, strict=True)
     ]
 
@@ -122,6 +123,25 @@ def chosen(
     Returns:
         Of each recording its columns and rows, ascending; None as in `judged`.
     """
+    found = _asked(query, topic, fields, as_rows=as_rows, instead_s=instead_s)
+    return None if found is None else [(part, part.rows(spans)) for part, spans in found]
+
+
+def count(query: Query, topic: str) -> int | None:
+    """Number of messages of a topic that a question is about; None as in `judged`."""
+    found = _asked(query, topic)
+    return None if found is None else sum(part.count(spans) for part, spans in found)
+
+
+def _asked(
+    query: Query,
+    topic: str,
+    fields: Collection[str] = (),
+    *,
+    as_rows: bool = False,
+    instead_s: float | None = None,
+) -> list[tuple[Judged, list[Span] | None]] | None:
+    """Columns of each recording, and the ranges of time that a question is about."""
     if not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)
@@ -130,16 +150,7 @@ def chosen(
     found = judged(query, topic, fields, instead_s=instead_s)
     if found is None:
         return None
-    return [
-        (part, part.rows(None if spans is None else spans.get(part.recording.id, [])))
-        for part in found
-    ]
-
-
-def count(query: Query, topic: str) -> int | None:
-    """Number of messages of a topic that a question is about; None as in `judged`."""
-    found = chosen(query, topic)
-    return None if found is None else sum(len(rows) for _, rows in found)
+    return [(part, None if spans is None else spans.get(part.recording.id, [])) for part in found]
 
 
 def _spans(query: Query) -> dict[str, list[Span]]:

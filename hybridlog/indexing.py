@@ -451,9 +451,8 @@ class IndexWriter:
 
     def _put_back(self, entry: ChunkEntry) -> int:
         """A chunk is to be indexed again; returns its messages."""
-        place = ChunkPlace(entry.offset, entry.length, entry.trailer, entry.first, entry.last, ())
         count = sum(stats.messages for stats in entry.stats.values())
-        self._forgotten.append(_Forgotten(entry.segment, place, count))
+        self._forgotten.append(_Forgotten(entry.segment, entry.place, count))
         return count
 
     def _ensure(self, collection: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.plan import Counters, place_of
+from hybridlog.query.plan import Counters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,7 +73,7 @@ def _times(
     counters: Counters,
 ) -> list[NDArray[np.int64]]:
     """Log times of the messages of each of some channels in a chunk, ascending, ns."""
-    place = place_of(chunk)
+    place = chunk.place
     read_before = reader.bytes_read
     times = reader.read_times(place)
     found = [times.get(c, np.empty(0, np.int64)) for c in wanted]

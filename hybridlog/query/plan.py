@@ -23,7 +23,7 @@ from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
 from hybridlog_storage.messages import REDUCED
-from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import StoredChunk
 
 if TYPE_CHECKING:
@@ -59,13 +59,6 @@ class Counters:
     documents_read: int = 0
     reduced: int = 0
     elapsed_s: float = 0.0
-
-
-def place_of(chunk: ChunkEntry) -> ChunkPlace:
-    """Where a chunk lies, as its segment's reader wants to know it."""
-    return ChunkPlace(
-        chunk.offset, chunk.length, chunk.trailer, chunk.first, chunk.last, tuple(chunk.stats)
-    )
 
 
 def count_given(counters: Counters, batch: Batch) -> None:
@@ -297,7 +290,7 @@ class Sweep:
     def _load(self, task: Task, offsets: NDArray[np.int64] | None) -> tuple[Piece, int]:
         entry = task.chunk
         reader = self._reader_of(task.target.recording.id, entry.segment)
-        chunk = reader.read_chunk(place_of(entry))
+        chunk = reader.read_chunk(entry.place)
         return self._wanted(task, chunk, offsets), chunk.length + chunk.trailer
 
     def _wanted(self, task: Task, chunk: StoredChunk, offsets: NDArray[np.int64] | None) -> Piece:

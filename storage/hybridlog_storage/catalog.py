@@ -14,6 +14,7 @@ from typing import Any, Final, cast
 
 from hybridlog_storage.database import Database
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_reader import ChunkPlace
 
 RECORDINGS: Final = "hybridlog.recordings"
 SCHEMAS: Final = "hybridlog.schemas"
@@ -149,6 +150,13 @@ class ChunkEntry:
     first: int
     last: int
     stats: dict[int, ChannelStats]
+
+    @property
+    def place(self) -> ChunkPlace:
+        """Where it lies in its segment, as the segment's reader wants to know it."""
+        return ChunkPlace(
+            self.offset, self.length, self.trailer, self.first, self.last, tuple(self.stats)
+        )
 
     def span(self, channels: Container[int]) -> tuple[int, int] | None:
         """First and last log time of some channels in it, None when it has none of them."""
