@@ -103,6 +103,21 @@ def judged(
     ]
 
 
+def whole(query: Query, topic: str, fields: Collection[str] = ()) -> dict[str, Judged] | None:
+    """All messages of a topic, and what a question about some time says of them.
+
+    Args:
+        query: The question.
+        topic: One of its topics.
+        fields: Paths of fields that are needed besides those of the predicate.
+
+    Returns:
+        By id of the recording; None as in `judged`.
+    """
+    found = _asked(query, topic, fields, as_rows=True)
+    return None if found is None else {part.recording.id: part for part, _ in found}
+
+
 def chosen(
     query: Query,
     topic: str,

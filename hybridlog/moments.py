@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.column_answers import Judged, chosen, judged
+from hybridlog.column_answers import Judged, chosen, whole
 from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
-from hybridlog.kept_columns import cost_s
 from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.query.unequal import unequal
@@ -41,7 +40,7 @@ def states(query: Query, max_gap: DurationLike | None) -> Intervals:
     gap = None if max_gap is None else parse_duration(max_gap)
     if gap == 0:
         raise UsageError("A message that is believed for no time makes no interval.")
-    found = _judged(query, ())
+    found = whole(query, query.topics[0])
     if found is not None:
         return Intervals.of(
             (entry.id, rows)
@@ -64,7 +63,7 @@ def changes(
         raise UsageError(f"A tolerance is a number from 0 on, not {tolerance}.")
     quiet = parse_duration(pause)
     leaves = _leaves(query, fields)
-    found = None if leaves is None else _judged(query, leaves)
+    found = None if leaves is None else whole(query, query.topics[0], leaves)
     if found is not None and leaves is not None:
         return Intervals.of(
             (entry.id, rows)
@@ -124,22 +123,6 @@ def _check(query: Query, what: str) -> None:
         )
     if not query.is_unthinned or query.is_reversed:
         raise UsageError(f"{what} is found in all messages: limit, every and reverse do not fit.")
-
-
-def _judged(query: Query, fields: Collection[str]) -> dict[str, Judged] | None:
-    """What columns say of all messages, by recording; None if they say nothing."""
-    if not query.is_by_log_time:
-        return None
-    messages = sum(
-        c.stats.messages
-        for entry in query.store.recordings()
-        if entry.id in query.recording_ids
-        for c in entry.channels
-        if c.topic == query.topics[0]
-    )
-    instead_s = cost_s(messages, as_rows=True)
-    found = judged(query, query.topics[0], fields, instead_s=instead_s)
-    return None if found is None else {part.recording.id: part for part in found}
 
 
 def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDArray[np.int64]]:

@@ -1016,6 +1016,8 @@ class Query:
                 left.extend((topic, t) for t in targets if topic in _topics_of(t))
             else:
                 total += found
+        if not left:
+            return total
         if not self.is_unbounded:
             return total + self._count_documents(left)
         from hybridlog.counting import in_all_times

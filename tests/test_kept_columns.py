@@ -398,3 +398,30 @@ def test_a_damaged_segment_leaves_the_answer_to_mongodb(store: hl.Store, at_once
         content[place] ^= 0xFF
     segment.write_bytes(content)
     assert store.topic("/state").where("i8 == 1").count() == 20
+
+
+def test_a_question_about_a_moment_gets_no_columns(
+    plain: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads = []
+    load = kept_columns.KeptColumns._load
+    monkeypatch.setattr(
+        kept_columns.KeptColumns, "_load", lambda *given: loads.append(given) or load(*given)
+    )
+    # As if each message took MongoDB a millisecond, and columns a tenth of that.
+    monkeypatch.setattr(kept_columns, "_LOOK_S", 1e-3)
+    monkeypatch.setattr(kept_columns, "_DOCUMENT_S", 1e-3)
+    monkeypatch.setattr(kept_columns.KeptColumns, "_prices", lambda *_: (60 * 1e-4, 1.0))
+    moment = plain.topic("/state").where("i8 == 1").between(BASE, BASE + SECOND // 100)
+    for ask in (
+        moment.count,
+        moment.intervals,
+        lambda: moment.changes("f64"),
+        lambda: moment.windows("1ms"),
+        lambda: moment.fields("f64").to_pandas(),
+    ):
+        plain.refresh()
+        ask()
+    assert not loads
+    plain.topic("/state").where("i8 == 1").count()
+    assert len(loads) == 1
