@@ -88,17 +88,18 @@ def any_in_each(query: Query, recording: str, spans: NDArray[np.int64]) -> NDArr
     if recording not in query.recording_ids or not len(spans):
         return found
     part = query.in_recording(recording)
-    if _in_columns(part, spans, found):
-        return found
     entry = part.store.select([recording])[0]
     rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
     covered = joined(rows[np.argsort(rows[:, 0], kind="stable")])
+    near = part.during(Intervals.of([(recording, covered)]))
+    if _in_columns(near, spans, found):
+        return found
     if part.store.database is not None and part.is_unbounded:
         keys = _expected(part.topics, entry, int((covered[:, 1] - covered[:, 0]).sum()))
         # Spans that overlap much are read together with less than they are asked about.
         if len(spans) <= 2 * len(covered) + keys / _SEVERAL:
             return _asked_each(part, entry, spans)
-    times = np.sort(_times(part.during(Intervals.of([(recording, covered)]))))
+    times = np.sort(_times(near))
     first, after = np.searchsorted(times, spans[:, 0]), np.searchsorted(times, spans[:, 1])
     found[:] = first < after
     return found

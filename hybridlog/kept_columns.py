@@ -22,6 +22,7 @@ from hybridlog.frames.text import repaired
 from hybridlog.indexing import rows_by_channel
 from hybridlog.query.column_filter import Single, is_single
 from hybridlog.query.plan import Sweep
+from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import Records, Scalars, Strings, concatenate, take
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 
 MOST_BYTES = 256 << 20
-"""Most memory that the columns of a store take."""
+"""Most memory that the columns of a store take; getting some takes up to four times theirs."""
 _SINGLE_READ = {"ros1", "cdr"}
 """Encodings of which every message has every field, so that payloads tell what the index does."""
 _SMALL = SegmentSettings().large_payload
@@ -92,11 +93,14 @@ class KeptColumns:
         self._types: dict[tuple[str, str], dict[str, str] | None] = {}
         self._unfit: set[tuple[str, str]] = set()
         self._spent: defaultdict[str, float] = defaultdict(float)
-        self._lock = threading.Lock()
+        self._generation = 0
+        self._lock = threading.RLock()
+        self._loading = threading.Lock()
 
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
+            self._generation += 1  # what is on its way is of the past
             self._kept.clear()
             self._types.clear()
             self._unfit.clear()
@@ -109,9 +113,15 @@ class KeptColumns:
         are documents already.
         """
         key = recording.id, topic
-        if key not in self._types:
-            self._types[key] = self._types_of(recording, topic)
-        return self._types[key]
+        with self._lock:
+            generation = self._generation
+            if key in self._types:
+                return self._types[key]
+        types = self._types_of(recording, topic)
+        with self._lock:
+            if generation == self._generation:
+                self._types[key] = types
+        return types
 
     def _types_of(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
         lanes = self._lanes(recording, topic)
@@ -148,32 +158,61 @@ class KeptColumns:
             counters: Get what is read.
         """
         wanted = frozenset(fields)
-        keys = [(recording.id, topic) for recording in recordings]
         with self._lock:
-            found = {key: self._kept[key] for key in keys if key in self._kept}
-            missing = [
-                recording
-                for recording, key in zip(recordings, keys, strict=True)
-                if key not in found or not wanted <= found[key].fields.keys()
-            ]
+            generation = self._generation
+            found, missing = self._look(topic, recordings, wanted)
             if missing and not self._is_worth(topic, recordings, missing, wanted, instead_s):
                 return None
-        for recording in missing:
-            key = recording.id, topic
-            kept = found.get(key)
-            lacking = wanted if kept is None else wanted - kept.fields.keys()
-            try:
-                loaded = self._load(recording, topic, lacking, counters)
-            except _UnfitError:
+        if missing:
+            # Of several who want the same at once, the first one gets it for all.
+            with self._loading:
                 with self._lock:
-                    self._unfit.add(key)
-                return None
-            if kept is not None:
-                fresh = {**kept.fields, **loaded.fields}
-                loaded = TopicColumns(kept.log_time, kept.seq, fresh)
-            found[key] = loaded
-        self._keep(found)
-        return [found[key] for key in keys]
+                    found, missing = self._look(topic, recordings, wanted)
+                for recording in missing:
+                    try:
+                        self._add(found, recording, topic, wanted, counters)
+                    except _UnfitError:
+                        with self._lock:
+                            if generation == self._generation:
+                                self._unfit.add((recording.id, topic))
+                        return None
+                self._keep(found, generation)
+        return [found[recording.id, topic] for recording in recordings]
+
+    def _look(
+        self, topic: str, recordings: Sequence[RecordingEntry], wanted: frozenset[str]
+    ) -> tuple[dict[tuple[str, str], TopicColumns], list[RecordingEntry]]:
+        """What is kept, and recordings of which something is missing."""
+        keys = [(recording.id, topic) for recording in recordings]
+        found = {key: self._kept[key] for key in keys if key in self._kept}
+        for key in found:
+            self._kept.move_to_end(key)
+        missing = [
+            recording
+            for recording, key in zip(recordings, keys, strict=True)
+            if key not in found or not wanted <= found[key].fields.keys()
+        ]
+        return found, missing
+
+    def _add(
+        self,
+        found: dict[tuple[str, str], TopicColumns],
+        recording: RecordingEntry,
+        topic: str,
+        wanted: frozenset[str],
+        counters: Counters,
+    ) -> None:
+        """Get what is missing of a recording."""
+        key = recording.id, topic
+        kept = found.get(key)
+        if kept is None:
+            found[key] = self._load(recording, topic, wanted, counters)
+            return
+        loaded = self._load(recording, topic, wanted - kept.fields.keys(), counters)
+        fields = {**kept.fields, **loaded.fields}
+        if sum(map(_nbytes, fields.values())) > self.most_bytes / 2:
+            fields = {path: fields[path] for path in wanted}  # so that these at least have room
+        found[key] = TopicColumns(kept.log_time, kept.seq, fields)
 
     def _is_worth(
         self,
@@ -231,7 +270,10 @@ class KeptColumns:
         known = self.types(recording, topic) or {}
         assert recording.span is not None
         first, last = recording.span
-        query = self._store.query([topic], [recording.id]).between(f"{first}ns", f"{last + 1}ns")
+        query = self._store.query([topic], [recording.id])
+        if last + 1 < TIME_LIMIT:
+            # The documents of other recordings need not be looked at.
+            query = query.between(f"{first}ns", f"{last + 1}ns")
         columns = load(query, {path: known[path] for path in fields})
         counters.bytes_read += query.counters.bytes_read
         counters.chunks_read += query.counters.chunks_read
@@ -240,9 +282,11 @@ class KeptColumns:
             raise _UnfitError
         return columns
 
-    def _keep(self, found: Mapping[tuple[str, str], TopicColumns]) -> None:
+    def _keep(self, found: Mapping[tuple[str, str], TopicColumns], generation: int) -> None:
         """Keep these, and of the others those that were used last, as many as have room."""
         with self._lock:
+            if generation != self._generation:
+                return
             for key, columns in found.items():
                 self._kept[key] = columns
                 self._kept.move_to_end(key)

@@ -104,6 +104,7 @@ def windows(query: Query, before: DurationLike, after: DurationLike) -> Interval
         # Where windows begin together, those of the recording with the least key are first.
         (names[number].id, np.stack([time, time, np.ones_like(time)], axis=1))
         for number, time in sorted(parts, key=lambda part: part[0])
+        if len(time)
     ).widened(before, after)
     return wide.within({entry.id: _extent(entry) for entry in names.values()})
 
@@ -128,14 +129,14 @@ def _check(query: Query, what: str) -> None:
 def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDArray[np.int64]]:
     assert part.recording.span is not None
     time = part.columns.log_time
-    holds = np.ones(len(time), np.bool_) if part.holds is None else part.holds
     low, high = np.searchsorted(time, span)
     holding = Holding(max_gap)
     if low:
         # What was said last before the range still holds when it begins.
-        before = slice(low - 1, low)
-        yield clipped(holding.add(time[before], holds[before], counted=False), span)
-    yield clipped(holding.add(time[low:high], holds[low:high]), span)
+        before = np.array([low - 1])
+        yield clipped(holding.add(time[before], part.holds(before), counted=False), span)
+    within = np.arange(low, high)
+    yield clipped(holding.add(time[within], part.holds(within)), span)
     yield clipped(holding.finish(part.recording.span[1] + 1), span)
 
 

@@ -531,7 +531,7 @@ class Query:
         """
         from hybridlog.moments import states
 
-        with self._costing():
+        with self.costing():
             found = states(self, max_gap)
         if at_least is not None:
             found = found.at_least(at_least)
@@ -568,7 +568,7 @@ class Query:
         if not fields:
             raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
         self.fields(*fields)  # refuses what there is not
-        with self._costing():
+        with self.costing():
             return changes(self, fields, pause, tolerance)
 
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
@@ -587,7 +587,8 @@ class Query:
         """
         from hybridlog.moments import windows
 
-        return windows(self, before, after)
+        with self.costing():
+            return windows(self, before, after)
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
@@ -867,7 +868,7 @@ class Query:
             setattr(self.counters, name, getattr(fresh, name))
 
     @contextmanager
-    def _costing(self) -> Iterator[None]:
+    def costing(self) -> Iterator[None]:
         """Counts from zero, and takes the time, while an answer is made."""
         self._reset()
         started = time.monotonic()

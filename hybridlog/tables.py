@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.column_answers import chosen
+from hybridlog.column_answers import Judged, chosen
 from hybridlog.frames import TableBuilder
+from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
 from hybridlog.indexing import rows_by_channel
 from hybridlog.query.plan import Lane, Piece, Plan, Sweep
-from hybridlog.schema.column import Records, Strings, concatenate, take
+from hybridlog.schema.column import Column, Records, Scalars, Strings, take
 from hybridlog_storage.errors import DefinitionError, UsageError
 from hybridlog_storage.messages import Batch
 
@@ -55,11 +56,7 @@ def collect(query: Query) -> TableBuilder:
     types = scalar_types(query)
     if types is not None:
         builder = TableBuilder()
-        for block in _empty(query.empty_plan(), query):
-            _append(builder, block, several=False)
-        kept = _from_columns(query, types)
-        blocks = chain.from_iterable(_from_index(query, types)) if kept is None else kept
-        for block in blocks:
+        for block in chain.from_iterable(_single_values(query, types)):
             builder.append(block.log_time, block.seq, block.records)
         return builder
     plan = query.plan()
@@ -79,15 +76,13 @@ def stream(query: Query) -> Iterator[pa.Table]:
     several = len(query.topics) > 1
     types = scalar_types(query)
     groups: Iterator[Iterable[Block]]
-    kept = None if types is None else _from_columns(query, types)
-    if kept is not None:
-        groups = _in_order(kept, reverse=query.is_reversed)
-    elif types is not None:
-        groups = _from_index(query, types)
+    if types is not None:
+        groups = _single_values(query, types)
     else:
         plan = query.plan()
         _check(plan.lanes)
-        groups = (_decoded(plan.lanes, piece, query) for piece in query.pieces(plan))
+        decoded = (_decoded(plan.lanes, piece, query) for piece in query.pieces(plan))
+        groups = chain([_empty(query.empty_plan(), query)], decoded)
     yield from _tables(query, groups, several=several)
 
 
@@ -95,8 +90,6 @@ def _tables(
     query: Query, groups: Iterator[Iterable[Block]], *, several: bool
 ) -> Iterator[pa.Table]:
     builder, size = TableBuilder(), 0
-    for block in _empty(query.empty_plan(), query):
-        _append(builder, block, several=several)
     given = False
     for group in groups:
         # Blocks of one group overlap in time, so no table ends between them.
@@ -209,7 +202,6 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
     Raises:
         UsageError: a summary of an array is asked for where the index cannot answer.
     """
-    from hybridlog.frames.bson import INDEX_TYPES
     from hybridlog.reader import summary_type
 
     fields = query.selected_fields
@@ -239,41 +231,65 @@ def scalar_types(query: Query) -> Mapping[str, str] | None:
     return types if indexed else None
 
 
-def _from_columns(query: Query, types: Mapping[str, str]) -> list[Block] | None:
-    """Blocks of the fields asked for out of kept columns; None when they do not have them."""
+def _single_values(query: Query, types: Mapping[str, str]) -> Iterator[Iterable[Block]]:
+    """Blocks of single values of one topic, out of kept columns or the index.
+
+    The first group has no rows, so that there are columns even when no message is found.
+    """
     topic = query.topics[0]
-    found = chosen(query, topic, types, as_rows=True) if query.is_unthinned else None
-    if found is None:
-        return None
-    blocks = []
-    for rank, (part, rows) in enumerate(sorted(found, key=lambda item: item[0].recording.key)):
-        columns = part.columns
-        records = Records({path: take(columns.fields[path], rows) for path in types}, len(rows))
-        seq = columns.seq[rows] + (rank << _SEQ_BITS)
-        blocks.append(Block(topic, columns.log_time[rows], seq, records, 0))
-        query.counters.messages += len(rows)
-    return blocks
+    none = np.empty(0, np.int64)
+    yield [Block(topic, none, none, Records(_no_values(types), 0), 0)]
+    found = None
+    if query.is_unthinned:
+        with query.costing():
+            found = chosen(query, topic, types, as_rows=True)
+    yield from _from_index(query, types) if found is None else _from_columns(query, types, found)
 
 
-def _in_order(blocks: Sequence[Block], *, reverse: bool) -> Iterator[list[Block]]:
-    """Blocks of one topic as one of each time, in order, none of them large."""
-    if not blocks:
+def _no_values(types: Mapping[str, str]) -> dict[str, Column]:
+    """Columns without rows."""
+    columns: dict[str, Column] = {}
+    for path, kind in types.items():
+        dtype = INDEX_TYPES[kind]
+        if kind == "string":
+            columns[path] = Strings(np.empty(0, np.uint8), np.zeros(1, np.int64))
+        elif dtype is None:
+            columns[path] = Scalars(np.empty(0, np.int64), INSTANTS[kind])
+        else:
+            columns[path] = Scalars(np.empty(0, dtype))
+    return columns
+
+
+def _from_columns(
+    query: Query, types: Mapping[str, str], found: Sequence[tuple[Judged, NDArray[np.intp]]]
+) -> Iterator[list[Block]]:
+    """Blocks of fields out of kept columns, in groups that are in order."""
+    if not found:
         return
-    log_time = np.concatenate([block.log_time for block in blocks])
-    seq = np.concatenate([block.seq for block in blocks])
-    records = concatenate([block.records for block in blocks])
-    order = np.lexsort((seq, log_time))
-    if reverse:
+    parts = sorted(found, key=lambda item: item[0].recording.key)
+    times = [part.columns.log_time[rows] for part, rows in parts]
+    owner = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
+    order = np.lexsort((owner, np.concatenate(times)))  # stable: within one, by arrival
+    if query.is_reversed:
         order = order[::-1]
+    row = np.concatenate([rows for _, rows in parts])
     for begin in range(0, len(order), _BLOCK_ROWS):
-        rows = order[begin : begin + _BLOCK_ROWS]
-        yield [Block(blocks[0].topic, log_time[rows], seq[rows], take(records, rows), 0)]
+        here = order[begin : begin + _BLOCK_ROWS]
+        group = []
+        for rank, (part, _) in enumerate(parts):
+            rows = np.sort(row[here[owner[here] == rank]])
+            columns: dict[str, Column] = {
+                path: take(part.columns.fields[path], rows) for path in types
+            }
+            seq = part.columns.seq[rows] + (rank << _SEQ_BITS)
+            log_time = part.columns.log_time[rows]
+            group.append(Block(query.topics[0], log_time, seq, Records(columns, len(rows)), 0))
+        query.counters.messages += len(here)
+        yield group
 
 
 def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:
     """Blocks of the fields asked for, in groups that are in the order of the index."""
-    from hybridlog.frames.bson import records_from_bson
-
     topic = query.topics[0]
     projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
     for raw, rows, before in query.thinned_documents(topic, projection):

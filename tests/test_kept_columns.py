@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import random
 import struct
+import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -261,6 +263,7 @@ def answers(store: hl.Store, where: str, bounds: tuple[int, int] | None) -> dict
         "near": lambda: rows(other.changes("f64", pause="1s", tolerance=1)),
         "containing": lambda: rows(events.containing(query)),
         "during": query.during(events).count,
+        "nothing": lambda: rows(query.where("i8 > 100").windows("1s").containing(query.limit(1))),
         "frame": lambda: query.fields("f64", "name", "at").to_pandas(),
         "reversed": lambda: query.reverse().fields("i8").to_pandas(),
         "arrow": lambda: query.fields("name").to_arrow().to_pydict(),
@@ -425,3 +428,66 @@ def test_a_question_about_a_moment_gets_no_columns(
     assert not loads
     plain.topic("/state").where("i8 == 1").count()
     assert len(loads) == 1
+
+
+def test_events_are_looked_for_in_recordings_that_a_range_is_not_in(
+    store: hl.Store, at_once: None
+) -> None:
+    later = [(100 + n, "/state", {"i8": n % 3}) for n in range(5)]
+    recorded(store, {"one": [(n, "/state", {"i8": n % 3}) for n in range(5)], "two": later})
+    topic = store.topic("/state")
+    in_one = topic.between(BASE, BASE + 3 * SECOND)
+    for most in (MOST_BYTES, 0):
+        store.kept.most_bytes = most
+        assert len(topic.windows(after="100ms").containing(in_one)) == 3
+    store.kept.most_bytes = MOST_BYTES
+
+
+def test_a_message_at_the_end_of_time(store: hl.Store, at_once: None) -> None:
+    recorded(store, {})
+    path = store.directory.path / "last.mcap"
+    write_log(path, [(t, "/state", message(usual(i8=1))) for t in (BASE, 2**63 - 1)], "last")
+    store.record(path)
+    assert [store.topic("/state").where("i8 == 1").count() for _ in range(3)] == [2, 2, 2]
+
+
+def test_columns_that_were_on_their_way_when_all_was_forgotten(
+    plain: hl.Store, at_once: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = kept_columns.KeptColumns._load
+
+    def slowly(kept: kept_columns.KeptColumns, *given: Any) -> kept_columns.TopicColumns:
+        loaded = load(kept, *given)
+        kept.clear()
+        return loaded
+
+    monkeypatch.setattr(kept_columns.KeptColumns, "_load", slowly)
+    assert plain.topic("/state").where("i8 == 1").count() == 20
+    assert not plain.kept._kept
+
+
+def test_what_several_want_at_once_is_got_once(
+    plain: hl.Store, at_once: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads = []
+    load = kept_columns.KeptColumns._load
+
+    def counted(*given: Any) -> kept_columns.TopicColumns:
+        loads.append(given)
+        time.sleep(0.2)
+        return load(*given)
+
+    monkeypatch.setattr(kept_columns.KeptColumns, "_load", counted)
+    with ThreadPoolExecutor(4) as pool:
+        asked = [pool.submit(plain.topic("/state").where("i8 == 1").count) for _ in range(4)]
+        assert [one.result() for one in asked] == [20] * 4
+    assert len(loads) == 1
+
+
+def test_counters_are_of_one_answer(plain: hl.Store, at_once: None) -> None:
+    query = plain.topic("/state").where("i8 == 1").fields("f64")
+    assert [query.to_pandas().attrs["hybridlog"]["messages"] for _ in range(3)] == [20] * 3
+    assert query.counters.bytes_read == 0
+    assert query.counters.elapsed_s > 0
+    query.windows("1s")
+    assert query.counters.messages == 0

@@ -41,7 +41,7 @@ is none of them: its sign differs between the ROS versions."""
 WireType: TypeAlias = "np.dtype[Any] | str"
 """A dtype or a key of `INDEX_TYPES`."""
 
-_INSTANTS: Final[Mapping[str, Literal["time", "duration"]]] = {
+INSTANTS: Final[Mapping[str, Literal["time", "duration"]]] = {
     "time": "time",
     "duration": "duration",
 }
@@ -329,7 +329,7 @@ def _typed(values: NDArray[Any], wanted: WireType | None) -> Scalars:
         # Saturating: milliseconds reach further than nanoseconds.
         most = np.iinfo(np.int64).max // 10**6
         return Scalars(np.clip(values.view(np.int64), -most, most) * 10**6, "time")
-    if isinstance(wanted, str) and (kind := _INSTANTS.get(wanted)) is not None:
+    if isinstance(wanted, str) and (kind := INSTANTS.get(wanted)) is not None:
         fits = values.dtype.kind == "i"
         return Scalars(values.astype(np.int64), kind) if fits else Scalars(values)
     dtype = None if wanted is None else _dtype(wanted)

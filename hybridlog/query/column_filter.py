@@ -46,7 +46,7 @@ _ORDERS: dict[str, Callable[[Any, Any], Any]] = {
     "$gte": ge,
 }
 _EXACT = 1 << 53  # integers up to it are floats without a loss
-_MOST_VALUES = 100  # of a list; each is compared with the whole column
+_MOST_VALUES = 16  # of a list, each of which is compared with the whole column
 _INT64 = np.iinfo(np.int64)
 
 
@@ -233,15 +233,16 @@ def _of_integers(operator: str, operand: float) -> _Test:
 def _of_floats(operator: str, operand: float) -> _Test:
     if isinstance(operand, int) and abs(operand) > _EXACT:
         raise _UnfitError
-    if not math.isnan(operand):
-        # A float64 of its own kind, so that float32 are compared as the index holds them.
-        return _ordered(operator, np.float64(operand))
-    if operator not in {"$eq", "$lte", "$gte"}:
+    if math.isnan(operand) and operator not in {"$eq", "$lte", "$gte"}:
         return _always(False)
+    order = _ORDERS[operator]
 
     def found(column: Single) -> Any:
         assert isinstance(column, Scalars)
-        return np.isnan(column.values)
+        if math.isnan(operand):
+            return np.isnan(column.values)
+        # As the index holds them; float32 would be compared with a float32 otherwise.
+        return order(column.values.astype(np.float64, copy=False), operand)
 
     return found
 
