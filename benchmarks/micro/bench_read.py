@@ -53,6 +53,25 @@ def bench_fetch(case: str, store: Any, benchmark: Any) -> None:
     assert benchmark(fetch) == count
 
 
+FAST = "angular_velocity.z > 2.5"
+AGAIN: dict[str, Callable[[Any], int]] = {
+    "count": lambda store: store.topic("/imu/data").where(FAST).count(),
+    "states": lambda store: len(store.topic("/imu/data").where(FAST).intervals()),
+    "changes": lambda store: len(store.topic("/imu/data").changes("orientation")),
+    "frame": lambda store: len(
+        store.topic("/imu/data").where(FAST).fields("angular_velocity.z").to_pandas()
+    ),
+}
+
+
+@pytest.mark.parametrize("case", AGAIN)
+def bench_again(case: str, store: Any, benchmark: Any) -> None:
+    """What was asked before about single values of a topic."""
+    ask = AGAIN[case]
+    answer = ask(store)
+    assert benchmark(ask, store) == answer
+
+
 DECODED = {
     "imu": (IMU, "/imu/data", 5000),
     "scan": (DRIVE, "/scan", 80),
