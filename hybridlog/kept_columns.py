@@ -238,7 +238,7 @@ class KeptColumns:
     def _size(self, recording: RecordingEntry, topic: str, fields: Collection[str]) -> int:
         """Most memory that columns take."""
         types = self.types(recording, topic) or {}
-        has_text = any(types[path] == "string" for path in fields)
+        has_text = any(types.get(path) == "string" for path in fields)
         text = sum(s.payload_bytes for s in _stats(recording, topic)) if has_text else 0
         return _messages(recording, topic) * 8 * (2 + len(fields)) + text
 
@@ -268,6 +268,8 @@ class KeptColumns:
         from_segments, from_index = self._prices(recording, topic)
         load = _from_segments if from_segments < from_index else _from_index
         known = self.types(recording, topic) or {}
+        if not fields <= known.keys():
+            raise _UnfitError  # all was forgotten meanwhile, and the recording is another one
         assert recording.span is not None
         first, last = recording.span
         query = self._store.query([topic], [recording.id])
