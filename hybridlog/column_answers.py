@@ -22,17 +22,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """All messages of a topic in a recording, and a predicate.
+    """All messages of a topic in a recording, and what is asked of them.
 
     Attributes:
         recording: The recording.
         columns: The messages, in order.
-        predicate: What is asked of them; None for nothing.
+        predicate: Of which messages; None for all.
+        spans: In which ranges of log time, apart and in order; None for all times.
     """
 
     recording: RecordingEntry
     columns: TopicColumns
     predicate: ColumnFilter | None
+    spans: Sequence[Span] | None
 
     def holds(self, rows: NDArray[np.intp] | None = None) -> NDArray[np.bool_]:
         """Of which of some messages, or of all, the predicate holds: bool[n]."""
@@ -44,49 +46,29 @@ class Judged:
             fields = {path: take(column, rows) for path, column in fields.items()}
         return self.predicate.mask(fields, count)
 
-    def rows(self, spans: Sequence[Span] | None = None) -> NDArray[np.intp]:
-        """Messages of which it holds, in order.
-
-        Args:
-            spans: Only those in one of these ranges of log time, which are apart and in
-                order; None for all.
-        """
-        if spans is None:
+    def rows(self) -> NDArray[np.intp]:
+        """Messages in the ranges of which the predicate holds, in order."""
+        if self.spans is None:
             return np.flatnonzero(self.holds())
-        bounds = np.array(spans, np.int64).reshape(-1, 2)
+        bounds = np.array(self.spans, np.int64).reshape(-1, 2)
         low, high = np.searchsorted(self.columns.log_time, bounds).T
         rows = ranges(low, high - low)
         return rows if self.predicate is None else rows[self.holds(rows)]
 
-    def count(self, spans: Sequence[Span] | None = None) -> int:
-        """Number of messages of which it holds."""
-        return int(np.count_nonzero(self.holds())) if spans is None else len(self.rows(spans))
+    def count(self) -> int:
+        """Number of these messages."""
+        return int(np.count_nonzero(self.holds())) if self.spans is None else len(self.rows())
 
 
-def whole(query: Query, topic: str, fields: Collection[str] = ()) -> dict[str, Judged] | None:
-    """All messages of a topic, and what a question about some time says of them.
-
-    Args:
-        query: The question.
-        topic: One of its topics.
-        fields: Paths of fields that are needed besides those of the predicate.
-
-    Returns:
-        By id of the recording; None if columns do not have it all, or are not worth getting.
-    """
-    found = _asked(query, topic, fields, as_rows=True)
-    return None if found is None else {part.recording.id: part for part, _ in found}
-
-
-def chosen(
+def judged(
     query: Query,
     topic: str,
     fields: Collection[str] = (),
     *,
     as_rows: bool = False,
     instead_s: float | None = None,
-) -> list[tuple[Judged, NDArray[np.intp]]] | None:
-    """Messages of a topic that a question is about, of `limit` and `every` apart.
+) -> list[Judged] | None:
+    """What columns say of one of a question's topics, of `limit` and `every` apart.
 
     Args:
         query: The question.
@@ -96,50 +78,19 @@ def chosen(
         instead_s: What the answer costs without columns, if the caller knows it.
 
     Returns:
-        Of each recording its columns and rows, ascending; None as in `whole`.
+        One of each recording that has the topic; None if columns do not have it all, or
+        are not worth getting.
     """
-    found = _asked(query, topic, fields, as_rows=as_rows, instead_s=instead_s)
-    return None if found is None else [(part, part.rows(spans)) for part, spans in found]
-
-
-def count(query: Query, topic: str) -> int | None:
-    """Number of messages of a topic that a question is about; None as in `whole`."""
-    found = _asked(query, topic)
-    return None if found is None else sum(part.count(spans) for part, spans in found)
-
-
-def _asked(
-    query: Query,
-    topic: str,
-    fields: Collection[str] = (),
-    *,
-    as_rows: bool = False,
-    instead_s: float | None = None,
-) -> list[tuple[Judged, list[Span] | None]] | None:
-    """Columns of each recording, and the ranges of time that a question is about."""
     store = query.store
     if store.database is None or not store.kept.most_bytes or not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)
     if instead_s is None:
         instead_s = _instead_s(query, topic, spans, as_rows=as_rows)
-    found = _judged(query, topic, fields, instead_s)
-    if found is None:
-        return None
-    return [(part, None if spans is None else spans.get(part.recording.id, [])) for part in found]
-
-
-def _judged(
-    query: Query, topic: str, fields: Collection[str], instead_s: float
-) -> list[Judged] | None:
-    """What columns say of a topic, whatever the time range; None as in `whole`."""
-    store = query.store
     predicate = query.filter
     filters, wanted, recordings = [], set(fields), []
     for recording in store.recordings():
-        if recording.id not in query.recording_ids:
-            continue
-        if not any(c.topic == topic for c in recording.channels):
+        if recording.id not in query.recording_ids or not recording.stats_of(topic):
             continue
         types = store.kept.types(recording, topic)
         if types is None or not types.keys() >= set(fields):
@@ -156,7 +107,12 @@ def _judged(
     if columns is None:
         return None
     return [
-        Judged(recording, own, part if predicate else None)
+        Judged(
+            recording,
+            own,
+            part if predicate else None,
+            None if spans is None else spans.get(recording.id, []),
+        )
         for recording, own, part in zip(recordings, columns, filters, strict=True)
     ]
 
@@ -183,5 +139,5 @@ def _instead_s(
             share = sum(end - begin for begin, end in own) / (
                 recording.span[1] - recording.span[0] + 1
             )
-        messages += share * sum(c.stats.messages for c in recording.channels if c.topic == topic)
+        messages += share * recording.messages_of(topic)
     return cost_s(messages, windows=windows, as_rows=as_rows)

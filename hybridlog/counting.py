@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.column_answers import chosen
+from hybridlog.column_answers import judged
 from hybridlog.kept_columns import cost_s
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.times import TIME_LIMIT
@@ -109,11 +109,11 @@ def _in_columns(query: Query, spans: NDArray[np.int64], found: NDArray[np.bool_]
     """Mark the spans in which a message lies, if columns tell it; whether they do."""
     instead_s = cost_s(_SEVERAL * len(spans), windows=len(spans)) / len(query.topics)
     for topic in query.topics:
-        parts = chosen(query, topic, instead_s=instead_s)
+        parts = judged(query, topic, instead_s=instead_s)
         if parts is None:
             return False
-        for part, rows in parts:
-            times = part.columns.log_time[rows]
+        for part in parts:
+            times = part.columns.log_time[part.rows()]
             first, after = np.searchsorted(times, spans.T)
             found |= first < after
     return True
@@ -154,13 +154,13 @@ def _expected(topics: Iterable[str], entry: RecordingEntry, length: int) -> floa
     """About how many messages of some topics a recording has in so many nanoseconds."""
     if entry.span is None:
         return 0.0
-    messages = sum(_messages(topic, [entry]) for topic in topics)
+    messages = sum(map(entry.messages_of, topics))
     return messages * length / max(entry.span[1] - entry.span[0], 1)
 
 
 def _messages(topic: str, recordings: Iterable[RecordingEntry]) -> int:
     """How many messages of a topic the catalog knows of."""
-    return sum(c.stats.messages for r in recordings for c in r.channels if c.topic == topic)
+    return sum(recording.messages_of(topic) for recording in recordings)
 
 
 def _is_whole(
@@ -204,7 +204,7 @@ def _key_ranges(
     topic: str, recordings: Sequence[RecordingEntry], parts: int
 ) -> Iterator[dict[str, object]]:
     """All keys there can be, cut where the times of a topic's messages are."""
-    stats = [c.stats for r in recordings for c in r.channels if c.topic == topic]
+    stats = [s for recording in recordings for s in recording.stats_of(topic)]
     first = min((s.first for s in stats if s.first is not None), default=0)
     last = max((s.last for s in stats if s.last is not None), default=TIME_LIMIT)
     edges = [key_bound(first + (last - first) * n // parts) for n in range(1, parts)]

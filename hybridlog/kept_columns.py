@@ -125,7 +125,7 @@ class KeptColumns:
 
     def _types_of(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
         lanes = self._lanes(recording, topic)
-        stats = _stats(recording, topic)
+        stats = recording.stats_of(topic)
         one_codec = len({id(lane.codec) for lane in lanes}) == 1
         if (
             recording.status == "open"
@@ -239,17 +239,17 @@ class KeptColumns:
         """Most memory that columns take."""
         types = self.types(recording, topic) or {}
         has_text = any(types.get(path) == "string" for path in fields)
-        text = sum(s.payload_bytes for s in _stats(recording, topic)) if has_text else 0
-        return _messages(recording, topic) * 8 * (2 + len(fields)) + text
+        text = sum(s.payload_bytes for s in recording.stats_of(topic)) if has_text else 0
+        return recording.messages_of(topic) * 8 * (2 + len(fields)) + text
 
     def _prices(self, recording: RecordingEntry, topic: str) -> tuple[float, float]:
         """What columns cost out of the segments, and out of the index, seconds."""
-        from_index = _QUESTION_S + _DOCUMENT_S * _messages(recording, topic)
+        from_index = _QUESTION_S + _DOCUMENT_S * recording.messages_of(topic)
         encodings = {lane.channel.message_encoding for lane in self._lanes(recording, topic)}
         if not encodings <= _SINGLE_READ:
             return np.inf, from_index
         # Small messages of all topics share chunks, large ones have their own.
-        is_own = any(_is_large(stats) for stats in _stats(recording, topic))
+        is_own = any(_is_large(stats) for stats in recording.stats_of(topic))
         read = [
             c.stats
             for c in recording.channels
@@ -280,7 +280,7 @@ class KeptColumns:
         counters.bytes_read += query.counters.bytes_read
         counters.chunks_read += query.counters.chunks_read
         counters.documents_read += query.counters.documents_read
-        if len(columns) != _messages(recording, topic) or columns.fields.keys() != fields:
+        if len(columns) != recording.messages_of(topic) or columns.fields.keys() != fields:
             raise _UnfitError
         return columns
 
@@ -387,14 +387,6 @@ def _nbytes(column: Single) -> int:
     if isinstance(column, Strings):
         return column.data.nbytes + column.offset.nbytes
     return column.values.nbytes
-
-
-def _stats(recording: RecordingEntry, topic: str) -> list[ChannelStats]:
-    return [c.stats for c in recording.channels if c.topic == topic]
-
-
-def _messages(recording: RecordingEntry, topic: str) -> int:
-    return sum(stats.messages for stats in _stats(recording, topic))
 
 
 def _is_large(stats: ChannelStats) -> bool:

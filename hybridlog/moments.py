@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.column_answers import Judged, chosen, whole
+from hybridlog.column_answers import Judged, judged
 from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
 from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
@@ -40,7 +40,7 @@ def states(query: Query, max_gap: DurationLike | None) -> Intervals:
     gap = None if max_gap is None else parse_duration(max_gap)
     if gap == 0:
         raise UsageError("A message that is believed for no time makes no interval.")
-    found = whole(query, query.topics[0])
+    found = _by_recording(query)
     if found is not None:
         return Intervals.of(
             (entry.id, rows)
@@ -63,7 +63,7 @@ def changes(
         raise UsageError(f"A tolerance is a number from 0 on, not {tolerance}.")
     quiet = parse_duration(pause)
     leaves = _leaves(query, fields)
-    found = None if leaves is None else whole(query, query.topics[0], leaves)
+    found = None if leaves is None else _by_recording(query, leaves)
     if found is not None and leaves is not None:
         return Intervals.of(
             (entry.id, rows)
@@ -92,9 +92,9 @@ def windows(query: Query, before: DurationLike, after: DurationLike) -> Interval
     names = {entry.key: entry for entry in query.store.recordings()}
     parts: list[tuple[int, NDArray[np.int64]]] = []
     for topic in query.topics:
-        found = chosen(query, topic, as_rows=True) if query.is_unthinned else None
+        found = judged(query, topic, as_rows=True) if query.is_unthinned else None
         if found is not None:
-            parts.extend((part.recording.key, part.columns.log_time[rows]) for part, rows in found)
+            parts.extend((p.recording.key, p.columns.log_time[p.rows()]) for p in found)
             continue
         for raw, rows, _ in query.thinned_documents(topic, _KEY):
             keys = key_columns(raw).take(rows)
@@ -126,6 +126,12 @@ def _check(query: Query, what: str) -> None:
         raise UsageError(f"{what} is found in all messages: limit, every and reverse do not fit.")
 
 
+def _by_recording(query: Query, fields: Collection[str] = ()) -> dict[str, Judged] | None:
+    """What columns say of the one topic of a question, by id of the recording."""
+    found = judged(query, query.topics[0], fields, as_rows=True)
+    return None if found is None else {part.recording.id: part for part in found}
+
+
 def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDArray[np.int64]]:
     assert part.recording.span is not None
     time = part.columns.log_time
@@ -143,7 +149,7 @@ def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDAr
 def _changes_kept(
     part: Judged, leaves: Collection[str], span: Span, tolerance: float, changing: Changing
 ) -> Iterator[NDArray[np.int64]]:
-    rows = part.rows()
+    rows = np.flatnonzero(part.holds())  # also those before the range
     low, high = np.searchsorted(part.columns.log_time[rows], span)
     rows = rows[max(low - 1, 0) : high]
     differs = np.zeros(max(len(rows) - 1, 0), np.bool_)

@@ -1007,16 +1007,16 @@ class Query:
         if database is None:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
-        from hybridlog import column_answers
+        from hybridlog.column_answers import judged
 
         total = 0
         left: list[tuple[str, Target]] = []
         for topic in sorted({topic for target in targets for topic in _topics_of(target)}):
-            found = column_answers.count(self, topic)
+            found = judged(self, topic)
             if found is None:
                 left.extend((topic, t) for t in targets if topic in _topics_of(t))
             else:
-                total += found
+                total += sum(part.count() for part in found)
         if not left:
             return total
         if not self.is_unbounded:
@@ -1138,7 +1138,7 @@ def _has_full_chunks(recording: RecordingEntry, topic: str) -> bool:
     """Whether entries of chunks are much fewer than the messages of a topic, and all there."""
     if recording.status == "open":
         return False
-    stats = [c.stats for c in recording.channels if c.topic == topic]
+    stats = recording.stats_of(topic)
     first = min((s.first for s in stats if s.first is not None), default=0)
     last = max((s.last for s in stats if s.last is not None), default=0)
     chunks = (last - first) / max(1, *(s.longest for s in stats)) + 1

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.column_answers import Judged, chosen
+from hybridlog.column_answers import Judged, judged
 from hybridlog.frames import TableBuilder
 from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
 from hybridlog.indexing import rows_by_channel
@@ -242,7 +242,7 @@ def _single_values(query: Query, types: Mapping[str, str]) -> Iterator[Iterable[
     found = None
     if query.is_unthinned:
         with query.costing():
-            found = chosen(query, topic, types, as_rows=True)
+            found = judged(query, topic, types, as_rows=True)
     yield from _from_index(query, types) if found is None else _from_columns(query, types, found)
 
 
@@ -261,12 +261,13 @@ def _no_values(types: Mapping[str, str]) -> dict[str, Column]:
 
 
 def _from_columns(
-    query: Query, types: Mapping[str, str], found: Sequence[tuple[Judged, NDArray[np.intp]]]
+    query: Query, types: Mapping[str, str], found: Sequence[Judged]
 ) -> Iterator[list[Block]]:
     """Blocks of fields out of kept columns, in groups that are in order."""
     if not found:
         return
-    parts = sorted(found, key=lambda item: item[0].recording.key)
+    ordered = sorted(found, key=lambda part: part.recording.key)
+    parts = [(part, part.rows()) for part in ordered]
     times = [part.columns.log_time[rows] for part, rows in parts]
     owner = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
     order = np.lexsort((owner, np.concatenate(times)))  # stable: within one, by arrival

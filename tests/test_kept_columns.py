@@ -159,8 +159,8 @@ filters = st.recursive(
 )
 
 
-def _seqs(parts: list[tuple[column_answers.Judged, Any]]) -> list[int]:
-    return [seq for part, rows in parts for seq in part.columns.seq[rows].tolist()]
+def _seqs(parts: list[column_answers.Judged]) -> list[int]:
+    return [seq for part in parts for seq in part.columns.seq[part.rows()].tolist()]
 
 
 @settings(
@@ -176,7 +176,7 @@ def _seqs(parts: list[tuple[column_answers.Judged, Any]]) -> list[int]:
 @example(query={"yes": {"$gt": False}})
 def test_columns_satisfy_what_documents_do(mixed: hl.Store, at_once: None, query: Filter) -> None:
     asked = mixed.topic("/state").where(query)
-    found = column_answers.chosen(asked, "/state")
+    found = column_answers.judged(asked, "/state")
     if found is not None:
         assert _seqs(found) == [d["_meta"]["seq"] for d in asked.documents()]
 

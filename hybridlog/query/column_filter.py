@@ -19,7 +19,6 @@ from hybridlog.schema.column import Scalars, Strings
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-Mask = "NDArray[np.bool_]"
 Single = Scalars | Strings
 """A column of which every row has one value."""
 
@@ -107,13 +106,15 @@ class _Compiler:
     def all_of(self, query: object) -> _Filter:
         if not isinstance(query, Mapping):
             raise _UnfitError
-        return _joined(np.logical_and, True, [self._clause(*item) for item in query.items()])
+        if not query:
+            return lambda _, rows: np.ones(rows, np.bool_)
+        return _joined(np.logical_and, [self._clause(*item) for item in query.items()])
 
     def _clause(self, key: str, value: Any) -> _Filter:
         if key == "$and":
-            return _joined(np.logical_and, True, [self.all_of(item) for item in value])
+            return _joined(np.logical_and, [self.all_of(item) for item in value])
         if key in {"$or", "$nor"}:
-            found = _joined(np.logical_or, False, [self.all_of(item) for item in value])
+            found = _joined(np.logical_or, [self.all_of(item) for item in value])
             return _negated(found) if key == "$nor" else found
         kind = _KINDS.get(self._types.get(key, ""))
         if kind is None:
@@ -123,13 +124,13 @@ class _Compiler:
         return lambda columns, _: test(columns[key])
 
 
-def _joined(join: np.ufunc, empty: bool, parts: Sequence[_Filter]) -> _Filter:  # noqa: FBT001
-    def found(columns: Mapping[str, Single], rows: int) -> Any:
-        if not parts:
-            return np.full(rows, empty)
-        mask = parts[0](columns, rows)
+def _joined(join: np.ufunc, parts: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
+    """All or any of some filters, or of some tests; at least one."""
+
+    def found(*asked: object) -> Any:
+        mask = parts[0](*asked)
         for part in parts[1:]:
-            mask = join(mask, part(columns, rows))
+            mask = join(mask, part(*asked))
         return mask
 
     return found
@@ -146,17 +147,7 @@ def _condition(kind: _Kind, value: object) -> _Test:
     if not value:
         raise _UnfitError
     tests = [_operation(kind, operator, operand) for operator, operand in value.items()]
-    return _any_or_all(np.logical_and, tests)
-
-
-def _any_or_all(join: np.ufunc, tests: Sequence[_Test]) -> _Test:
-    def found(column: Single) -> Any:
-        mask = tests[0](column)
-        for test in tests[1:]:
-            mask = join(mask, test(column))
-        return mask
-
-    return found
+    return _joined(np.logical_and, tests)
 
 
 def _operation(kind: _Kind, operator: str, operand: Any) -> _Test:
@@ -173,7 +164,7 @@ def _operation(kind: _Kind, operator: str, operand: Any) -> _Test:
             return _always(False)
         if len(operand) > _MOST_VALUES:
             raise _UnfitError
-        return _any_or_all(np.logical_or, [_operation(kind, "$eq", item) for item in operand])
+        return _joined(np.logical_or, [_operation(kind, "$eq", item) for item in operand])
     if operator == "$exists" and isinstance(operand, bool):
         return _always(operand)
     if operator == "$type" and operand == "null":

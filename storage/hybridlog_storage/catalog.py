@@ -114,6 +114,14 @@ class RecordingEntry:
         """Messages in all channels."""
         return sum(c.stats.messages for c in self.channels)
 
+    def stats_of(self, topic: str) -> list[ChannelStats]:
+        """What is known of each of a topic's channels."""
+        return [c.stats for c in self.channels if c.topic == topic]
+
+    def messages_of(self, topic: str) -> int:
+        """Messages of a topic."""
+        return sum(stats.messages for stats in self.stats_of(topic))
+
     @property
     def span(self) -> tuple[int, int] | None:
         """Log time `[first, last]`, ns, both inclusive; None without messages."""
