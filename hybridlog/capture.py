@@ -36,10 +36,11 @@ class Capture:
         tags: Kept with it.
         source: What its messages come from, as the catalog shows it.
         settings: How segments are cut and packed.
-        behind: Says whether whoever appends has more than it can hand over. Chunks are
-            then not compressed, and the index waits, falls behind, and reads back later
-            from the segments what is no longer in memory. None when whoever appends may
-            wait for compression and for the index.
+        hurry: Says whether whoever appends has more than it can hand over. Chunks are
+            then not compressed. None when whoever appends may wait for compression.
+        behind: Says whether it has so much more that the index waits, falls behind, and
+            reads back later from the segments what is no longer in memory. None when
+            whoever appends may wait for the index.
         renew: With `behind`: another connection to the index when one has failed.
         check: Called with the catalog before anything is made, while nobody else can
             start a recording; raises to refuse.
@@ -59,6 +60,7 @@ class Capture:
         tags: Mapping[str, str],
         source: Mapping[str, Any],
         settings: SegmentSettings,
+        hurry: Callable[[], bool] | None = None,
         behind: Callable[[], bool] | None = None,
         renew: Callable[[], Database] | None = None,
         check: Callable[[Catalog], None] | None = None,
@@ -84,7 +86,7 @@ class Capture:
             recording_metadata(self.entry),
             self.index.submit,
             settings,
-            behind,
+            hurry,
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:

@@ -38,8 +38,9 @@ _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and is no
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
-_BEHIND = 8 << 20  # bytes not yet written from which all that can wait does
-_CALM_S = 1.0  # and for so long afterwards, or it would be the cause of the next delay
+_HURRY = 8 << 20  # bytes not yet written from which nothing is compressed any more
+_BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
+_CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
 _MOST_NS = 1 << 63
 
 
@@ -75,6 +76,20 @@ class _Message(NamedTuple):
     publish_time: int
     sequence: int
     payload: bytes
+
+
+class _Strain:
+    """Whether more waits to be written than a bound, or did a moment ago."""
+
+    def __init__(self, bound: int) -> None:
+        self._bound = bound
+        self._calm = 0.0
+
+    def is_felt(self, unwritten: int) -> bool:
+        now = time.monotonic()
+        if unwritten > self._bound:
+            self._calm = now + _CALM_S
+        return now < self._calm
 
 
 class LiveRecording:
@@ -119,7 +134,8 @@ class LiveRecording:
         self._room = threading.Condition(self._lock)
         self._wake = threading.Event()
         self._ended = False
-        self._calm = 0.0
+        self._hurry = _Strain(_HURRY)
+        self._behind = _Strain(_BEHIND)
         self._failure: BaseException | None = None
         self._report: RecordReport | None = None
         self.ledger = Ledger()
@@ -136,7 +152,8 @@ class LiveRecording:
                 tags=options.tags,
                 source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
-                behind=self._behind,
+                hurry=lambda: self._is_under(self._hurry),
+                behind=lambda: self._is_under(self._behind),
                 renew=renew,
             )
             self._held = self._held.pop_all()
@@ -323,10 +340,8 @@ class LiveRecording:
         if self._ended:
             raise UsageError(f"The recording {self.id!r} was closed.")
 
-    def _behind(self) -> bool:
-        if self._unwritten > _BEHIND:
-            self._calm = time.monotonic() + _CALM_S
-        return time.monotonic() < self._calm and not self._ended
+    def _is_under(self, strain: _Strain) -> bool:
+        return strain.is_felt(self._unwritten) and not self._ended
 
     def _stop(self) -> None:
         with self._lock:

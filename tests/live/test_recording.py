@@ -99,7 +99,7 @@ def test_the_index_falls_behind_and_catches_up(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     busy = True
-    monkeypatch.setattr(LiveRecording, "_behind", lambda _: busy)
+    monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: busy)
     own = channel("/talk")
     payloads = [text(os.urandom(50_000)) for _ in range(40)]
     settings = SegmentSettings(chunk_size=100_000, segment_size=1_000_000)
