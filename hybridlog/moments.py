@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridlog.column_answers import Judged, judged
 from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
-from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped
+from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped, span_of
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.query.unequal import unequal
 from hybridlog.schema.column import Scalars
@@ -113,7 +113,8 @@ def _extent(entry: RecordingEntry) -> Span:
     """Log time in which a recording has messages, or may have some by now."""
     if entry.span is None:
         return 0, TIME_LIMIT - 1
-    return entry.span[0], TIME_LIMIT - 1 if entry.status == "open" else entry.span[1] + 1
+    begin, end = span_of(entry)
+    return begin, TIME_LIMIT - 1 if entry.status == "open" else end
 
 
 def _check(query: Query, what: str) -> None:
@@ -133,7 +134,6 @@ def _by_recording(query: Query, fields: Collection[str] = ()) -> dict[str, Judge
 
 
 def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDArray[np.int64]]:
-    assert part.recording.span is not None
     time = part.columns.log_time
     low, high = np.searchsorted(time, span)
     holding = Holding(max_gap)
@@ -143,7 +143,7 @@ def _states_kept(part: Judged, span: Span, max_gap: int | None) -> Iterator[NDAr
         yield clipped(holding.add(time[before], part.holds(before), counted=False), span)
     within = np.arange(low, high)
     yield clipped(holding.add(time[within], part.holds(within)), span)
-    yield clipped(holding.finish(part.recording.span[1] + 1), span)
+    yield clipped(holding.finish(span_of(part.recording)[1]), span)
 
 
 def _changes_kept(
@@ -176,7 +176,6 @@ def _leaves(query: Query, fields: Sequence[str]) -> set[str] | None:
 def _states_in(
     query: Query, entry: RecordingEntry, span: Span, max_gap: int | None
 ) -> Iterator[NDArray[np.int64]]:
-    assert entry.span is not None
     holding = Holding(max_gap)
     start = _key_before(query, entry, span, {})
     if start is not None:
@@ -189,7 +188,7 @@ def _states_in(
         no = _keys(query, _asked(entry, span, {"$nor": [query.filter]}))
     for times, holds in _merged(yes, no):
         yield clipped(holding.add(times, holds), span)
-    yield clipped(holding.finish(entry.span[1] + 1), span)
+    yield clipped(holding.finish(span_of(entry)[1]), span)
 
 
 def _holds(query: Query, key: bytes) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ import numpy as np
 
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_counts import count_in_chunks
+from hybridlog.query.intervals import span_of
 from hybridlog.query.plan import (
     Chosen,
     Clock,
@@ -405,7 +406,7 @@ class Query:
             )
         moments: list[tuple[int, int, RecordingEntry]] = []
         for recording in self._recordings():
-            start, end = _span(recording)
+            start, end = span_of(recording)
             now = parse_time(moment, start=start, end=end)
             if recording.span is not None and now >= start:
                 moments.append((min(now, end - 1), now, recording))
@@ -414,7 +415,7 @@ class Query:
         for latest, now, recording in sorted(moments, key=lambda m: m[0], reverse=True):
             if best is not None and latest < best[0][0]:
                 break
-            for begin in _earlier_and_earlier(latest, _span(recording)[0]):
+            for begin in _earlier_and_earlier(latest, span_of(recording)[0]):
                 query = self._with(
                     recording_ids=(recording.id,),
                     _bounds=(f"{begin}ns", f"{now + 1}ns"),
@@ -678,7 +679,7 @@ class Query:
             if bounds is not None and self._is_outside(bounds, recording):
                 outside.append((recording, bounds))
                 continue
-            start, end = _span(recording)
+            start, end = span_of(recording)
             if bounds is not None:
                 start, end = max(start, bounds[0]), min(end, bounds[1])
             found.extend((recording, span) for span in self._windows_in(recording, (start, end)))
@@ -690,7 +691,7 @@ class Query:
         """Recordings in which the time range begins after the recording does, and when, ns."""
         for recording in self._recordings():
             bounds = self._bounds_in(recording) if self._clock == "log" else None
-            start, end = _span(recording)
+            start, end = span_of(recording)
             begin, stop = bounds or (start, end)
             windows = self._windows_in(recording, (max(begin, start), min(end, stop)))
             if windows and start < windows[0][0]:
@@ -700,7 +701,7 @@ class Query:
         """Bytes of payload, about: what a progress bar counts up to."""
         total = 0.0
         for recording in self._recordings():
-            start, end = _span(recording)
+            start, end = span_of(recording)
             begin, stop = self._bounds_in(recording) or (start, end)
             windows = self._windows_in(recording, (max(start, begin), min(end, stop)))
             share = sum(high - low for low, high in windows) / max(end - start, 1)
@@ -751,7 +752,7 @@ class Query:
         """
         if self._bounds is None:
             return None
-        start, end = _span(recording)
+        start, end = span_of(recording)
         begin, stop = self._bounds
         return (
             0 if begin is None else parse_time(begin, start=start, end=end),
@@ -820,7 +821,7 @@ class Query:
 
     def _is_outside(self, bounds: tuple[int, int], recording: RecordingEntry) -> bool:
         """Whether a range is empty, or by the log clock beside a recording."""
-        start, end = _span(recording)
+        start, end = span_of(recording)
         beside = self._clock == "log" and (bounds[0] >= end or bounds[1] <= start)
         return beside or bounds[0] >= bounds[1]
 
@@ -834,12 +835,12 @@ class Query:
         begin, stop = self._bounds
         spans = []
         for recording, (low, high) in outside:
-            start, end = _span(recording)
+            start, end = span_of(recording)
             # `2025-01-01` to `end` is no mistake, there is only nothing so late.
             if low < high or low == start or high == end:
                 spans.append(f"{recording.id} spans {format_time(start)} to {format_time(end)}")
         if not spans:
-            start, end = _span(outside[0][0])
+            start, end = span_of(outside[0][0])
             parse_range(begin, stop, start=start, end=end)
         raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans[:5])}.")
 
@@ -1147,12 +1148,6 @@ def _has_full_chunks(recording: RecordingEntry, topic: str) -> bool:
 
 def _any_of(filters: list[dict[str, object]]) -> dict[str, object]:
     return filters[0] if len(filters) == 1 else {"$or": filters}
-
-
-def _span(recording: RecordingEntry) -> tuple[int, int]:
-    """Log time `[start, end)` of a recording, ns; empty at 0 without messages."""
-    span = recording.span
-    return (span[0], span[1] + 1) if span is not None else (0, 0)
 
 
 def _as_dict(counters: Counters) -> dict[str, float]:

@@ -449,6 +449,15 @@ def test_a_message_at_the_end_of_time(store: hl.Store, at_once: None) -> None:
     write_log(path, [(t, "/state", message(usual(i8=1))) for t in (BASE, 2**63 - 1)], "last")
     store.record(path)
     assert [store.topic("/state").where("i8 == 1").count() for _ in range(3)] == [2, 2, 2]
+    for most in (MOST_BYTES, 0):
+        store.kept.most_bytes = most
+        asked = store.topic("/state").where("i8 == 1")
+        ((begin, end),) = asked.intervals().of_recording("last").tolist()
+        assert (begin, end) == (BASE, 2**63 - 1)
+        windows = asked.windows(before="2ns", after="1ns").of_recording("last").tolist()
+        assert windows == [[BASE, BASE + 1], [2**63 - 3, 2**63 - 1]]
+        # The last moment of all begins no interval.
+        assert store.topic("/state").during(asked.intervals()).count() == 1
 
 
 def test_columns_that_were_on_their_way_when_all_was_forgotten(

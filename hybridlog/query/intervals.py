@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
+from hybridlog.query.times import (
+    TIME_LIMIT,
+    DurationLike,
+    format_duration,
+    format_time,
+    parse_duration,
+)
 from hybridlog.schema.column import ranges
 from hybridlog_storage.errors import UsageError
 
@@ -22,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.reader import Query
+    from hybridlog_storage.catalog import RecordingEntry
 
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
@@ -259,6 +266,16 @@ class Intervals:
             self._end[rows],
             self._messages[rows],
         )
+
+
+def span_of(recording: RecordingEntry) -> Span:
+    """Log time of a recording; empty at 0 without messages.
+
+    It ends no later than the last nanosecond that 64 bits can say: a message of just then
+    is in no interval.
+    """
+    span = recording.span
+    return (span[0], min(span[1] + 1, TIME_LIMIT - 1)) if span is not None else (0, 0)
 
 
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:
