@@ -159,7 +159,7 @@ def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("at_once", [1, 7, 100])
 def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> None:
     setup = SegmentSettings()
-    for place, size, hz in (("sparse", 2000, 8), ("usual", 5000, 16), ("rare", 5000, 1)):
+    for place, size, hz in (("sparse", 2000, 8), ("usual", 20_000, 16), ("rare", 5000, 1)):
         step = 10**9 // hz
         rows = many(100, size=size, step=step)
         batches = [rows[at : at + at_once] for at in range(0, len(rows), at_once)]
