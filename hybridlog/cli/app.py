@@ -324,8 +324,11 @@ def record(
         ),
     ] = None,
     budget: Annotated[
-        str, typer.Option(help="Live: payload bytes in memory.", metavar="SIZE")
-    ] = "512MB",
+        str | None,
+        typer.Option(
+            help="Live: payload bytes in memory; a sixteenth of all if not said.", metavar="SIZE"
+        ),
+    ] = None,
     reserve: Annotated[
         str,
         typer.Option(help="Live: stop when the disk has less than this left.", metavar="SIZE"),

@@ -39,7 +39,7 @@ class LiveChoices:
     max_size: str | None = None
     split_size: str | None = None
     split_duration: str | None = None
-    budget: str = "512MB"
+    budget: str | None = None
     reserve: str = "1GB"
     flush_interval: str = "1s"
     ring: str | None = None
@@ -115,6 +115,7 @@ def recorder_options(
         UsageError: An option that makes no sense.
         TopicError: A pattern that is malformed.
     """
+    from hybridlog.live.budget import usual_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
@@ -137,7 +138,9 @@ def recorder_options(
         max_messages=live.max_messages,
         max_bytes=None if live.max_size is None else _size("--max-size", live.max_size, 1),
         reserve_bytes=_size("--reserve", live.reserve),
-        budget_bytes=_size("--budget", live.budget, _LEAST_BUDGET),
+        budget_bytes=usual_budget()
+        if live.budget is None
+        else _size("--budget", live.budget, _LEAST_BUDGET),
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(live),

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.live.budget import usual_budget
 from hybridlog.live.door import Door
 from hybridlog.live.policy import EVERY, SMALL, Keep, Priority, Rule, Throttle, first_fit, step
 from hybridlog.live.recording import LiveOptions, LiveRecording
@@ -73,7 +74,7 @@ class RecorderOptions:
     max_messages: int | None = None
     max_bytes: int | None = None
     reserve_bytes: int = 1 << 30
-    budget_bytes: int = 512 << 20
+    budget_bytes: int = field(default_factory=usual_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
     snapshots: SnapshotOptions | None = None

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Capture
+from hybridlog.live.budget import usual_budget
 from hybridlog.live.policy import SMALL
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
@@ -59,7 +60,7 @@ class LiveOptions:
 
     tags: Mapping[str, str] = field(default_factory=dict)
     source: Mapping[str, Any] = field(default_factory=dict)
-    budget_bytes: int = 512 << 20
+    budget_bytes: int = field(default_factory=usual_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
 
