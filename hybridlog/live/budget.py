@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-LEAST = 256 << 20
+LEAST = 64 << 20
 MOST = 2 << 30
 _SHARE = 16
 _CGROUPS = Path("/sys/fs/cgroup")

@@ -38,7 +38,7 @@ def test_no_limit_is_the_machine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("memory", "want"),
-    [(1 << 30, 256 << 20), (8 << 30, 512 << 20), (24 << 30, 1536 << 20), (1 << 40, 2 << 30)],
+    [(512 << 20, 64 << 20), (8 << 30, 512 << 20), (24 << 30, 1536 << 20), (1 << 40, 2 << 30)],
 )
 def test_a_sixteenth(monkeypatch: pytest.MonkeyPatch, memory: int, want: int) -> None:
     monkeypatch.setattr(budget, "memory_bytes", lambda: memory)
