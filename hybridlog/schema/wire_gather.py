@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridlog.schema.column import Arrays, Column, Scalars
 from hybridlog.schema.definition import Instant, Primitive
+from hybridlog_storage.buffers import buffers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,8 +19,9 @@ if TYPE_CHECKING:
 # From here on a single row is a view into the buffer: below, a copy costs less than
 # keeping the whole buffer alive.
 _VIEW_BYTES = 4096
-# numpy's void type counts its bytes in 31 bits, and gains nothing for long blocks.
-_LONG_BLOCK = 1 << 16
+# From here on rows are copied one by one into a buffer that is used again: numpy's own
+# gathering takes new memory from the system, which costs more than the copy.
+_LONG_BLOCK = 1 << 12
 # Rows of equal length are copied together when that pays for finding them.
 _MAX_GROUPS = 32
 _ROWS_A_GROUP = 16
@@ -92,7 +94,8 @@ class Source:
         return self._join(start.tolist(), size.tolist())
 
     def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
-        joined = np.empty(sum(size), np.uint8)
+        total = sum(size)
+        joined = buffers.take(total)[:total]
         content = np.frombuffer(self.buffer, np.uint8)
         to = 0
         for at, count in zip(start, size, strict=True):
