@@ -93,7 +93,7 @@ class SegmentSettings:
 
     chunk_size: int = 2 << 20
     chunk_span_ns: int = 250_000_000
-    span_size: int = 64 << 10
+    span_size: int = 32 << 10
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 1
