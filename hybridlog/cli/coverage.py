@@ -115,11 +115,12 @@ def gaps(
 
 def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
     """Whether a time range may meet what a recording lost: it can lie behind its end, too."""
+    from hybridlog.query.intervals import span_of
     from hybridlog.query.times import parse_range
 
     if entry.span is None:
         return True
-    start, end = entry.span[0], entry.span[1] + 1
+    start, end = span_of(entry)
     try:
         low, high = parse_range(*between, start=start, end=end)
     except TimeError:  # empty in this recording: nothing of the answer is from there
