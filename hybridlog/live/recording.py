@@ -24,6 +24,7 @@ from hybridlog.live.budget import usual_budget
 from hybridlog.live.policy import SMALL
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
+from hybridlog_storage.buffers import buffers
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
@@ -41,7 +42,10 @@ _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
 _HURRY = 8 << 20  # bytes not yet written from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
-_CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
+_STEADY = 64 << 20  # and from which whoever writes lets the writing thread go first
+_PACE = 1e9  # bytes a second that are still taken then, although nothing is laid down
+_AT_HAND = 64 << 20  # bytes of buffers that are there before the first message, at most
+_CALM_S = 1.0  # the first two for so long afterwards, or they would be the cause of the next delay
 _MOST_NS = 1 << 63
 
 
@@ -134,6 +138,9 @@ class LiveRecording:
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
         self._wake = threading.Event()
+        self._steady = min(_STEADY, options.budget_bytes // 2)
+        self._gate = threading.Lock()
+        self._laid = threading.Event()
         self._ended = False
         self._hurry = _Strain(_HURRY)
         self._behind = _Strain(_BEHIND)
@@ -143,6 +150,7 @@ class LiveRecording:
         """What is missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that were taken and found no room on the disk, by topic; known at the end."""
+        buffers.prepare(options.settings.chunk_size, min(_AT_HAND, options.budget_bytes // 16))
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -204,8 +212,9 @@ class LiveRecording:
             publish_time: When it was sent, ns since the epoch; None for the log time, which
                 is what a channel without publish times has.
             sequence: The sender's number, 0 to 2³²-1.
-            wait: False to refuse the message instead of waiting. Messages of up to `SMALL`
-                bytes may go beyond the budget by a quarter: fields land when payloads cannot.
+            wait: False to refuse the message instead of waiting for the budget. Messages of
+                up to `SMALL` bytes may go beyond it by a quarter: fields land when payloads
+                cannot.
 
         Returns:
             Whether it was taken.
@@ -218,6 +227,8 @@ class LiveRecording:
         sent = now if publish_time is None else publish_time
         if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
             raise UsageError("a time or the sequence number of a message is out of its range")
+        if self._unwritten > self._steady and len(payload) >= _LARGE:
+            self._give_way(len(payload))
         with self._lock:
             bound = self._small_bound if len(payload) <= SMALL else self._options.budget_bytes
             while self._unwritten and self._unwritten + len(payload) > bound:
@@ -335,6 +346,19 @@ class LiveRecording:
         with self._held:
             self._capture.forget()
 
+    def _give_way(self, size: int) -> None:
+        """Let the writing thread go first, for as long as so many bytes may take.
+
+        Many threads that write, each into new memory, leave one thread that makes room no
+        turn; what waits then grows, and with it the new memory. So they queue up here, and
+        one at a time goes on: at once when something was laid down, and in any case at a
+        pace that no robot has, since a disk may be slow for a while.
+        """
+        with self._gate:
+            self._laid.clear()
+            self._wake.set()
+            self._laid.wait(size / _PACE)
+
     def _check(self) -> None:
         if self._failure is not None:
             raise self._failure
@@ -395,6 +419,7 @@ class LiveRecording:
             with self._lock:
                 self._unwritten -= size
                 self._room.notify()
+            self._laid.set()
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _LEAST = 1 << 18  # smaller buffers are malloc's business
-_SPARE_BYTES = 64 << 20
+_SPARE_BYTES = 96 << 20
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 
@@ -49,19 +49,36 @@ class Buffers:
             if memory is not None:
                 self._spare_bytes -= size
         if memory is None:
-            memory = mmap.mmap(-1, size, flags=_PRIVATE)
-            if _HUGE is not None:
-                memory.madvise(_HUGE)
+            memory = _new(size)
         # What is over this array keeps this array, and so the memory, from being taken again.
         array = np.frombuffer(memory, np.uint8)
         weakref.finalize(array, self._give, memory).atexit = False
         return array
+
+    def prepare(self, size: int, total: int) -> None:
+        """Have spare buffers at hand, whose memory the system has given already.
+
+        Args:
+            size: Bytes of each, as they will be taken.
+            total: Bytes of all, about.
+        """
+        # Held until all are there, or the same one would be taken again and again.
+        held = [self.take(size) for _ in range(total // max(size, _LEAST))]
+        for buffer in held:
+            buffer[:: mmap.PAGESIZE] = 0
 
     def _give(self, memory: mmap.mmap) -> None:
         with self._lock:
             if self._spare_bytes + len(memory) <= _SPARE_BYTES:
                 self._spare.setdefault(len(memory), []).append(memory)
                 self._spare_bytes += len(memory)
+
+
+def _new(size: int) -> mmap.mmap:
+    memory = mmap.mmap(-1, size, flags=_PRIVATE)
+    if _HUGE is not None:
+        memory.madvise(_HUGE)
+    return memory
 
 
 buffers = Buffers()

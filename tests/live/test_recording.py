@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -21,7 +22,7 @@ from hybridlog.live import LiveRecording
 from hybridlog_storage import append_file
 from hybridlog_storage.errors import DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 from tests.test_faults import kill_mongod, wait_for
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
@@ -83,6 +84,41 @@ def test_many_threads_one_recording(store: hl.Store) -> None:
             (when, payload) for _, when, _, payload in written[number]
         ]
     assert store.verify().findings == []
+
+
+def test_while_nothing_is_laid_down_the_budget_is_still_taken(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    append_one = RecordingWriter.append_one
+
+    def wait(writer: RecordingWriter, *arguments: Any) -> None:
+        assert go_on.wait(60)
+        append_one(writer, *arguments)
+
+    monkeypatch.setattr(RecordingWriter, "append_one", wait)
+    refused = [0] * 5
+    payload = text(bytes(100_000))
+
+    def speak(number: int, recording: LiveRecording) -> None:
+        own = channel(f"/topic{number}")
+        for i in range(20):
+            refused[number] += not recording.write(own, payload, sequence=i, wait=False)
+
+    # A disk that stands still. From half of the budget on writers give way to the thread
+    # that waits for it, but not for long, and nothing is refused before the budget is spent.
+    with store.start("talk", budget_bytes=8 << 20) as recording:
+        threads = [threading.Thread(target=speak, args=(n, recording)) for n in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert 0.98 < recording.filled <= 1
+        assert sum(refused) == 100 - (8 << 20) // len(payload)
+        go_on.set()
+        wait_for(lambda: recording.filled == 0)
+    report = recording.close()
+    assert (report.indexed, report.missed, report.failure) == (100 - sum(refused), 0, None)
 
 
 def test_what_is_written_can_be_asked_for_while_it_goes_on(store: hl.Store) -> None:

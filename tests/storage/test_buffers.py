@@ -1,0 +1,69 @@
+"""Buffers that are used again."""
+
+from __future__ import annotations
+
+import mmap
+
+import numpy as np
+import pytest
+
+from hybridlog_storage import buffers as module
+from hybridlog_storage.buffers import Buffers
+
+SIZE = 1 << 20
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Bytes of each buffer that the system was asked for."""
+    asked: list[int] = []
+    new = module._new
+
+    def count(size: int) -> mmap.mmap:
+        asked.append(size)
+        return new(size)
+
+    monkeypatch.setattr(module, "_new", count)
+    return asked
+
+
+def test_what_was_prepared_is_taken(made: list[int]) -> None:
+    pool = Buffers()
+    pool.prepare(SIZE - 5, 4 * SIZE)
+    assert made == [SIZE] * 4
+    held = [pool.take(SIZE - 5) for _ in range(4)]
+    assert made == [SIZE] * 4
+    held.append(pool.take(SIZE))
+    assert made == [SIZE] * 5
+    starts = {array.ctypes.data for array in held}
+    assert len(starts) == 5
+    assert not any(start % mmap.PAGESIZE for start in starts)
+
+
+def test_nothing_is_prepared_where_one_is_too_much(made: list[int]) -> None:
+    Buffers().prepare(2 * SIZE, SIZE)
+    assert made == []
+
+
+def test_a_buffer_is_not_taken_again_while_something_lies_over_it(made: list[int]) -> None:
+    pool = Buffers()
+    first = pool.take(SIZE)
+    first[:] = 7
+    view = memoryview(first)[10:20]
+    del first
+    pool.take(SIZE)[:] = 9
+    assert bytes(view) == bytes([7] * 10)
+    view.release()
+    kept = [pool.take(SIZE), pool.take(SIZE)]
+    assert len(made) == 2
+    assert {int(np.max(array)) for array in kept} == {7, 9}
+
+
+def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
+    pool = Buffers()
+    most = module._SPARE_BYTES // SIZE
+    pool.prepare(SIZE, (most + 3) * SIZE)
+    del made[:]
+    held = [pool.take(SIZE) for _ in range(most + 3)]
+    assert len(made) == 3
+    del held
