@@ -4,7 +4,9 @@ A record is `u32 header length, header, u32 data length, data`; a header is a li
 `u32 length, name=value`. Message records have headers that differ only in two values,
 so a run of them is read by columns: one pass finds where each record starts, then
 numpy checks all headers against a template and gathers the values. Whatever does not
-look like the template takes the general way, one header at a time.
+look like the template takes the general way, one header at a time. Where messages are
+small that one pass is numpy's too: it looks for what the template's headers have in
+common, and believes those places only where each record ends at the next one.
 
 Nothing here trusts a size: a run stops at the first record that does not fit.
 """
@@ -39,6 +41,10 @@ _LOOK_BACK = 320
 _TEMPLATE_HEADER = 512
 _TEMPLATES = 16
 _LEAST_HEADER = 8  # of the field `op` alone
+_MANY = 100  # records in a run, from which on the next one is looked through by columns,
+_SMALL = 4096  # if they have no more bytes than this each, in the mean
+_SAMPLE = 1 << 16  # bytes that tell which values are rare
+_MOST_HITS = 1 / 16  # places that may be a header's, of all: with more, columns cost too much
 
 # What a header of each kind must hold to be believed: name and length of the value
 # (None: any length).
@@ -189,6 +195,7 @@ class _Template:
         fixed[time : time + 8] = False
         self._columns = np.flatnonzero(fixed)
         self._bytes = np.frombuffer(raw, np.uint8)[self._columns]
+        self._rare: int | None = None
         self._values = np.dtype(
             {
                 "names": ["conn", "sec", "nsec"],
@@ -212,41 +219,69 @@ class _Template:
             seconds * 1_000_000_000 + values["nsec"],
         )
 
+    def find(self, data: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Every place where a record with such a header may start, ascending.
+
+        Between them there may be others, and a payload may hold what looks like a header.
+        """
+        count = len(data) - self.size - 7  # the lengths of header and data must be there, too
+        if count <= 0:
+            return np.empty(0, np.int64)
+        if self._rare is None:
+            # Of all bytes that must be there the one that is seen least leaves least to look at.
+            seen = np.bincount(data[:_SAMPLE], minlength=256)
+            self._rare = int(seen[self._bytes].argmin())
+        at = 4 + int(self._columns[self._rare])
+        places = np.flatnonzero(data[at : at + count] == self._bytes[self._rare])
+        if len(places) > _MOST_HITS * len(data):
+            return np.empty(0, np.int64)
+        places = places[_u32_at(data, places) == self.size]
+        if len(places) * self.size > len(data):
+            return np.empty(0, np.int64)  # they would lie over each other
+        headers = sliding_window_view(data, self.size)[places + 4]
+        found: NDArray[np.int64] = places[(headers[:, self._columns] == self._bytes).all(axis=1)]
+        return found
+
 
 class RunReader:
     """Reads runs of message records, and remembers what their headers look like."""
 
     def __init__(self) -> None:
         self._templates: list[_Template] = []
+        self._usual: _Template | None = None
 
     def read(self, data: bytes) -> Run:
         """Reads the message and connection records at the start of `data`."""
-        heads, bodies, end, need = _walk(data)
+        raw = np.frombuffer(data, np.uint8)
+        found = None if self._usual is None else self._usual.find(raw)
+        head, body, end, need = _walk(data) if found is None else _follow(data, raw, found)
         why = Stop.END if end == len(data) else _why_cut(data, end)
-        n = len(heads)
-        head = np.array(heads, np.int64)
-        body = np.array(bodies, np.int64)
+        n = len(head)
         conn = np.zeros(n, np.int64)
         time = np.zeros(n, np.int64)
         is_message = np.zeros(n, np.bool_)
         connections: list[tuple[int, Header]] = []
 
-        raw = np.frombuffer(data, np.uint8)
         todo = np.arange(n)
+        self._usual = None
         for template in self._templates:
-            todo = _apply(template, raw, (head, body), todo, (is_message, conn, time))
+            left = _apply(template, raw, (head, body), todo, (is_message, conn, time))
+            if len(todo) - len(left) > n / 2 and n >= _MANY and end <= _SMALL * n:
+                self._usual = template
+            todo = left
         while len(todo):
             row = int(todo[0])
-            header = parse_header(data, heads[row] + 4, bodies[row])
+            at, data_at = int(head[row]), int(body[row])
+            header = parse_header(data, at + 4, data_at)
             if header is None or header.op not in {OP_MESSAGE, OP_CONNECTION}:
                 why = Stop.BAD if header is None else Stop.FOREIGN
-                end, need, n = heads[row], 0, row
+                end, need, n = at, 0, row
                 break
             if header.op == OP_CONNECTION:
                 connections.append((row, header))
                 todo = todo[1:]
                 continue
-            learned = self._learn(data, heads[row] + 4, bodies[row], header)
+            learned = self._learn(data, at + 4, data_at, header)
             if learned is not None:
                 todo = _apply(learned, raw, (head, body), todo, (is_message, conn, time))
                 continue
@@ -255,7 +290,7 @@ class RunReader:
             time[row] = header.time(data, b"time")
             todo = todo[1:]
 
-        ends = np.append(head[1:], end)[:n] if n == len(heads) else head[1 : n + 1]
+        ends = np.append(head[1:], end)[:n] if n == len(head) else head[1 : n + 1]
         rows = np.flatnonzero(is_message[:n])
         offset = body[rows] + 4
         before = np.searchsorted(rows, [row for row, _ in connections])
@@ -265,13 +300,13 @@ class RunReader:
             connection=conn[rows],
             log_time=time[rows],
             connections=[
-                (int(count), header, (bodies[row] + 4, int(ends[row])))
+                (int(count), header, (int(body[row]) + 4, int(ends[row])))
                 for count, (row, header) in zip(before, connections, strict=True)
             ],
             why=why,
             end=end,
             need=need,
-            last=bodies[n - 1] + 4 if n and is_message[n - 1] else None,
+            last=int(body[n - 1]) + 4 if n and is_message[n - 1] else None,
         )
 
     def _learn(self, data: bytes, start: int, end: int, header: Header) -> _Template | None:
@@ -284,19 +319,25 @@ class RunReader:
         return template
 
 
-def _walk(data: bytes) -> tuple[list[int], list[int], int, int]:
+_Records = tuple["NDArray[np.int64]", "NDArray[np.int64]", int, int]
+"""Starts of the records, starts of their data lengths, where the first record that does
+not fit starts, and how many bytes that one needs."""
+
+
+def _walk(data: bytes, pos: int = 0, most: int | None = None) -> _Records:
     """Finds records by their lengths alone.
 
-    Returns:
-        Starts of the records, starts of their data lengths, where the first record
-        that does not fit starts, and how many bytes that one needs.
+    Args:
+        data: Where they lie, one after the other.
+        pos: Where the first one starts.
+        most: Most records; None for all. With so many, the place of the next is given.
     """
     u32 = _u32
     heads: list[int] = []
     bodies: list[int] = []
-    pos = need = 0
+    need = 0
     size = len(data)
-    while True:
+    while len(heads) != most:
         if pos + 4 > size:
             need = 4
             break
@@ -313,7 +354,46 @@ def _walk(data: bytes) -> tuple[list[int], list[int], int, int]:
         heads.append(pos)
         bodies.append(body)
         pos = after
-    return heads, bodies, pos, need
+    return np.array(heads, np.int64), np.array(bodies, np.int64), pos, need
+
+
+def _follow(data: bytes, raw: NDArray[np.uint8], head: NDArray[np.int64]) -> _Records:
+    """Finds what `_walk` finds, from one to the next of places where records may start.
+
+    Args:
+        data: Where they lie, one after the other.
+        raw: The same.
+        head: Such places, ascending; a header and the length of the data are there.
+    """
+    body = head + 4 + _u32_at(raw, head)
+    after = body + 4 + _u32_at(raw, body)
+    whole = after <= len(raw)
+    head, body, after = head[whole], body[whole], after[whole]
+    # Each of these is the last of some of which one ends where the next starts.
+    lasts = np.append(np.flatnonzero(after[:-1] != head[1:]), len(head) - 1)
+    heads, bodies = [], []
+    pos, need, most = 0, 0, 1
+    while True:
+        first = int(np.searchsorted(head, pos))
+        if first < len(head) and head[first] == pos:
+            stop = int(lasts[np.searchsorted(lasts, first)]) + 1
+            heads.append(head[first:stop])
+            bodies.append(body[first:stop])
+            pos = int(after[stop - 1])
+        # What lies between is walked over, in ever longer walks: to find the way back costs
+        # as much as some records.
+        more, more_bodies, pos, need = _walk(data, pos, most)
+        heads.append(more)
+        bodies.append(more_bodies)
+        if len(more) < most:
+            return np.concatenate(heads), np.concatenate(bodies), pos, need
+        most *= 2
+
+
+def _u32_at(data: NDArray[np.uint8], places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The number at each of some places."""
+    found = sliding_window_view(data, 4)[places]
+    return found.view("<u4")[:, 0].astype(np.int64)
 
 
 def _why_cut(data: bytes, pos: int) -> Stop:

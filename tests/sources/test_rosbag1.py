@@ -10,13 +10,14 @@ from collections import defaultdict
 from pathlib import Path
 
 import lz4.frame
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.rosbag1.reader import ReaderError
 
-from hybridlog.sources import base
+from hybridlog.sources import base, rosbag1_records
 from hybridlog.sources.base import BATCH_MESSAGES, Damage, Source
 from hybridlog.sources.rosbag1 import Rosbag1Source
 from hybridlog.sources.rosbag1_records import RunReader, Stop
@@ -542,6 +543,62 @@ def test_run_reader_stops() -> None:
     assert reader.read(body + index(0, 1)).why is Stop.FOREIGN
     assert reader.read(body + b"\x01\x00\x00\x00abcdefgh").why is Stop.BAD
     assert reader.read(body + b"\xff" * 40).why is Stop.BAD
+
+
+@st.composite
+def runs(draw: st.DrawFn) -> bytes:
+    """Records of several writers in a row, with payloads that look like records, and damage."""
+    decoy = message(1, 7, b"inner")
+    payloads = st.sampled_from([b"", b"abc", decoy, decoy[:-1], decoy * 2, bytes(100)])
+    records = [
+        message(draw(st.integers(0, 3)), at, draw(payloads))
+        if draw(st.integers(0, 9))
+        else connection(draw(st.integers(0, 3)))
+        for at in range(draw(st.integers(1, 40)))
+    ]
+    data = bytearray(b"".join(records))
+    for _ in range(draw(st.integers(0, 2))):
+        data[draw(st.integers(0, len(data) - 1))] ^= 1 << draw(st.integers(0, 7))
+    return bytes(data[: draw(st.integers(len(data) * 2 // 3, len(data)))])
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=runs(), more=st.sets(st.integers(0, 3000)), every=st.integers(1, 3))
+def test_places_where_records_may_start_change_nothing(
+    data: bytes, more: set[int], every: int
+) -> None:
+    head, body, end, need = rosbag1_records._walk(data)
+    u32 = struct.Struct("<I").unpack_from
+    places = [
+        place
+        for place in sorted({*head.tolist()[::every], *more})
+        if place + 8 <= len(data) and place + 8 + u32(data, place)[0] <= len(data)
+    ]
+    found = rosbag1_records._follow(data, np.frombuffer(data, np.uint8), np.array(places, np.int64))
+    assert found[0].tolist() == head.tolist()
+    assert found[1].tolist() == body.tolist()
+    assert found[2:] == (end, need)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=runs())
+def test_a_reader_that_has_seen_many_messages_finds_what_a_new_one_finds(data: bytes) -> None:
+    many = connection(0) + b"".join(message(0, at, b"x" * (at % 7)) for at in range(300))
+    seasoned = RunReader()
+    seasoned.read(many)
+    again = seasoned.read(many)
+    assert again.log_time.tolist() == list(range(300))
+    assert again.length.tolist() == [at % 7 for at in range(300)]
+    fresh, found = RunReader().read(data), seasoned.read(data)
+    for name in ("offset", "length", "connection", "log_time"):
+        assert getattr(found, name).tolist() == getattr(fresh, name).tolist(), name
+    assert found.connections == fresh.connections
+    assert (found.why, found.end, found.need, found.last) == (
+        fresh.why,
+        fresh.end,
+        fresh.need,
+        fresh.last,
+    )
 
 
 def test_rosbags_refuses_what_is_read_here() -> None:
