@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import textwrap
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,6 +74,9 @@ def _in(root: Path) -> Ros1:
         libraries = [*root.glob("usr/lib/*-linux-gnu"), *root.glob("lib/*-linux-gnu")]
         environment = {
             "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
+            # Where the player looks for the package that reads bags, and for its plugin.
+            "ROS_PACKAGE_PATH": str(root / "usr/share"),
+            "CMAKE_PREFIX_PATH": str(_plugins(root)),
             "LD_LIBRARY_PATH": ":".join(map(str, libraries)),
         }
         if own_python.exists():
@@ -81,6 +85,16 @@ def _in(root: Path) -> Ros1:
         else:
             own_python = _SYSTEM / "usr/bin/python3"
     return Ros1(str(own_python), root / "usr/lib/rosbag", environment)
+
+
+def _plugins(root: Path) -> Path:
+    """A directory below which `lib` has a tree's plugins: they are found in no other way."""
+    prefix = root / "plugins"
+    prefix.mkdir(exist_ok=True)
+    for plugins in root.glob("usr/lib/*-linux-gnu/ros"):
+        with suppress(FileExistsError):  # also of a test that runs beside this one
+            (prefix / "lib").symlink_to(plugins)
+    return prefix
 
 
 def _failure(found: Ros1) -> str:
