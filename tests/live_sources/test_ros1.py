@@ -650,10 +650,11 @@ def test_ipv6(brackets: bool, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_has_come_is_handed_over_when_it_stops() -> None:
     """The source is held up with its socket full, and stopped."""
     payloads = [str(number).encode() * 100 for number in range(2000)]
-    holding, sent = threading.Event(), threading.Event()
+    held, holding, sent = threading.Event(), threading.Event(), threading.Event()
 
     class Slow(Collector):
         def take(self, *arguments: object, **more: object) -> None:
+            held.set()
             holding.wait(20)
             super().take(*arguments, **more)  # type: ignore[arg-type]
 
@@ -664,7 +665,9 @@ def test_what_has_come_is_handed_over_when_it_stops() -> None:
 
     sink = Slow()
     with _system(FakePublisher(script), sink=sink):
+        # All of it may fit into the socket before anybody reads there.
         assert sent.wait(20)
+        assert held.wait(20)
         threading.Timer(0.1, holding.set).start()
     assert sink.payloads() == payloads
     assert sink.topics == [("/topic", "std_msgs/String", 1)]
