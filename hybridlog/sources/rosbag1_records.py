@@ -5,8 +5,8 @@ A record is `u32 header length, header, u32 data length, data`; a header is a li
 so a run of them is read by columns: one pass finds where each record starts, then
 numpy checks all headers against a template and gathers the values. Whatever does not
 look like the template takes the general way, one header at a time. Where messages are
-small that one pass is numpy's too: it looks for what the template's headers have in
-common, and believes those places only where each record ends at the next one.
+small that one pass is numpy's too: it looks for the length of the template's headers and
+one byte of theirs, and believes those places only where each record ends at the next one.
 
 Nothing here trusts a size: a run stops at the first record that does not fit.
 """
@@ -235,11 +235,8 @@ class _Template:
         places = np.flatnonzero(data[at : at + count] == self._bytes[self._rare])
         if len(places) > _MOST_HITS * len(data):
             return np.empty(0, np.int64)
-        places = places[_u32_at(data, places) == self.size]
-        if len(places) * self.size > len(data):
-            return np.empty(0, np.int64)  # they would lie over each other
-        headers = sliding_window_view(data, self.size)[places + 4]
-        found: NDArray[np.int64] = places[(headers[:, self._columns] == self._bytes).all(axis=1)]
+        # The rest of each header is looked at once, when it is known where records start.
+        found: NDArray[np.int64] = places[_u32_at(data, places) == self.size]
         return found
 
 
