@@ -42,6 +42,8 @@ class Capture:
             reads back later from the segments what is no longer in memory. None when
             whoever appends may wait for the index.
         renew: With `behind`: another connection to the index when one has failed.
+        on_written: Called, on another thread, when less waits for the disk. With it whoever
+            appends never waits, and looks at `writer.waiting` instead.
         check: Called with the catalog before anything is made, while nobody else can
             start a recording; raises to refuse.
 
@@ -63,6 +65,7 @@ class Capture:
         hurry: Callable[[], bool] | None = None,
         behind: Callable[[], bool] | None = None,
         renew: Callable[[], Database] | None = None,
+        on_written: Callable[[], None] | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = Catalog(database)
@@ -86,7 +89,8 @@ class Capture:
             recording_metadata(self.entry),
             self.index.submit,
             settings,
-            hurry,
+            hurry=hurry,
+            on_written=on_written,
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:

@@ -1,10 +1,11 @@
 """Recording messages as they come, from any number of threads.
 
-`LiveRecording.write` only puts a message down; one thread of the recording's own takes
-what has come since it looked last, lays it into chunks and sees old chunks written. The
-index has the lowest rank: while messages come faster than they can be written, it waits,
-and makes up for it from the segments. So what bounds a recording is the disk, and what
-bounds its memory is the budget: when that is spent, `write` waits.
+`LiveRecording.write` lays a large message into its chunk at once, and only puts a small
+one down; one thread of the recording's own takes those that have come since it looked
+last, lays them into chunks together and sees old chunks closed. The index has the lowest
+rank: while messages come faster than they can be written, it waits, and makes up for it
+from the segments. So what bounds a recording is the disk, and what bounds its memory is
+the budget: when that is spent, `write` waits.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -22,13 +24,14 @@ import numpy as np
 from hybridlog.capture import Capture
 from hybridlog.live.budget import usual_budget
 from hybridlog.live.policy import SMALL
+from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segment_writer import AT_WORK, SegmentSettings
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -36,16 +39,18 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
 
-_LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and is not copied first
+_LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
-_HURRY = 8 << 20  # bytes not yet written from which nothing is compressed any more
+_HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
-_STEADY = 64 << 20  # and from which whoever writes lets the writing thread go first
-_PACE = 1e9  # bytes a second that are still taken then, although nothing is laid down
-_AT_HAND = 64 << 20  # bytes of buffers that are there before the first message, at most
-_CALM_S = 1.0  # the first two for so long afterwards, or they would be the cause of the next delay
+_COPYING = 2  # threads that lay down large messages at the same time
+_CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
+_AT_HAND = 128 << 20  # bytes of buffers that are there before the first message, at most
+_AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
+_LOOK_S = 0.25  # how often one looks how many that are
+_PAUSE_S = 0.005  # after each new one, since to get it takes as long
 _MOST_NS = 1 << 63
 
 
@@ -134,13 +139,14 @@ class LiveRecording:
         self._taken: list[int] = []  # messages, by index of the channel
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
-        self._unwritten = 0
+        self._taken_bytes = 0  # taken, and not laid into a chunk yet
+        self._at_work = AT_WORK * options.settings.chunk_size
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
-        self._wake = threading.Event()
-        self._steady = min(_STEADY, options.budget_bytes // 2)
-        self._gate = threading.Lock()
-        self._laid = threading.Event()
+        self._laying = threading.Lock()  # held by who lays into chunks, and taken before `_lock`
+        self._turns = Turns(_COPYING)
+        # No event: who is interrupted while setting one may leave it locked for ever.
+        self._calls: SimpleQueue[None] = SimpleQueue()
         self._ended = False
         self._hurry = _Strain(_HURRY)
         self._behind = _Strain(_BEHIND)
@@ -150,7 +156,10 @@ class LiveRecording:
         """What is missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that were taken and found no room on the disk, by topic; known at the end."""
-        buffers.prepare(options.settings.chunk_size, min(_AT_HAND, options.budget_bytes // 16))
+        self._at_hand = min(_AT_HAND, options.budget_bytes // 8)
+        buffers.prepare(options.settings.chunk_size, self._at_hand)
+        self._getting: threading.Thread | None = None
+        self._enough = threading.Event()
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -164,6 +173,7 @@ class LiveRecording:
                 hurry=lambda: self._is_under(self._hurry),
                 behind=lambda: self._is_under(self._behind),
                 renew=renew,
+                on_written=self._make_room,
             )
             self._held = self._held.pop_all()
         self.id = self._capture.entry.id
@@ -227,15 +237,16 @@ class LiveRecording:
         sent = now if publish_time is None else publish_time
         if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
             raise UsageError("a time or the sequence number of a message is out of its range")
-        if self._unwritten > self._steady and len(payload) >= _LARGE:
-            self._give_way(len(payload))
+        size = len(payload)
+        # Ctrl-C may come at any place of the main thread, and a chunk has no half messages.
+        at_once = size >= _LARGE and threading.current_thread() is not threading.main_thread()
         with self._lock:
-            bound = self._small_bound if len(payload) <= SMALL else self._options.budget_bytes
-            while self._unwritten and self._unwritten + len(payload) > bound:
+            bound = self._small_bound if size <= SMALL else self._options.budget_bytes
+            while (unwritten := self._unwritten()) and unwritten + size > bound:
                 self._check()
                 if not wait:
                     return False
-                self._wake.set()
+                self._wake()
                 self._room.wait()
             self._room.notify()  # there may be room for another
             self._check()
@@ -244,19 +255,24 @@ class LiveRecording:
                 index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
                 self._taken.append(0)
+            message = _Message(index, now, sent, sequence, payload)
             self._taken[index] += 1
-            self._inbox.append(_Message(index, now, sent, sequence, payload))
-            self._unwritten += len(payload)
-            self._inbox_bytes += len(payload)
+            self._taken_bytes += size
+            if not at_once:
+                self._inbox.append(message)
+                self._inbox_bytes += size
             enough = self._inbox_bytes >= _ENOUGH
-        if enough:
-            self._wake.set()
+        if at_once:
+            self._lay_now(message)
+        elif enough:
+            self._wake()
         return True
 
     @property
     def filled(self) -> float:
         """How much of the memory budget is spent, 0 to 1."""
-        return self._unwritten / self._options.budget_bytes
+        # An open chunk counts when it is closed, and may then be more than there is room for.
+        return min(self._unwritten() / self._options.budget_bytes, 1.0)
 
     @property
     def stored(self) -> tuple[int, int]:
@@ -346,18 +362,18 @@ class LiveRecording:
         with self._held:
             self._capture.forget()
 
-    def _give_way(self, size: int) -> None:
-        """Let the writing thread go first, for as long as so many bytes may take.
+    def _unwritten(self) -> int:
+        """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
+        return self._taken_bytes + max(self._capture.writer.waiting - self._at_work, 0)
 
-        Many threads that write, each into new memory, leave one thread that makes room no
-        turn; what waits then grows, and with it the new memory. So they queue up here, and
-        one at a time goes on: at once when something was laid down, and in any case at a
-        pace that no robot has, since a disk may be slow for a while.
-        """
-        with self._gate:
-            self._laid.clear()
-            self._wake.set()
-            self._laid.wait(size / _PACE)
+    def _make_room(self) -> None:
+        with self._lock:
+            self._room.notify()
+
+    def _wake(self) -> None:
+        """See that the writing thread looks."""
+        if self._calls.empty():
+            self._calls.put(None)
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -366,60 +382,118 @@ class LiveRecording:
             raise UsageError(f"The recording {self.id!r} was closed.")
 
     def _is_under(self, strain: _Strain) -> bool:
-        return strain.is_felt(self._unwritten) and not self._ended
+        return strain.is_felt(self._unwritten()) and not self._ended
 
     def _stop(self) -> None:
-        with self._lock:
+        # Who lays down a message at this moment has it in the recording.
+        with self._laying, self._lock:
             self._ended = True
             self._room.notify_all()
-        self._wake.set()
+        self._wake()
         self._thread.join()
+        self._enough.set()
+        if self._getting is not None:
+            self._getting.join()
+        buffers.settle()
 
     def _run(self) -> None:
         """What the writing thread does."""
-        flushed = told = time.monotonic()
+        flushed = told = looked = time.monotonic()
+        seen = 0
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 8)
-        try:
+        with suppress(BaseException), self._failing():
             while True:
-                self._wake.wait(tick)
-                self._wake.clear()
+                with suppress(Empty):
+                    self._calls.get(timeout=tick)
                 ended = self._ended
-                self._take()
-                if ended:
-                    self._write_losses(everything=True)
-                    return
-                now = time.monotonic()
-                if now - flushed >= tick:
-                    # What is laid down may have waited for a tick already.
-                    self._capture.writer.flush_older(interval * 3 / 4 - tick)
-                    flushed = now
-                if now - told >= interval / 4:
-                    self._write_losses()
-                    self._capture.index.nudge()
-                    told = now
+                with self._laying:
+                    self._take()
+                    if ended:
+                        self._write_losses(everything=True)
+                        return
+                    now = time.monotonic()
+                    if now - flushed >= tick:
+                        # What is laid down may have waited for a tick already.
+                        self._capture.writer.flush_older(interval * 3 / 4 - tick)
+                        flushed = now
+                    if now - told >= interval / 4:
+                        self._write_losses()
+                        self._capture.index.nudge()
+                        told = now
+                if now - looked >= _LOOK_S:
+                    stored = self._capture.writer.totals.payload_bytes
+                    self._look_ahead((stored - seen) / (now - looked))
+                    looked, seen = now, stored
+
+    def _look_ahead(self, rate: float) -> None:
+        """Get memory for a disk that stands still, before it does: then it takes too long.
+
+        Args:
+            rate: Bytes that come in a second.
+        """
+        need = int(min(rate * _AHEAD_S, self._options.budget_bytes / 2))
+        if need > self._at_hand and (self._getting is None or not self._getting.is_alive()):
+            self._at_hand = need
+            self._getting = threading.Thread(
+                target=buffers.prepare,
+                args=(self._options.settings.chunk_size, need),
+                kwargs={"pause_s": _PAUSE_S, "enough": self._enough},
+                name="hybridlog-memory",
+                daemon=True,
+            )
+            self._getting.start()
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """Whatever goes wrong: those who write and close must hear of it, or wait for ever."""
+        try:
+            yield
         except BaseException as error:
-            # Whatever it is: those who write and close must hear of it, or wait for ever.
             with self._lock:
-                self._failure = error
+                self._failure = self._failure or error
                 self._room.notify_all()
+            raise
 
     def _write_losses(self, *, everything: bool = False) -> None:
         rows = self.ledger.take(everything=everything)
         if rows:
             self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
+    def _lay_now(self, message: _Message) -> None:
+        """Lay a message into its chunk, and before it what has come before it.
+
+        By the thread that brings it: handed on, it would wait in memory of its own, and new
+        memory is what a machine may be slow to give. A few at a time: many that run leave
+        those that write the chunks no turn at the interpreter.
+        """
+        try:
+            with self._turns:
+                with self._laying:
+                    self._check()
+                    with self._failing():
+                        self._take()
+                        copy = self._place(message)
+                copy()
+        except BaseException:
+            with self._lock:
+                self._taken[message.channel] -= 1
+            raise
+        finally:
+            self._let_go(len(message.payload))
+
     def _take(self) -> None:
-        """Lay what has come into chunks."""
+        """Lay what was put down into chunks; by who holds `_laying`."""
         with self._lock:
             inbox, self._inbox, self._inbox_bytes = self._inbox, deque(), 0
         while inbox:
-            size = self._lay_down(_next_group(inbox))
-            # What was laid down is not in memory any more, so there is room for as much.
-            with self._lock:
-                self._unwritten -= size
-                self._room.notify()
-            self._laid.set()
+            self._let_go(self._lay_down(_next_group(inbox)))
+
+    def _let_go(self, size: int) -> None:
+        """So many bytes are not waiting to be laid down any more, so there is room for as much."""
+        with self._lock:
+            self._taken_bytes -= size
+            self._room.notify()
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""
@@ -428,11 +502,18 @@ class LiveRecording:
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
         (one,) = group
-        channel = self._channels[one.channel]
-        self._capture.writer.append_one(
-            channel, one.payload, one.log_time, one.publish_time, one.sequence
-        )
+        self._place(one)()
         return len(one.payload)
+
+    def _place(self, message: _Message) -> Callable[[], None]:
+        """Make a place in a chunk for a large message; what comes back copies it there."""
+        return self._capture.writer.place_one(
+            self._channels[message.channel],
+            message.payload,
+            message.log_time,
+            message.publish_time,
+            message.sequence,
+        )
 
 
 def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:

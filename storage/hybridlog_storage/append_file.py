@@ -125,19 +125,19 @@ class AppendFile:
                     pieces = []
         self._put(pieces)
 
-    def room_before(self, content: Buffer, head: int) -> int:
+    def room_before(self, content: Buffer, position: int) -> int:
         """Bytes to leave free, so that large content need not be copied to be written.
 
         Args:
             content: What is about to be appended.
-            head: Bytes that will stand right before it.
+            position: Byte of the file where it would begin.
 
         Returns:
             0 where it makes no difference.
         """
         if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
             return 0
-        return -(self.position + head) % BLOCK
+        return -position % BLOCK
 
     def cut(self, position: int) -> None:
         """Drop everything from a position on; not for direct writes.

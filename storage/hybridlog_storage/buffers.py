@@ -10,6 +10,7 @@ from __future__ import annotations
 import mmap
 import threading
 import weakref
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 _LEAST = 1 << 18  # smaller buffers are malloc's business
 _SPARE_BYTES = 96 << 20
+_HUGE_PAGE = 2 << 20
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 
@@ -27,9 +29,12 @@ class Buffers:
     """A pool of buffers. Thread safe."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        # The collector may give a buffer back on a thread that is in here already.
+        self._lock = threading.RLock()
         self._spare: dict[int, list[mmap.mmap]] = {}
         self._spare_bytes = 0
+        self._most_spare = _SPARE_BYTES
+        self._there: Counter[int] = Counter()  # buffers that are spare or taken, by their size
 
     def take(self, size: int, *, whole_pages: bool = False) -> NDArray[np.uint8]:
         """A buffer of at least `size` bytes, whatever they are.
@@ -42,36 +47,81 @@ class Buffers:
             if not whole_pages:
                 return np.empty(size, np.uint8)
             size = _LEAST
-        size = 1 << (size - 1).bit_length()
+        size = _rounded(size)
         with self._lock:
             spare = self._spare.get(size)
             memory = spare.pop() if spare else None
             if memory is not None:
                 self._spare_bytes -= size
+        is_new = memory is None
         if memory is None:
-            memory = _new(size)
+            memory = self._make(size)
         # What is over this array keeps this array, and so the memory, from being taken again.
         array = np.frombuffer(memory, np.uint8)
         weakref.finalize(array, self._give, memory).atexit = False
+        if is_new:
+            # Here other threads go on meanwhile; the first bytes laid down would hold them up.
+            array[:_HUGE_PAGE].fill(0)
         return array
 
-    def prepare(self, size: int, total: int) -> None:
-        """Have spare buffers at hand, whose memory the system has given already.
+    def prepare(
+        self,
+        size: int,
+        total: int,
+        *,
+        pause_s: float = 0.0,
+        enough: threading.Event | None = None,
+    ) -> None:
+        """Have buffers, spare or taken, whose memory the system has given already.
+
+        As many bytes may then be spare until `settle`.
 
         Args:
             size: Bytes of each, as they will be taken.
             total: Bytes of all, about.
+            pause_s: How long to leave the system alone after each.
+            enough: Ends it early.
         """
-        # Held until all are there, or the same one would be taken again and again.
-        held = [self.take(size) for _ in range(total // max(size, _LEAST))]
-        for buffer in held:
-            buffer[:: mmap.PAGESIZE] = 0
+        enough = enough or threading.Event()
+        size = _rounded(max(size, _LEAST))
+        with self._lock:
+            missing = max(total // size - self._there[size], 0)
+            self._most_spare = max(self._most_spare, total, self._spare_bytes + missing * size)
+        for _ in range(missing):
+            memory = self._make(size)
+            np.frombuffer(memory, np.uint8).fill(0)
+            self._give(memory)
+            if enough.wait(pause_s):
+                return
+
+    def settle(self) -> None:
+        """Give back to the system what is more than usually spare."""
+        with self._lock:
+            self._most_spare = _SPARE_BYTES
+            for size, spare in list(self._spare.items()):
+                while spare and self._spare_bytes > self._most_spare:
+                    spare.pop()
+                    self._spare_bytes -= size
+                    self._there[size] -= 1
+
+    def _make(self, size: int) -> mmap.mmap:
+        memory = _new(size)
+        with self._lock:
+            self._there[size] += 1
+        return memory
 
     def _give(self, memory: mmap.mmap) -> None:
+        size = len(memory)
         with self._lock:
-            if self._spare_bytes + len(memory) <= _SPARE_BYTES:
-                self._spare.setdefault(len(memory), []).append(memory)
-                self._spare_bytes += len(memory)
+            if self._spare_bytes + size <= self._most_spare:
+                self._spare.setdefault(size, []).append(memory)
+                self._spare_bytes += size
+            else:
+                self._there[size] -= 1
+
+
+def _rounded(size: int) -> int:
+    return 1 << (size - 1).bit_length()
 
 
 def _new(size: int) -> mmap.mmap:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import time
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,8 @@ from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Batch, Buffer
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 _HEAD = MESSAGE_HEAD.itemsize
@@ -34,6 +37,8 @@ class ChunkBuilder:
         self._used = 0
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self._rows: list[tuple[int, int, int, int, int, int, int]] = []
+        self.copying: list[Lock] = []
+        """A lock a message that was given a place; it is held until the payload is there."""
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
         self.opened = 0.0
@@ -75,7 +80,7 @@ class ChunkBuilder:
             )
         )
 
-    def append_one(
+    def place_one(
         self,
         payload: Buffer,
         *,
@@ -84,8 +89,8 @@ class ChunkBuilder:
         publish_time: int,
         sequence: int,
         seq: int,
-    ) -> None:
-        """Copy one message in: for payloads so large that a batch of one costs more.
+    ) -> Callable[[], None]:
+        """Make a place for one message: for payloads so large that a batch of one costs more.
 
         Args:
             payload: The serialized message.
@@ -94,31 +99,51 @@ class ChunkBuilder:
             publish_time: Nanoseconds since the epoch.
             sequence: The sender's number.
             seq: Arrival number.
+
+        Returns:
+            What copies the payload in. It must be called once, on any thread; several may
+            at the same time, and while others are given a place.
         """
+        source = np.frombuffer(payload, np.uint8)
+        length = len(source)
+        start = self._used + _HEAD
+        # The buffer stays where it is as long as anything is copied into it.
+        self._grow(max(start + length, self._capacity))
         if not self._used:
             self.first_log_time = log_time
             self.opened = time.monotonic()
-        length = len(payload)
-        start = self._used + _HEAD
-        self._grow(start + length)
         self._buffer[self._used : start] = np.frombuffer(
             _ONE_HEAD.pack(
                 Opcode.MESSAGE, length + (_HEAD - 9), channel, sequence, log_time, publish_time
             ),
             np.uint8,
         )
-        self._buffer[start : start + length] = np.frombuffer(payload, np.uint8)
+        target = self._buffer[start : start + length]
         self._used = start + length
         self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
+        copying = Lock()
+        copying.acquire()
+        self.copying.append(copying)
+
+        def copy() -> None:
+            try:
+                target[:] = source
+            finally:
+                copying.release()
+
+        return copy
 
     def take(self) -> tuple[Batch, NDArray[np.int64], int]:
         """Everything collected, and an empty builder again.
+
+        The content is whole when each lock of `copying`, as it was before, has been released.
 
         Returns:
             The messages, over the chunk's uncompressed content; their arrival numbers;
             the content's size in bytes (the batch's buffer may be longer).
         """
         self._settle()
+        self.copying = []
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]

@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -67,10 +68,13 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
+AT_WORK = 8
+"""Closed chunks that may be on their way to the file without anything being late."""
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _SPARSE = 4  # times the usual span, for a chunk that holds little
 _SYNC_STRIDE = 32 << 20  # bytes
+_WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,35 +243,61 @@ class SegmentFile:
             )
         )
 
-    def append_chunk(self, chunk: PackedChunk) -> StoredChunk:
-        """Append a chunk with its message indexes and arrival numbers."""
-        head = chunk_head(
-            first=chunk.first,
-            last=chunk.last,
-            uncompressed_size=chunk.uncompressed_size,
-            crc=chunk.crc,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-        )
-        padding = self._padding(chunk.data, len(head))
-        offset = self.position + len(padding)
-        length = len(head) + len(chunk.data)
-        arrivals = arrival_record(offset, chunk.arrivals)
-        trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
-        self._write([padding, head, chunk.data, *chunk.indexes.values(), arrivals])
-        self.note_chunk(
-            (chunk.first, chunk.last),
-            {channel: entries_of(data) for channel, data in chunk.indexes.items()},
-            offset=offset,
-            length=length,
-            indexes={channel: len(data) for channel, data in chunk.indexes.items()},
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            uncompressed_size=chunk.uncompressed_size,
-        )
-        return StoredChunk(
-            self.number, offset, length, trailer, chunk.batch, chunk.seq, len(chunk.data)
-        )
+    def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
+        """Append chunks, each with its message indexes and arrival numbers, in one go.
+
+        Args:
+            chunks: One at least.
+            end: Byte of the file from which no chunk begins, but for the first.
+
+        Returns:
+            Those that were appended: the first ones.
+        """
+        parts: list[Buffer] = []
+        stored: list[StoredChunk] = []
+        at = self.position
+        for chunk in chunks:
+            if stored and at >= end:
+                break
+            head = chunk_head(
+                first=chunk.first,
+                last=chunk.last,
+                uncompressed_size=chunk.uncompressed_size,
+                crc=chunk.crc,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+            )
+            padding = self._padding(chunk.data, at, len(head))
+            offset = at + len(padding)
+            length = len(head) + len(chunk.data)
+            trailer = [*chunk.indexes.values(), arrival_record(offset, chunk.arrivals)]
+            trailer_length = sum(map(len, trailer))
+            parts += [padding, head, chunk.data, *trailer]
+            at = offset + length + trailer_length
+            stored.append(
+                StoredChunk(
+                    self.number,
+                    offset,
+                    length,
+                    trailer_length,
+                    chunk.batch,
+                    chunk.seq,
+                    len(chunk.data),
+                )
+            )
+        self._write(parts)
+        for chunk, place in zip(chunks, stored, strict=False):
+            self.note_chunk(
+                (chunk.first, chunk.last),
+                {channel: entries_of(data) for channel, data in chunk.indexes.items()},
+                offset=place.offset,
+                length=place.length,
+                indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+                compression=chunk.compression,
+                compressed_size=place.compressed_size,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        return stored
 
     def append_trailer(self, indexes: Mapping[int, bytes], arrivals: bytes) -> None:
         """Give a chunk the indexes and arrival numbers that a crash has cost it."""
@@ -354,12 +384,12 @@ class SegmentFile:
         with suppress(OSError):
             self._file.finish(sync=False)
 
-    def _padding(self, content: Buffer, head: int) -> bytes:
-        """What must stand before a chunk record for its content to start at a block."""
-        if not self._file.room_before(content, head):
+    def _padding(self, content: Buffer, at: int, head: int) -> bytes:
+        """What must stand before a chunk record at a byte for its content to start at a block."""
+        if not self._file.room_before(content, at + head):
             return b""
         least = PADDING_HEAD.size
-        return padding_record(least + self._file.room_before(content, least + head))
+        return padding_record(least + self._file.room_before(content, at + least + head))
 
     def _write(self, parts: Sequence[Buffer]) -> None:
         try:
@@ -450,6 +480,15 @@ def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
     )
 
 
+def _pack_whole(
+    copying: Sequence[Lock], compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
+) -> PackedChunk:
+    """Pack a chunk once all payloads are there: the same microseconds, seldom more."""
+    for lock in copying:
+        lock.acquire()
+    return pack(compressor, batch, seq, size)
+
+
 _AS_IT_IS = Compressor("none")
 
 
@@ -481,6 +520,9 @@ class RecordingWriter:
             that is in the file.
         settings: How to cut and pack.
         hurry: Says whether there is no time to compress; None when there always is.
+        on_written: Called, on a thread of the writer's, when there is less that waits. With
+            it nothing that is appended waits for the disk: whoever appends looks at
+            `waiting`. Without it `append` waits while the disk is slow.
     """
 
     def __init__(
@@ -489,7 +531,9 @@ class RecordingWriter:
         recording: Mapping[str, object],
         on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
         settings: SegmentSettings | None = None,
+        *,
         hurry: Callable[[], bool] | None = None,
+        on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -508,6 +552,10 @@ class RecordingWriter:
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
         self._hurry = hurry
+        self._on_written = on_written
+        self._closed_bytes = 0
+        self._stored_bytes = 0
+        self._packed: deque[Future[PackedChunk]] = deque()  # in the order of the file
         self._storing: deque[Future[None]] = deque()
         self._broken: BaseException | None = None
         self._next_seq = 0
@@ -518,6 +566,11 @@ class RecordingWriter:
         self._closed: list[Path] = []
         self._synced = 0
         self._syncing: Future[None] | None = None
+
+    @property
+    def waiting(self) -> int:
+        """Bytes of content of closed chunks that are not in the file yet."""
+        return self._closed_bytes - self._stored_bytes
 
     def append(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Take a batch; `batch.channel` indexes `channels`.
@@ -556,12 +609,16 @@ class RecordingWriter:
                 self._fill(key, own.take(rows), seq[rows])
         self.totals.messages += len(batch)
         self.totals.payload_bytes += batch.payload_bytes
-        self._drain(limit=4)
+        self._keep_pace(limit=4)
 
-    def append_one(
+    def place_one(
         self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
-    ) -> None:
+    ) -> Callable[[], None]:
         """Take one message; for large payloads this costs less than a batch.
+
+        Returns:
+            What copies the payload. It must be called once, on any thread, also while
+            others append; the message's chunk is not written before.
 
         Raises:
             DiskFullError: no space; what was flushed before stays.
@@ -575,7 +632,7 @@ class RecordingWriter:
             is_far = away >= self._span_of(len(builder))
             if (key != _SHARED and is_far) or size > self.settings.chunk_size:
                 self._close_chunk(key)
-        builder.append_one(
+        copy = builder.place_one(
             payload,
             channel=known.channel_id,
             log_time=log_time,
@@ -587,11 +644,17 @@ class RecordingWriter:
         self.totals.messages += 1
         self.totals.payload_bytes += len(payload)
         if len(builder) >= self.settings.chunk_size:
-            self._close_chunk(key)
+            try:
+                self._close_chunk(key)
+            except BaseException:
+                copy()  # or who packs the chunk would wait for ever
+                raise
+        return copy
 
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Keep an attachment or a metadata record of the source."""
-        self._disk.submit(self._add, record).result()
+        self._storing.append(self._disk.submit(self._add, record))
+        self._keep_pace(limit=0)
 
     def flush(self) -> None:
         """Close every open chunk and see it written."""
@@ -605,7 +668,7 @@ class RecordingWriter:
         for key, builder in self._clusters.items():
             if len(builder) and builder.opened <= limit:
                 self._close_chunk(key)
-        self._drain(limit=4)
+        self._keep_pace(limit=4)
 
     def close(self, end: Metadata | None = None) -> list[Path]:
         """Flush, seal the last segment; returns the paths of all segments.
@@ -617,6 +680,7 @@ class RecordingWriter:
             self.flush()
             if end is not None:
                 self.add_extra(end)
+                self._drain(limit=0)
             self._disk.submit(self._seal).result()
         finally:
             self._shut_down()
@@ -716,12 +780,19 @@ class RecordingWriter:
     def _close_chunk(self, key: int) -> None:
         builder = self._clusters[key]
         if len(builder):
+            copying = builder.copying
             batch, seq, size = builder.take()
             hurried = self._hurry is not None and self._hurry()
             compressor = _AS_IT_IS if hurried else self._compressor
-            packed = self._pool.submit(pack, compressor, batch, seq, size)
+            self._closed_bytes += size
+            packed = self._pool.submit(_pack_whole, copying, compressor, batch, seq, size)
+            self._packed.append(packed)
             self._storing.append(self._disk.submit(self._store, packed))
-            self._drain(limit=8)
+            self._keep_pace(limit=AT_WORK)
+
+    def _keep_pace(self, limit: int) -> None:
+        """Wait as `_drain` does, or only hear of what went wrong if somebody else waits."""
+        self._drain(limit if self._on_written is None else len(self._storing))
 
     def _drain(self, limit: int) -> None:
         """Wait until at most `limit` chunks are still being packed and written."""
@@ -731,14 +802,39 @@ class RecordingWriter:
     # What follows runs on the thread that writes, and on no other.
 
     def _store(self, packed: Future[PackedChunk]) -> None:
-        """Write a closed chunk; none after one that could not be written."""
+        """See a closed chunk written, with those behind it that can be; none after a failure."""
         if self._broken is not None:
             raise self._broken
+        if not self._packed or packed is not self._packed[0]:
+            return  # it was written with one before it
         try:
-            self._write(packed.result())
+            self._write()
         except BaseException as error:
             self._broken = error
             raise
+
+    def _next_chunks(self, segment: SegmentFile) -> list[PackedChunk]:
+        """The first chunk, once it is packed, and what is packed already and lies behind it.
+
+        Each time this thread stops and goes on, it waits for its turn at the interpreter;
+        so when much waits, much is written at once. The file is as if it had not waited.
+        """
+        first = self._packed[0].result()
+        for channel_id in first.indexes:
+            if channel_id not in segment.channels:
+                channel = self.channels[channel_id]
+                segment.define(channel_id, self._known[channel].schema_id, channel)
+        chunks, size = [first], len(first.data)
+        while size < _WRITTEN_AT_ONCE and len(chunks) < len(self._packed):
+            following = self._packed[len(chunks)]
+            if not following.done() or following.exception() is not None:
+                break
+            chunk = following.result()
+            if not chunk.indexes.keys() <= segment.channels.keys():
+                break
+            chunks.append(chunk)
+            size += len(chunk.data)
+        return chunks
 
     def _add(self, record: Metadata | Attachment) -> None:
         segment = self._open_segment()
@@ -747,27 +843,34 @@ class RecordingWriter:
         else:
             segment.add_attachment(record)
 
-    def _write(self, chunk: PackedChunk) -> None:
+    def _write(self) -> None:
         segment = self._open_segment()
-        for channel_id in chunk.indexes:
-            if channel_id not in segment.channels:
-                channel = self.channels[channel_id]
-                segment.define(channel_id, self._known[channel].schema_id, channel)
-        stored = segment.append_chunk(chunk)
+        chunks = self._next_chunks(segment)
+        stored = segment.append_chunks(chunks, self.settings.segment_size)
+        for _ in stored:
+            self._packed.popleft()
         if self.settings.sync == "chunk":
             segment.sync()
         elif self.settings.sync == "seal" and not segment.direct:
             self._sync_behind(segment)
+        for chunk, place in zip(chunks, stored, strict=False):
+            self._tell(chunk, place)
+        span = self.settings.segment_span_s
+        is_old = span is not None and time.monotonic() - self._opened >= span
+        if is_old or segment.position >= self.settings.segment_size:
+            self._seal()
+
+    def _tell(self, chunk: PackedChunk, stored: StoredChunk) -> None:
+        """Whom it concerns that a chunk is in the file."""
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
         self.last_log_time = max(self.last_log_time, chunk.last)
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
-        span = self.settings.segment_span_s
-        is_old = span is not None and time.monotonic() - self._opened >= span
-        if is_old or segment.position >= self.settings.segment_size:
-            self._seal()
+        self._stored_bytes += chunk.uncompressed_size
+        if self._on_written is not None:
+            self._on_written()
 
     def _sync_behind(self, segment: SegmentFile) -> None:
         """Force long segments to the disk as they grow, so that sealing them takes no time."""

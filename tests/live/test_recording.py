@@ -10,9 +10,8 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -20,9 +19,16 @@ from mcap.reader import make_reader
 import hybridlog as hl
 from hybridlog.live import LiveRecording
 from hybridlog_storage import append_file
+from hybridlog_storage.buffers import buffers
 from hybridlog_storage.errors import DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segment_writer import (
+    AT_WORK,
+    PackedChunk,
+    SegmentFile,
+    SegmentSettings,
+    StoredChunk,
+)
 from tests.test_faults import kill_mongod, wait_for
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
@@ -86,39 +92,149 @@ def test_many_threads_one_recording(store: hl.Store) -> None:
     assert store.verify().findings == []
 
 
-def test_while_nothing_is_laid_down_the_budget_is_still_taken(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("size", [100_000, 10_000])
+def test_while_the_disk_stands_still_the_budget_is_still_taken(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     go_on = threading.Event()
-    append_one = RecordingWriter.append_one
+    append_chunks = SegmentFile.append_chunks
 
-    def wait(writer: RecordingWriter, *arguments: Any) -> None:
+    def wait(segment: SegmentFile, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
         assert go_on.wait(60)
-        append_one(writer, *arguments)
+        return append_chunks(segment, chunks, end)
 
-    monkeypatch.setattr(RecordingWriter, "append_one", wait)
+    monkeypatch.setattr(SegmentFile, "append_chunks", wait)
+    budget, settings = 8 << 20, SegmentSettings(chunk_size=1 << 19)
+    # Closed chunks that are on their way come on top, and one open one a topic.
+    room = budget + AT_WORK * settings.chunk_size
+    written: list[list[bytes]] = [[] for _ in range(5)]
     refused = [0] * 5
-    payload = text(bytes(100_000))
 
     def speak(number: int, recording: LiveRecording) -> None:
         own = channel(f"/topic{number}")
-        for i in range(20):
-            refused[number] += not recording.write(own, payload, sequence=i, wait=False)
+        for i in range(room // size // 2):
+            payload = text(bytes([i % 251]) * size)
+            if recording.write(own, payload, sequence=i, wait=False):
+                written[number].append(payload)
+            else:
+                refused[number] += 1
+                time.sleep(0.005)  # small ones must have been laid down before there is room
 
-    # A disk that stands still. From half of the budget on writers give way to the thread
-    # that waits for it, but not for long, and nothing is refused before the budget is spent.
-    with store.start("talk", budget_bytes=8 << 20) as recording:
+    with store.start("talk", budget_bytes=budget, settings=settings) as recording:
         threads = [threading.Thread(target=speak, args=(n, recording)) for n in range(5)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        assert 0.98 < recording.filled <= 1
-        assert sum(refused) == 100 - (8 << 20) // len(payload)
+        filled = recording.filled
         go_on.set()
         wait_for(lambda: recording.filled == 0)
     report = recording.close()
-    assert (report.indexed, report.missed, report.failure) == (100 - sum(refused), 0, None)
+    assert 0.95 < filled <= 1
+    taken = sum(len(payload) for one in written for payload in one)
+    assert room * 0.9 < taken < room + 6 * settings.chunk_size
+    assert any(refused)
+    assert (report.indexed, report.missed, report.failure) == (sum(map(len, written)), 0, None)
+    for number in range(5):
+        if written[number]:  # one may have come when others had taken all the room
+            assert [m.raw for m in store.topic(f"/topic{number}")] == written[number]
+    assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("rate", [0, 1e9])
+def test_memory_for_a_disk_that_stands_still_is_there_before(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, rate: float
+) -> None:
+    settings, budget = SegmentSettings(chunk_size=1 << 18), 32 << 20
+    there = set_up = buffers._there[1 << 18]
+    with store.start("talk", budget_bytes=budget, settings=settings) as recording:
+        assert buffers._there[1 << 18] == max(set_up, budget // 8 // settings.chunk_size)
+        recording._look_ahead(rate)
+        if rate:
+            # No more than half of the budget.
+            wanted = budget // 2 // settings.chunk_size
+            wait_for(lambda: buffers._there[1 << 18] >= wanted)
+        there = buffers._there[1 << 18]
+        assert there == max(set_up, (budget // 2 if rate else budget // 8) // settings.chunk_size)
+        recording._look_ahead(rate)
+        assert buffers._there[1 << 18] == there
+
+
+def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> None:
+    """Small ones wait for others to be laid down together, large ones do not."""
+    sizes = [10, 40_000, 20, 30_000, 35_000, 0]
+    payloads = [text(bytes([i]) * sizes[i % len(sizes)]) for i in range(120)]
+    own, other = channel("/talk"), channel("/other")
+
+    def speak(recording: LiveRecording) -> None:
+        for i, payload in enumerate(payloads):
+            recording.write(own, payload, log_time=10**18, sequence=i)
+
+    with store.start("talk") as recording:
+        # The main thread hands on what is large; the other lays it down itself.
+        thread = threading.Thread(target=speak, args=(recording,))
+        thread.start()
+        for i, payload in enumerate(payloads):
+            recording.write(other, payload, log_time=10**18, sequence=i)
+        thread.join()
+    for topic in ("/talk", "/other"):
+        assert [m.raw for m in store.topic(topic)] == payloads
+        found = [m for m in in_segments(store, recording.id) if m[0] == topic]
+        assert [data for *_, data in found] == payloads
+    assert store.verify().findings == []
+
+
+INTERRUPTED = """
+import itertools, signal, sys
+import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
+
+own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
+sizes = [10, 40_000, 10, 100, 3000]
+payloads = [
+    (size := sizes[n % 5]).to_bytes(4, "little") + bytes([n % 251]) * size for n in range(1255)
+]
+written = interrupted = 0
+writing = False
+
+def interrupt(*_):
+    if writing:
+        raise KeyboardInterrupt
+
+signal.signal(signal.SIGALRM, interrupt)
+with hl.open(sys.argv[1], create=True) as store:
+    with store.start("talk") as recording:
+        while interrupted < 40:
+            signal.setitimer(signal.ITIMER_REAL, 0.0005 + interrupted * 0.00002)
+            try:
+                writing = True
+                while True:
+                    recording.write(own, payloads[written % 1255], sequence=written)
+                    written += 1
+            except KeyboardInterrupt:
+                writing = False
+                interrupted += 1
+    found = list(store.topic("/talk"))
+    numbers = [message.sequence for message in found]
+    assert numbers == sorted(numbers)
+    # One whose writing was interrupted may be in it, and once more when it was tried again.
+    assert set(range(written)) <= set(numbers) <= set(range(written + 1))
+    assert len(numbers) <= written + interrupted
+    assert all(message.raw == payloads[message.sequence % 1255] for message in found)
+    assert store.verify().findings == []
+print("whole after", interrupted)
+"""
+
+
+def test_an_interruption_leaves_no_half_message(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(tmp_path / "store")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert (done.stdout, done.stderr) == ("whole after 40\n", "")
 
 
 def test_what_is_written_can_be_asked_for_while_it_goes_on(store: hl.Store) -> None:
@@ -203,7 +319,7 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.Monke
         raise ZeroDivisionError
 
     recording = store.start("talk", budget_bytes=1 << 20)
-    monkeypatch.setattr("hybridlog_storage.segment_writer.RecordingWriter.append_one", broken)
+    monkeypatch.setattr("hybridlog_storage.segment_writer.RecordingWriter.place_one", broken)
     own = channel("/talk")
 
     def until_refused() -> None:

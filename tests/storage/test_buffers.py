@@ -62,8 +62,41 @@ def test_a_buffer_is_not_taken_again_while_something_lies_over_it(made: list[int
 def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
     pool = Buffers()
     most = module._SPARE_BYTES // SIZE
-    pool.prepare(SIZE, (most + 3) * SIZE)
+    held = [pool.take(SIZE) for _ in range(most + 3)]
+    del held
     del made[:]
     held = [pool.take(SIZE) for _ in range(most + 3)]
+    assert len(made) == 3
+    del held
+
+
+def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
+    pool = Buffers()
+    usual = module._SPARE_BYTES // SIZE
+    pool.prepare(SIZE, (usual + 5) * SIZE)
+    assert len(made) == usual + 5
+    held = [pool.take(SIZE) for _ in range(usual + 5)]
+    del held
+    # Those that are taken count: nothing is made on top of them.
+    held = [pool.take(SIZE) for _ in range(10)]
+    pool.prepare(SIZE, (usual + 5) * SIZE)
+    assert len(made) == usual + 5
+    del held
+    pool.settle()
+    held = [pool.take(SIZE) for _ in range(usual + 5)]
+    assert len(made) == usual + 10
+    pool.prepare(SIZE, (usual + 7) * SIZE)
+    assert len(made) == usual + 12
+    del held
+
+
+def test_what_is_spare_of_another_size_is_not_in_the_way(made: list[int]) -> None:
+    pool = Buffers()
+    held = [pool.take(SIZE) for _ in range(module._SPARE_BYTES // SIZE)]
+    del held
+    del made[:]
+    pool.prepare(2 * SIZE, 6 * SIZE)
+    assert made == [2 * SIZE] * 3
+    held = [pool.take(2 * SIZE) for _ in range(3)]
     assert len(made) == 3
     del held

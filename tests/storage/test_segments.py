@@ -6,6 +6,8 @@ import io
 import os
 import re
 import shutil
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,17 +15,24 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.append_file import BLOCK, AppendFile
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import DiskFullError, SegmentError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings, StoredChunk
+from hybridlog_storage.segment_writer import (
+    PackedChunk,
+    RecordingWriter,
+    SegmentFile,
+    SegmentSettings,
+    StoredChunk,
+)
 
 RECORDING = {
     "id": "r",
@@ -69,6 +78,113 @@ def write(
     for rows in batches:
         writer.append(batch_of(rows), CHANNELS)
     return writer.close(json_metadata(END_METADATA, {"status": "complete"})), chunks
+
+
+def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, m.sequence, m.data)
+            for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+
+
+def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None:
+    """By any thread and in any order; the chunks keep theirs."""
+    chunks: list[StoredChunk] = []
+    setup = SegmentSettings(chunk_size=250_000, compression="none")
+    writer = RecordingWriter(
+        tmp_path, RECORDING, lambda c, _: chunks.append(c), setup, on_written=lambda: None
+    )
+    payloads = [bytes([n]) * 100_000 for n in range(20)]
+    copies = [
+        writer.place_one(CHANNELS[n % 2], payload, n, n, n) for n, payload in enumerate(payloads)
+    ]
+    # All closed chunks but none can be packed, and whoever placed did not wait.
+    assert writer.waiting > 1_500_000
+    time.sleep(0.05)
+    assert not chunks
+    threads = [threading.Thread(target=copy) for copy in reversed(copies)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (path,) = writer.close()
+    assert writer.waiting == 0
+    assert [chunk.seq.tolist() for chunk in chunks] == [
+        [n, n + 2] for start in range(0, 20, 4) for n in (start, start + 1)
+    ]
+    assert messages_in(path) == [
+        (CHANNELS[n % 2].topic, n, payload) for n, payload in enumerate(payloads)
+    ]
+
+
+def test_chunks_that_wait_are_written_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    together: list[int] = []
+    append_chunks = SegmentFile.append_chunks
+
+    def wait(segment: SegmentFile, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
+        assert go_on.wait(60)
+        stored = append_chunks(segment, chunks, end)
+        together.append(len(stored))
+        return stored
+
+    monkeypatch.setattr(SegmentFile, "append_chunks", wait)
+    setup = SegmentSettings(chunk_size=100_000, compression="none", segment_size=1_000_000)
+    chunks: list[StoredChunk] = []
+    writer = RecordingWriter(
+        tmp_path, RECORDING, lambda c, _: chunks.append(c), setup, on_written=lambda: None
+    )
+    payloads = [bytes([n]) * 100_000 for n in range(35)]
+    for n, payload in enumerate(payloads):
+        writer.place_one(CHANNELS[0], payload, n, n, n)()
+    writer.place_one(CHANNELS[1], b"last", 99, 99, 99)()
+    while not all(future.done() for future in writer._packed):
+        time.sleep(0.01)
+    go_on.set()
+    paths = writer.close()
+    # Alone only those that were there first; and segments end as if each had come by itself.
+    assert sum(together) == 36
+    assert len(together) <= 6
+    assert max(together) in {9, 10}
+    assert [chunk.segment for chunk in chunks] == [n // 10 for n in range(36)]
+    found = [m for path in paths for m in messages_in(path)]
+    assert found == [
+        *((CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)),
+        (CHANNELS[1].topic, 99, b"last"),
+    ]
+    for chunk in chunks:
+        data = paths[chunk.segment].read_bytes()
+        assert data[chunk.offset] == Opcode.CHUNK
+        assert int.from_bytes(data[chunk.offset + 1 : chunk.offset + 9], "little") == (
+            chunk.length - 9
+        )
+
+
+def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise DiskFullError("There is no room.")
+
+    monkeypatch.setattr(SegmentFile, "append_chunks", full)
+    writer = RecordingWriter(
+        tmp_path,
+        RECORDING,
+        lambda *_: None,
+        SegmentSettings(chunk_size=100_000),
+        on_written=lambda: None,
+    )
+
+    def until_refused() -> None:
+        while True:
+            writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)()
+
+    with pytest.raises(DiskFullError):
+        until_refused()
+    # Nobody waits for a payload that nobody copies any more.
+    writer.abort()
+    assert writer.written.total() == 0
 
 
 def expected(batches: Sequence[Sequence[Row]]) -> list[tuple[str, bytes, int, int, int]]:
