@@ -366,8 +366,10 @@ class LiveRecording:
         """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
         return self._taken_bytes + max(self._capture.writer.waiting - self._at_work, 0)
 
-    def _make_room(self) -> None:
+    def _make_room(self, laid: int = 0) -> None:
+        """Less waits: a chunk was written, or so many bytes were laid down."""
         with self._lock:
+            self._taken_bytes -= laid
             self._room.notify()
 
     def _wake(self) -> None:
@@ -480,20 +482,14 @@ class LiveRecording:
                 self._taken[message.channel] -= 1
             raise
         finally:
-            self._let_go(len(message.payload))
+            self._make_room(len(message.payload))
 
     def _take(self) -> None:
         """Lay what was put down into chunks; by who holds `_laying`."""
         with self._lock:
             inbox, self._inbox, self._inbox_bytes = self._inbox, deque(), 0
         while inbox:
-            self._let_go(self._lay_down(_next_group(inbox)))
-
-    def _let_go(self, size: int) -> None:
-        """So many bytes are not waiting to be laid down any more, so there is room for as much."""
-        with self._lock:
-            self._taken_bytes -= size
-            self._room.notify()
+            self._make_room(self._lay_down(_next_group(inbox)))
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""

@@ -43,25 +43,19 @@ class Buffers:
             size: Bytes.
             whole_pages: Whether it must begin at a page of memory; large ones always do.
         """
-        if size < _LEAST:
-            if not whole_pages:
-                return np.empty(size, np.uint8)
-            size = _LEAST
+        if size < _LEAST and not whole_pages:
+            return np.empty(size, np.uint8)
         size = _rounded(size)
         with self._lock:
             spare = self._spare.get(size)
             memory = spare.pop() if spare else None
             if memory is not None:
                 self._spare_bytes -= size
-        is_new = memory is None
         if memory is None:
             memory = self._make(size)
         # What is over this array keeps this array, and so the memory, from being taken again.
         array = np.frombuffer(memory, np.uint8)
         weakref.finalize(array, self._give, memory).atexit = False
-        if is_new:
-            # Here other threads go on meanwhile; the first bytes laid down would hold them up.
-            array[:_HUGE_PAGE].fill(0)
         return array
 
     def prepare(
@@ -83,13 +77,13 @@ class Buffers:
             enough: Ends it early.
         """
         enough = enough or threading.Event()
-        size = _rounded(max(size, _LEAST))
+        size = _rounded(size)
         with self._lock:
             missing = max(total // size - self._there[size], 0)
             self._most_spare = max(self._most_spare, total, self._spare_bytes + missing * size)
         for _ in range(missing):
             memory = self._make(size)
-            np.frombuffer(memory, np.uint8).fill(0)
+            np.frombuffer(memory, np.uint8)[_HUGE_PAGE:].fill(0)
             self._give(memory)
             if enough.wait(pause_s):
                 return
@@ -108,6 +102,8 @@ class Buffers:
         memory = _new(size)
         with self._lock:
             self._there[size] += 1
+        # Other threads go on while this is filled; the first bytes laid down would hold them up.
+        np.frombuffer(memory, np.uint8)[:_HUGE_PAGE].fill(0)
         return memory
 
     def _give(self, memory: mmap.mmap) -> None:
@@ -121,7 +117,7 @@ class Buffers:
 
 
 def _rounded(size: int) -> int:
-    return 1 << (size - 1).bit_length()
+    return 1 << (max(size, _LEAST) - 1).bit_length()
 
 
 def _new(size: int) -> mmap.mmap:

@@ -142,11 +142,9 @@ def test_while_the_disk_stands_still_the_budget_is_still_taken(
 
 
 @pytest.mark.parametrize("rate", [0, 1e9])
-def test_memory_for_a_disk_that_stands_still_is_there_before(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, rate: float
-) -> None:
+def test_memory_for_a_disk_that_stands_still_is_there_before(store: hl.Store, rate: float) -> None:
     settings, budget = SegmentSettings(chunk_size=1 << 18), 32 << 20
-    there = set_up = buffers._there[1 << 18]
+    set_up = buffers._there[1 << 18]
     with store.start("talk", budget_bytes=budget, settings=settings) as recording:
         assert buffers._there[1 << 18] == max(set_up, budget // 8 // settings.chunk_size)
         recording._look_ahead(rate)
@@ -185,7 +183,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
 
 
 INTERRUPTED = """
-import itertools, signal, sys
+import signal, sys
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 
