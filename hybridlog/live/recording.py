@@ -141,6 +141,7 @@ class LiveRecording:
         self._inbox_bytes = 0
         self._taken_bytes = 0  # taken, and not laid into a chunk yet
         self._at_work = AT_WORK * options.settings.chunk_size
+        self._beyond = 0  # bytes closed beyond those, as last counted; `write` asks each time
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
         self._laying = threading.Lock()  # held by who lays into chunks, and taken before `_lock`
@@ -242,7 +243,7 @@ class LiveRecording:
         at_once = size >= _LARGE and threading.current_thread() is not threading.main_thread()
         with self._lock:
             bound = self._small_bound if size <= SMALL else self._options.budget_bytes
-            while (unwritten := self._unwritten()) and unwritten + size > bound:
+            while (unwritten := self._taken_bytes + self._beyond) and unwritten + size > bound:
                 self._check()
                 if not wait:
                     return False
@@ -362,14 +363,19 @@ class LiveRecording:
         with self._held:
             self._capture.forget()
 
+    def _closed_beyond(self) -> int:
+        """Bytes in closed chunks beyond those at work."""
+        return max(self._capture.writer.waiting - self._at_work, 0)
+
     def _unwritten(self) -> int:
         """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
-        return self._taken_bytes + max(self._capture.writer.waiting - self._at_work, 0)
+        return self._taken_bytes + self._closed_beyond()
 
     def _make_room(self, laid: int = 0) -> None:
-        """Less waits: a chunk was written, or so many bytes were laid down."""
+        """See how much waits now that a chunk was closed or written, or so much was laid down."""
         with self._lock:
             self._taken_bytes -= laid
+            self._beyond = self._closed_beyond()
             self._room.notify()
 
     def _wake(self) -> None:
@@ -418,6 +424,7 @@ class LiveRecording:
                     if now - flushed >= tick:
                         # What is laid down may have waited for a tick already.
                         self._capture.writer.flush_older(interval * 3 / 4 - tick)
+                        self._make_room()
                         flushed = now
                     if now - told >= interval / 4:
                         self._write_losses()
