@@ -47,6 +47,8 @@ _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
 _COPYING = 2  # threads that lay down large messages at the same time
 _CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
+_LATE_S = 0.01  # a large message that waits so long to be laid down is late: both happen, too,
+_LATE_TIMES = 20  # for so many times as long as it has waited
 _AT_HAND = 128 << 20  # bytes of buffers that are there before the first message, at most
 _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
 _LOOK_S = 0.25  # how often one looks how many that are
@@ -95,11 +97,14 @@ class _Strain:
         self._bound = bound
         self._calm = 0.0
 
+    def go_on(self, seconds: float) -> None:
+        """Be felt for some time, whatever waits to be written."""
+        self._calm = max(self._calm, time.monotonic() + seconds)
+
     def is_felt(self, unwritten: int) -> bool:
-        now = time.monotonic()
         if unwritten > self._bound:
-            self._calm = now + _CALM_S
-        return now < self._calm
+            self.go_on(_CALM_S)
+        return time.monotonic() < self._calm
 
 
 class LiveRecording:
@@ -477,7 +482,9 @@ class LiveRecording:
         those that write the chunks no turn at the interpreter.
         """
         try:
-            with self._turns:
+            with self._turns as waited:
+                if waited > _LATE_S:
+                    self._be_late(waited)
                 with self._laying:
                     self._check()
                     with self._failing():
@@ -490,6 +497,11 @@ class LiveRecording:
             raise
         finally:
             self._make_room(len(message.payload))
+
+    def _be_late(self, waited: float) -> None:
+        """Spare the processors and the disk: a message has waited for its turn."""
+        for strain in (self._hurry, self._behind):
+            strain.go_on(min(_LATE_TIMES * waited, _CALM_S))
 
     def _take(self) -> None:
         """Lay what was put down into chunks; by who holds `_laying`."""

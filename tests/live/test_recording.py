@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.live import LiveRecording
+from hybridlog.live import recording as live
 from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.errors import DiskFullError, UsageError
@@ -264,6 +266,31 @@ def test_the_index_falls_behind_and_catches_up(
     assert recording.close().indexed == 40
     assert [m.raw for m in store.topic("/talk")] == payloads
     assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_index_waits_while_messages_wait_for_their_turn(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    monkeypatch.setattr(live, "_CALM_S", 3600)
+    monkeypatch.setattr(live, "_LATE_TIMES", 36_000 if late else 0)
+    own = channel("/talk")
+    with store.start("talk", flush_interval_s=0.2) as recording:
+        thread = threading.Thread(target=recording.write, args=(own, text(os.urandom(50_000))))
+        with ExitStack() as all_turns:
+            for _ in range(live._COPYING):
+                all_turns.enter_context(recording._turns)
+            thread.start()
+            wait_for(lambda: len(recording._turns._waiting) == 1)
+            time.sleep(2 * live._LATE_S)
+        thread.join()
+        wait_for(lambda: recording.stored[0] == 1)
+        if late:
+            time.sleep(1)
+        else:
+            wait_for(lambda: recording.lag == 0)
+        assert recording.lag == late
+    assert recording.close().indexed == 1
 
 
 def in_segments_so_far(store: hl.Store, recording: str) -> list[Path]:
