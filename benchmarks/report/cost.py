@@ -32,8 +32,8 @@ def section(book: Book) -> Section | None:
         return None
     text = (
         "CPU time of the logger's process and of the servers it started, over the payload that "
-        "was kept; the publisher's is not in it. All rates together: where everything is kept, "
-        "the rate hardly matters.",
+        "was kept; the publisher's is not in it. All rates together at which a backend was "
+        "measured: a slow stream of small messages costs more a GB than a fast one.",
         "Memory is the kernel's high-water mark of resident memory: of the logger without the "
         "payload file that it maps, of servers with what their processes share counted once.",
     )
@@ -47,27 +47,39 @@ def section(book: Book) -> Section | None:
 
 
 def findings(book: Book) -> list[str]:
-    """CPU time of ours against the thriftiest database, at the least and the greatest size."""
-    samples = book.good(_STUDY)
+    """CPU time of ours against the thriftiest database, at the ends of both axes.
+
+    A slow stream costs more a GB than a fast one, so each rate stands alone.
+    """
+    told = {
+        (length, rate): found
+        for (length, rate), group in by_case(book.good(_STUDY), "size", "rate").items()
+        if (found := _beside_databases(length, rate, group))
+    }
     found = []
-    cases = by_case(samples, "size")
-    ends = list(cases)[:1] + list(cases)[-1:] if len(cases) > 1 else list(cases)
-    for case in ends:
-        medians = {
-            name: one.median
-            for name, group in by_backend(cases[case]).items()
-            if (one := value(group, _cpu_both)) is not None
-        }
-        others = [name for name in databases(medians) if medians[name]]
-        if not medians.get(OURS) or not others:
-            continue
-        best = min(others, key=lambda name: medians[name])
-        found.append(
-            f"At {size(case[0])} a message, a GB costs hybridlog {shown(medians[OURS])} s of CPU "
-            f"time; the thriftiest database, {title(best)}, takes {shown(medians[best])} s "
-            f"({times(medians[best] / medians[OURS])} as much)."
-        )
+    sizes = sorted({length for length, _ in told})
+    for length in dict.fromkeys((*sizes[:1], *sizes[-1:])):
+        rates = [rate for at, rate in told if at == length]
+        found += [told[length, rate] for rate in dict.fromkeys((rates[0], rates[-1]))]
     return found
+
+
+def _beside_databases(length: int, rate: float, samples: Sequence[Sample]) -> str:
+    """CPU time of ours and of the thriftiest database; empty when either was not measured."""
+    medians = {
+        name: one.median
+        for name, group in by_backend(samples).items()
+        if (one := value(group, _cpu_both)) is not None
+    }
+    others = [name for name in databases(medians) if medians[name]]
+    if not medians.get(OURS) or not others:
+        return ""
+    best = min(others, key=lambda name: medians[name])
+    return (
+        f"At {size(length)} a message and {rate:g} Hz a topic, a GB costs hybridlog "
+        f"{shown(medians[OURS])} s of CPU time; the thriftiest database, {title(best)}, takes "
+        f"{shown(medians[best])} s ({times(medians[best] / medians[OURS])} as much)."
+    )
 
 
 def timing(book: Book) -> Section | None:

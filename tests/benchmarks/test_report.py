@@ -7,6 +7,7 @@ import re
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from statistics import median
@@ -213,6 +214,22 @@ def test_cost_is_for_a_gigabyte_that_was_kept(tmp_path: Path) -> None:
     assert rows["hybridlog"] == (Value(40.0, 40.0, 40.0, 1), Value(20.0, 20.0, 20.0, 1))
     disk = {row[0]: row[1] for row in table(found, "Bytes on the disk").rows}
     assert disk["hybridlog"] == Value(2.0, 2.0, 2.0, 1)
+
+
+def test_cost_is_compared_at_the_same_rate(tmp_path: Path) -> None:
+    def at(backend: str, rate: float, cpu_s: float) -> Sample:
+        one = stream(backend, 1.0)
+        values = {**one.values, "cpu_s": cpu_s, "server_cpu_s": 0.0}
+        return replace(one, case={**one.case, "rate": rate}, values=values)
+
+    ours = (at("hybridlog", rate, cpu_s) for rate, cpu_s in ((4, 9.0), (16, 6.0), (64, 1.0)))
+    theirs = (at("sqlite_udf", 16, 3.0), at("sqlite_udf", 64, 2.0), at("mcap", 4, 1.0))
+    found = report(journal(tmp_path, *ours, *theirs)).findings
+    told = [text for text in found if "of CPU time" in text]
+    assert [re.findall(r"([0-9]+) Hz|([0-9.]+) times", text) for text in told] == [
+        [("16", ""), ("", "0.5")],
+        [("64", ""), ("", "2")],
+    ]
 
 
 def test_ceilings_are_those_of_the_search(tmp_path: Path) -> None:
