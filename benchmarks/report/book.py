@@ -52,6 +52,12 @@ def by_case(samples: Iterable[Sample], *names: str) -> dict[tuple[Any, ...], lis
     return dict(sorted(found.items(), key=lambda item: tuple(map(_sortable, item[0]))))
 
 
+def ends(values: Iterable[K]) -> list[K]:
+    """The first and the last of them, or the only one."""
+    found = list(values)
+    return found if len(found) < 2 else [found[0], found[-1]]
+
+
 def _sortable(part: object) -> tuple[bool, float, str]:
     if isinstance(part, int | float):
         return False, float(part), ""

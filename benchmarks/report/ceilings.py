@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from benchmarks.report.book import MB, Book
+from benchmarks.report.book import MB, Book, ends
 from benchmarks.report.look import OURS, databases, ordered, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number, size, times
@@ -50,8 +50,7 @@ def findings(book: Book) -> list[str]:
     """Our ceiling against the best database's, at the least and the greatest size."""
     ceilings = _ceilings(book)
     found = []
-    sizes = sorted({one.size for one in ceilings})
-    for bytes_ in sizes[:1] + sizes[-1:] if len(sizes) > 1 else sizes:
+    for bytes_ in ends(sorted({one.size for one in ceilings})):
         of_size = [one for one in ceilings if one.size == bytes_]
         pair = _pair(of_size)
         if pair is None:

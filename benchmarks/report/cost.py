@@ -10,6 +10,7 @@ from benchmarks.report.book import (
     by_backend,
     by_case,
     cpu_per_gb,
+    ends,
     named,
     number,
     ratio,
@@ -51,17 +52,11 @@ def findings(book: Book) -> list[str]:
 
     A slow stream costs more a GB than a fast one, so each rate stands alone.
     """
-    told = {
-        (length, rate): found
-        for (length, rate), group in by_case(book.good(_STUDY), "size", "rate").items()
-        if (found := _beside_databases(length, rate, group))
-    }
-    found = []
-    sizes = sorted({length for length, _ in told})
-    for length in dict.fromkeys((*sizes[:1], *sizes[-1:])):
-        rates = [rate for at, rate in told if at == length]
-        found += [told[length, rate] for rate in dict.fromkeys((rates[0], rates[-1]))]
-    return found
+    told: dict[int, list[str]] = {}
+    for (length, rate), group in by_case(book.good(_STUDY), "size", "rate").items():
+        if text := _beside_databases(length, rate, group):
+            told.setdefault(length, []).append(text)
+    return [text for length in ends(told) for text in ends(told[length])]
 
 
 def _beside_databases(length: int, rate: float, samples: Sequence[Sample]) -> str:
@@ -151,15 +146,14 @@ def _graph(samples: Sequence[Sample]) -> Graph:
 
 
 def _cpu(samples: Sequence[Sample]) -> Table:
-    cases = list(by_case(samples, "size"))
-    ends = [cases[0], cases[-1]] if len(cases) > 1 else cases
+    extremes = ends(by_case(samples, "size"))
     columns = ["backend"]
-    for (n,) in ends:
+    for (n,) in extremes:
         columns += [f"{size(n)}: logger", f"{size(n)}: servers"]
     rows: list[tuple[Cell, ...]] = []
     for name, group in by_backend(samples).items():
         row: list[Cell] = [title(name)]
-        for case in ends:
+        for case in extremes:
             of_size = by_case(group, "size").get(case, [])
             row += [value(of_size, cpu_per_gb(part)) for part in ("cpu_s", "server_cpu_s")]
         rows.append(tuple(row))
