@@ -38,6 +38,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 from hybridlog.query.regex import UnsafeRegexError, check_regex
@@ -189,6 +190,11 @@ def parse(text: str) -> Expression:
     """
     if not isinstance(text, str):
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
+    return _parsed(text)
+
+
+@lru_cache(maxsize=128)  # of a small topic, reading the predicate takes as long as the answer
+def _parsed(text: str) -> Expression:
     return _Parser(text).parse()
 
 
