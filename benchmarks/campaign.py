@@ -42,7 +42,7 @@ PARTS = {
     "throughput": _Part(
         "benchmarks.studies.throughput", ("sizes", "rates", "messages", "topics", "repetitions")
     ),
-    "ceilings": _Part("benchmarks.studies.ceiling", ("sizes", "topics", "seconds")),
+    "ceilings": _Part("benchmarks.studies.ceiling", ("sizes", "topics", "seconds", "repetitions")),
     "persistence": _Part("benchmarks.studies.persistence", ("logs", "repetitions")),
     "speed-up": _Part("benchmarks.studies.speed_up", ("logs", "repetitions")),
     "queries": _Part("benchmarks.studies.queries", ("repetitions",)),

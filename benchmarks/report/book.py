@@ -177,13 +177,5 @@ def cpu_per_gb(name: str) -> Callable[[Sample], float | None]:
 
 def repetitions(samples: Sequence[Sample]) -> str:
     """How many repetitions stand behind figures: `5 repetitions`, `2 to 5 repetitions`."""
-    counts = sorted(
-        len(group)
-        for group in grouped(samples, lambda one: (one.backend, str(dict(one.case)))).values()
-    )
-    if not counts:
-        return "no repetitions"
-    low, high = counts[0], counts[-1]
-    if low == high:
-        return f"{low} repetition{'s' if low != 1 else ''}"
-    return f"{low} to {high} repetitions"
+    groups = grouped(samples, lambda one: (one.backend, str(dict(one.case))))
+    return numbers.counted([len(of) for of in groups.values()], "repetition", "repetitions")

@@ -2,21 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 from benchmarks.report.book import MB, Book, ends
 from benchmarks.report.look import OURS, databases, ordered, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
-from benchmarks.report.numbers import listed, number, size, times
+from benchmarks.report.numbers import counted, listed, number, size, times, with_spread
 from benchmarks.studies.ceiling import STUDY, Ceiling
 from benchmarks.studies.ceiling import ceilings as found_in
 
-_Text = Callable[[Ceiling], str | None]
-
 _NOTE = (
     "≥: the ceiling is above; the harness could offer no more (harness), or no higher rate was "
-    "planned (plan). none: something was dropped at every rate that was tried."
+    "planned (plan), in one of the searches at least. none: something was dropped at every rate "
+    "that was tried."
 )
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What all searches found for one backend and one message size.
+
+    Attributes:
+        backend: Name.
+        size: Bytes of a message.
+        searches: One or more.
+        offered: MB/s; 0 is that of a search in which every rate was too much.
+    """
+
+    backend: str
+    size: int
+    searches: Sequence[Ceiling]
+    offered: Value
+
+    @property
+    def is_none(self) -> bool:
+        """Whether something was lost at every rate in every search."""
+        return all(one.rate is None for one in self.searches)
+
+    @property
+    def limit(self) -> str:
+        """What ended the searches; `backend` only if it ended all of them."""
+        others = [one.limit for one in self.searches if one.limit != "backend"]
+        return others[0] if others else "backend"
+
+    def of(self, measure: Callable[[Ceiling], float]) -> Value:
+        """One measure of the searches."""
+        return _value(self.searches, measure)
+
+
+_Text = Callable[[_Found], str | None]
 
 
 def section(book: Book) -> Section | None:
@@ -27,8 +62,8 @@ def section(book: Book) -> Section | None:
     text = (
         "The rate is doubled until a message is dropped, then the gap is halved a few times. The "
         "ceiling is the largest offered load of which everything was found in the backend "
-        "afterwards. Each trial is one run, so a ceiling has no spread; it is known to about the "
-        "last halving.",
+        "afterwards, known to about the last halving. Each trial is one run, and chance has a say "
+        "in the last ones, so the whole search is made anew for each repetition.",
         "A trial is short: what a backend can put off (dirty pages, a journal, work after the last "
         "message) helps it. “Stored” divides by the time until everything was on the disk.",
     )
@@ -59,9 +94,9 @@ def findings(book: Book) -> list[str]:
         marked = " or more" if ours.limit != "backend" else ""
         found.append(
             f"With {size(bytes_)} messages, hybridlog keeps everything up to "
-            f"{number(ours.offered_bytes_s / MB)} MB/s{marked}, "
-            f"{times(ours.offered_bytes_s / best.offered_bytes_s)} what the best database does "
-            f"({title(best.backend)}, {number(best.offered_bytes_s / MB)} MB/s)."
+            f"{with_spread(ours.offered)} MB/s{marked}, "
+            f"{times(ours.offered.median / best.offered.median)} what the best database does "
+            f"({title(best.backend)}, {with_spread(best.offered)} MB/s)."
         )
     short = [one for one in ceilings if one.backend == OURS and one.limit == "harness"]
     if short:
@@ -73,35 +108,46 @@ def findings(book: Book) -> list[str]:
     return found
 
 
-def _ceilings(book: Book) -> list[Ceiling]:
-    return found_in(one for one in book.all if one.status != "missing")
+def _ceilings(book: Book) -> list[_Found]:
+    searches: dict[tuple[str, int], list[Ceiling]] = {}
+    for one in found_in(one for one in book.all if one.status != "missing"):
+        searches.setdefault((one.backend, one.size), []).append(one)
+    return [
+        _Found(backend, bytes_, of, _value(of, lambda one: one.offered_bytes_s / MB))
+        for (backend, bytes_), of in searches.items()
+    ]
 
 
-def _pair(of_size: Sequence[Ceiling]) -> tuple[Ceiling, Ceiling] | None:
+def _value(searches: Iterable[Ceiling], measure: Callable[[Ceiling], float]) -> Value:
+    found = Value.of(map(measure, searches))
+    assert found is not None
+    return found
+
+
+def _pair(of_size: Sequence[_Found]) -> tuple[_Found, _Found] | None:
     """Ours, and the best of the databases; None when either has no ceiling."""
-    known = {one.backend: one for one in of_size if one.rate is not None}
+    known = {one.backend: one for one in of_size if one.offered.median}
     others = databases(known)
     if OURS not in known or not others:
         return None
-    best = max(others, key=lambda name: known[name].offered_bytes_s)
+    best = max(others, key=lambda name: known[name].offered.median)
     return known[OURS], known[best]
 
 
-def _graph(ceilings: Sequence[Ceiling]) -> Graph:
+def _graph(ceilings: Sequence[_Found]) -> Graph:
     lines = []
     for name in ordered(one.backend for one in ceilings):
-        points = sorted(
-            (float(one.size), one.offered_bytes_s / MB)
-            for one in ceilings
-            if one.backend == name and one.rate is not None
-        )
-        lines.append(Line(name, tuple((x, Value(y, y, y, 1)) for x, y in points)))
+        # The axis is logarithmic: 0 has no place on it.
+        of = [one for one in ceilings if one.backend == name and one.offered.median]
+        points = [(float(one.size), one.offered) for one in sorted(of, key=lambda one: one.size)]
+        lines.append(Line(name, tuple(points)))
     sizes = sorted({one.size for one in ceilings})
     return Graph(
         "ceilings",
         "Largest load of which everything is kept",
-        "Offered load over message size, both axes logarithmic. One search a point. Where the "
-        "line of “harness alone” is reached, the harness can offer no more.",
+        "Offered load over message size, both axes logarithmic. Median of "
+        f"{_searches(ceilings)}; the bars reach from the least to the greatest. Where the line of "
+        "“harness alone” is reached, the harness can offer no more.",
         "lines",
         (Panel("", tuple(lines)),),
         "message size",
@@ -112,7 +158,7 @@ def _graph(ceilings: Sequence[Ceiling]) -> Graph:
     )
 
 
-def _table(ceilings: Sequence[Ceiling], heading: str, text: _Text, note: str = _NOTE) -> Table:
+def _table(ceilings: Sequence[_Found], heading: str, text: _Text, note: str = _NOTE) -> Table:
     sizes = sorted({one.size for one in ceilings})
     by_place = {(one.backend, one.size): one for one in ceilings}
     rows = tuple(
@@ -125,19 +171,26 @@ def _table(ceilings: Sequence[Ceiling], heading: str, text: _Text, note: str = _
         )
         for name in ordered(one.backend for one in ceilings)
     )
+    note = f"Median (least…greatest) of {_searches(ceilings)}. {note}".rstrip()
     return Table(heading, ("backend", *map(size, sizes)), rows, note, title(OURS))
 
 
-def _megabytes(one: Ceiling) -> str:
-    return "none" if one.rate is None else _bound(one, one.offered_bytes_s / MB)
+def _searches(ceilings: Sequence[_Found]) -> str:
+    return counted([len(one.searches) for one in ceilings], "search", "searches")
 
 
-def _bound(one: Ceiling, value: float) -> str:
-    return number(value) if one.limit == "backend" else f"≥ {number(value)} ({one.limit})"
+def _megabytes(one: _Found) -> str:
+    return _bound(one, one.offered)
 
 
-def _kept(one: Ceiling) -> str | None:
-    return None if one.rate is None else number(one.stored_bytes_s / MB)
+def _bound(one: _Found, value: Value) -> str:
+    if one.is_none:
+        return "none"
+    return with_spread(value) if one.limit == "backend" else f"≥ {with_spread(value)} ({one.limit})"
+
+
+def _kept(one: _Found) -> str | None:
+    return None if one.is_none else with_spread(one.of(lambda each: each.stored_bytes_s / MB))
 
 
 def _messages(book: Book) -> _Text:
@@ -145,23 +198,23 @@ def _messages(book: Book) -> _Text:
         one.case.get("size"): one.case.get("topics") for one in book.all if one.study == STUDY
     }
 
-    def text(one: Ceiling) -> str | None:
+    def text(one: _Found) -> str | None:
         count = topics.get(one.size)
-        if one.rate is None or not isinstance(count, int):
+        if one.is_none or not isinstance(count, int):
             return None
-        return _bound(one, one.rate * count)
+        return _bound(one, one.of(lambda each: (each.rate or 0.0) * count))
 
     return text
 
 
-def _ratios(ceilings: Sequence[Ceiling]) -> list[Table]:
+def _ratios(ceilings: Sequence[_Found]) -> list[Table]:
     sizes = sorted({one.size for one in ceilings})
     cells: list[Cell] = []
     names: list[Cell] = []
     for bytes_ in sizes:
         pair = _pair([one for one in ceilings if one.size == bytes_])
         cells.append(
-            None if pair is None else number(pair[0].offered_bytes_s / pair[1].offered_bytes_s)
+            None if pair is None else number(pair[0].offered.median / pair[1].offered.median)
         )
         names.append(None if pair is None else title(pair[1].backend))
     if all(cell is None for cell in cells):

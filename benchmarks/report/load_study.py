@@ -10,6 +10,7 @@ from benchmarks.report.book import (
     Book,
     by_backend,
     by_case,
+    grouped,
     is_whole,
     middle,
     offered,
@@ -24,7 +25,7 @@ from benchmarks.report.look import FLOORS, OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number, percent
 from benchmarks.samples import Sample
-from benchmarks.studies.ceiling import verdict
+from benchmarks.studies.search import Verdict, verdict
 
 STUDY = "persistence"
 FASTER = "speed-up"
@@ -68,7 +69,7 @@ def speed_up(book: Book) -> Section | None:
         return None
     text = (
         "The same logs, played faster until a message is dropped: the speed is doubled, then the "
-        "gap is halved. Each trial is one run.",
+        "gap is halved. Each trial is one run; the whole search is made anew for each repetition.",
     )
     logs = _logs(samples)
     rows: list[tuple[Cell, ...]] = []
@@ -79,7 +80,8 @@ def speed_up(book: Book) -> Section | None:
         "Greatest speed at which everything was kept, times real time",
         ("backend", *(log for (log,) in logs)),
         tuple(rows),
-        "“or more”: no higher speed was planned, or (harness) it could not be published faster.",
+        "Median (least…greatest) of the searches. “or more”: no higher speed was planned, or "
+        "(harness) it could not be published faster.",
         title(OURS),
     )
     return Section("speed-up", "Faster than real time", text, (), (table,))
@@ -91,16 +93,31 @@ def _trials(book: Book) -> list[Sample]:
 
 
 def _bound(samples: Sequence[Sample]) -> str:
-    """The greatest speed at which one backend kept all of one log, below the first that was not."""
-    kept: float | None = None
-    for (speed,), (trial, *_) in by_case(samples, SPEED).items():
+    """The greatest speed at which one backend kept all of one log: median and spread."""
+    searches = [_greatest(of) for of in grouped(samples, lambda one: one.repetition).values()]
+    found = Value.of(speed for speed, _ in searches)
+    if found is None:
+        return "none tried"
+    if not found.high:
+        return f"below {number(min(one.case[SPEED] for one in samples))}x"
+    text = f"{number(found.median)}x"
+    if found.low != found.high:
+        text += f" ({number(found.low)}…{number(found.high)})"
+    ends = {end for _, end in searches}
+    if "late" in ends:
+        return f"{text} or more (harness)"
+    return f"{text} or more" if "kept" in ends else text
+
+
+def _greatest(trials: Sequence[Sample]) -> tuple[float, Verdict]:
+    """The greatest speed below the first that was not kept, 0 for none, and what ended it."""
+    greatest = 0.0
+    for (speed,), (trial, *_) in by_case(trials, SPEED).items():
         found = verdict(trial)
         if found != "kept":
-            if kept is None:
-                return f"below {number(speed)}x"
-            return f"{number(kept)}x or more (harness)" if found == "late" else f"{number(kept)}x"
-        kept = float(speed)
-    return "none tried" if kept is None else f"{number(kept)}x or more"
+            return greatest, found
+        greatest = float(speed)
+    return greatest, "kept"
 
 
 def findings(book: Book) -> list[str]:

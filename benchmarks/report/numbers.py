@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import floor, isfinite, log10
 
 from benchmarks.report.model import Cell, Value
@@ -87,6 +88,17 @@ def listed(names: list[str]) -> str:
     if len(names) < 2:
         return "".join(names)
     return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def counted(counts: Iterable[int], one: str, many: str) -> str:
+    """How many there are: `1 search`, `3 searches`, `2 to 5 searches`, `no searches`."""
+    known = sorted(counts)
+    if not known:
+        return f"no {many}"
+    low, high = known[0], known[-1]
+    if low == high:
+        return f"{low} {one if low == 1 else many}"
+    return f"{low} to {high} {many}"
 
 
 def plain(text: str) -> str:

@@ -20,7 +20,7 @@ from benchmarks.loads.hcr_like import RIGHT_GRIPPER, TF, WEBCAM
 from benchmarks.loads.mit_like import KINECT_DEPTH
 from benchmarks.progress import Steps
 from benchmarks.samples import Journal, Sample
-from benchmarks.studies import persistence, replays, speed_up
+from benchmarks.studies import persistence, replays, search, speed_up
 from benchmarks.studies.replays import MADE, Replay, logs_at
 from benchmarks.studies.runs import Context
 from hybridlog_storage.errors import SourceError
@@ -220,7 +220,7 @@ def test_chosen_logs_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 
 # --- the search for the speed ---
 
-ONE = speed_up.Settings(seconds=5, made=("hcr1",), chosen=False)
+ONE = speed_up.Settings(seconds=5, made=("hcr1",), chosen=False, repetitions=1)
 
 
 def speeds(context: Model, backend: str) -> list[float]:
@@ -247,8 +247,9 @@ def test_search_brackets_the_limit_and_goes_on(
     wanted = replace(ONE, halvings=halvings)
     replay = wanted.replays(1)[0]
     first = model(directory, {"one": limit})
+    of_one = speed_up._search(first, wanted, "one", replay, 0)
     for _ in range(stop):
-        if not speed_up._try(first, wanted, "one", replay, set()):
+        if not search._try(first, of_one, set()):
             break
     second = model(directory, {"one": limit})
     speed_up.run(second, wanted)
@@ -262,6 +263,13 @@ def test_search_brackets_the_limit_and_goes_on(
         assert kept <= limit < lost
         assert lost / kept <= 1 + 2.0**-halvings + 1e-9
     shutil.rmtree(directory)
+
+
+def test_each_search_is_repeated_from_the_beginning(tmp_path: Path) -> None:
+    context = model(tmp_path, {"five": 5.0})
+    speed_up.run(context, replace(ONE, repetitions=2))
+    assert speeds(context, "five") == [1, 2, 4, 8, 6, 5] * 2
+    assert [one.repetition for one in context.trials] == [0] * 6 + [1] * 6
 
 
 def test_a_trial_that_fails_ends_this_search_and_is_tried_by_the_next(tmp_path: Path) -> None:

@@ -232,11 +232,13 @@ def test_cost_is_compared_at_the_same_rate(tmp_path: Path) -> None:
     ]
 
 
-def test_ceilings_are_those_of_the_search(tmp_path: Path) -> None:
-    def trial(backend: str, rate: int, share: float) -> Sample:
-        case = {"size": 5000, "rate": rate, "topics": 20, "messages": 500}
-        return Sample("ceiling", case, backend, 0, "ok", run_values(share, mb=rate / 10))
+def ceiling_trial(backend: str, rate: int, share: float, repetition: int = 0) -> Sample:
+    case = {"size": 5000, "rate": rate, "topics": 20, "messages": 500}
+    return Sample("ceiling", case, backend, repetition, "ok", run_values(share, mb=rate / 10))
 
+
+def test_ceilings_are_those_of_the_search(tmp_path: Path) -> None:
+    trial = ceiling_trial
     found = report(
         journal(
             tmp_path,
@@ -257,6 +259,59 @@ def test_ceilings_are_those_of_the_search(tmp_path: Path) -> None:
     }
     assert {row[0]: row[1] for row in table(found, "messages/s").rows}["hybridlog"] == "5,120"
     assert table(found, "over the best database's").rows[0] == ("ratio", "4")
+
+
+def test_speeds_of_several_searches_have_a_spread(tmp_path: Path) -> None:
+    def trial(backend: str, speed: int, repetition: int, share: float = 1.0) -> Sample:
+        case = {"log": "hcr1", "seconds": 20, "speed": speed}
+        return Sample("speed-up", case, backend, repetition, "ok", run_values(share))
+
+    found = report(
+        journal(
+            tmp_path,
+            *(trial("hybridlog", speed, n) for n in range(2) for speed in (1, 2)),
+            trial("hybridlog", 4, 1),
+            trial("hybridlog", 4, 0, 0.9),
+            trial("mongo_json", 1, 0),
+            trial("mongo_json", 2, 0, 0.9),
+            trial("mongo_json", 1, 1, 0.9),
+            trial("sqlite_udf", 1, 0, 0.9),
+        )
+    )
+    assert {row[0]: row[1] for row in table(found, "Greatest speed").rows} == {
+        "hybridlog": "3x (2…4) or more",  # the second search came to its end
+        "MongoDB": "0.5x (0…1)",
+        "SQLite (Python functions)": "below 1x",
+    }
+
+
+def test_ceilings_of_several_searches_have_a_spread(tmp_path: Path) -> None:
+    trial = ceiling_trial
+    found = report(
+        journal(
+            tmp_path,
+            *(trial("hybridlog", rate, 1.0, n) for n in range(3) for rate in (64, 128)),
+            trial("hybridlog", 256, 1.0, 2),
+            *(trial("hybridlog", 512 >> (n < 2), 0.9, n) for n in range(3)),
+            trial("mongo_json", 64, 1.0),
+            trial("mongo_json", 128, 0.5),
+            trial("mongo_json", 64, 0.9, 1),
+            trial("sqlite_udf", 64, 0.99),
+            trial("sqlite_udf", 64, 0.99, 1),
+        )
+    )
+    offered = table(found, "Ceiling: offered load")
+    assert {row[0]: row[1] for row in offered.rows} == {
+        "hybridlog": "12.8 (12.8…25.6)",
+        "MongoDB": "3.2 (0…6.4)",  # the second search found none
+        "SQLite (Python functions)": "none",
+    }
+    assert offered.note.startswith("Median (least…greatest) of 2 to 3 searches.")
+    assert table(found, "over the best database's").rows[0] == ("ratio", "4")
+    assert any("12.8 (12.8…25.6) MB/s" in text for text in found.findings)
+    (graph,) = (one for of in found.sections for one in of.graphs if one.key == "ceilings")
+    (ours,) = (line for line in graph.panels[0].lines if line.backend == "hybridlog")
+    assert ours.points == ((5000.0, Value(12.8, 12.8, 25.6, 3)),)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,165 @@
+"""The search for the greatest rate at which a backend still keeps everything.
+
+The rate is doubled until something is lost, then the gap is halved a few times. Each
+trial is a sample, and what to try next follows from the samples alone, so a search that
+was stopped goes on where it was. Chance decides about the last trials, so each search
+is made several times, and every one of them begins anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from benchmarks.samples import Sample
+
+if TYPE_CHECKING:
+    from benchmarks.loads.base import Load
+    from benchmarks.studies.runs import Context
+
+TRIALS = 6
+"""About how many trials a search takes."""
+
+Verdict = Literal["kept", "lost", "late"]
+"""`late`: the publisher could not keep its own schedule, so the load was not offered."""
+
+_LATE_SHARE = 0.05
+_LATE_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Where a search looks.
+
+    Attributes:
+        start: Rate of the first trial.
+        lowest: No rate below is tried.
+        highest: No rate above is tried.
+        halvings: Of the gap between the rates that was kept and that was not.
+    """
+
+    start: float
+    lowest: float
+    highest: float
+    halvings: int
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One run of a search.
+
+    Attributes:
+        sample: Study, case, backend and repetition.
+        load: Gives what is published; called only when it is needed.
+        seconds: About how long it takes.
+        speed: Times as fast as the load says.
+    """
+
+    sample: Sample
+    load: Callable[[], Load]
+    seconds: float
+    speed: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """One search of one backend.
+
+    Attributes:
+        axis: Name of the rate in the case of a trial.
+        bounds: Where it looks.
+        trial: Gives the trial at a rate.
+    """
+
+    axis: str
+    bounds: Bounds
+    trial: Callable[[float], Trial]
+
+
+def verdict(sample: Sample) -> Verdict:
+    """What a trial shows."""
+    values = sample.values
+    if sample.status != "ok" or values["persisted"] < values["published"]:
+        return "lost"
+    late = values["publish_s"] - values["due_s"]
+    return "late" if late > _LATE_SHARE * values["due_s"] + _LATE_S else "kept"
+
+
+def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
+    """The rate to try next.
+
+    Args:
+        kept: Of the rates that were tried, whether all was kept.
+        bounds: Where to look.
+
+    Returns:
+        None when the search is over.
+    """
+    if not kept:
+        return bounds.start
+    lost = min((rate for rate, good in kept.items() if not good), default=None)
+    best = max((r for r, good in kept.items() if good and (lost is None or r < lost)), default=None)
+    if lost is None:
+        assert best is not None
+        return best * 2 if best * 2 <= bounds.highest else None
+    if best is None:
+        return lost / 2 if lost / 2 >= bounds.lowest else None
+    # The gap was once as wide as the rate below it, which was `start`, doubled or halved.
+    first_gap = bounds.start * 2.0 ** math.floor(math.log2(best / bounds.start) + 1e-9)
+    is_wide = lost - best > first_gap / 2**bounds.halvings * 1.001
+    return (best + lost) / 2 if is_wide else None
+
+
+def next_trial(context: Context, search: Search, failed: Collection[str] = ()) -> Trial | None:
+    """What a search tries next.
+
+    Args:
+        context: Its journal holds the trials so far.
+        search: The search.
+        failed: Keys of the trials that count although they failed.
+
+    Returns:
+        None at the end of the search.
+    """
+    first = search.trial(search.bounds.start).sample
+    kept: dict[float, bool] = {}
+    for sample in context.journal.samples.values():
+        is_of_search = (
+            (sample.study, sample.backend, sample.repetition)
+            == (first.study, first.backend, first.repetition)
+            and search.axis in sample.case
+            and (sample.status == "ok" or sample.key in failed)
+        )
+        if not is_of_search:
+            continue
+        tried = float(sample.case[search.axis])
+        if sample.key == search.trial(tried).sample.key:
+            kept[tried] = verdict(sample) == "kept"
+    rate = next_rate(kept, search.bounds)
+    return None if rate is None else search.trial(rate)
+
+
+def take_turns(context: Context, searches: Iterable[Search]) -> None:
+    """Do the trials that some searches still need; the searches take turns."""
+    # A trial that failed is tried again by the next process, not by this one.
+    failed: set[str] = set()
+    waiting = list(searches)
+    while waiting:
+        waiting = [search for search in waiting if _try(context, search, failed)]
+
+
+def _try(context: Context, search: Search, failed: set[str]) -> bool:
+    """Do the next trial of a search.
+
+    Returns:
+        Whether there was one to do.
+    """
+    trial = next_trial(context, search, failed)
+    if trial is None:
+        return False
+    found = context.run(trial.sample, trial.load, seconds=trial.seconds, speed=trial.speed)
+    if found.status == "failed":
+        failed.add(found.key)
+    return found.status != "missing"
