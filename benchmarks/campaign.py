@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -30,7 +30,7 @@ class _Part(NamedTuple):
     """A part of a campaign.
 
     Attributes:
-        module: With `Settings`, `run` and `expected_seconds`.
+        module: With `STUDY`, `Settings`, `run` and `expected_seconds`.
         options: Those of the command line that its settings take.
     """
 
@@ -221,12 +221,7 @@ def _plan(name: str, choices: Choices) -> _Planned:
         "logs": _existing(choices.logs),
         "repetitions": choices.repetitions,
     }
-    known = {field.name for field in fields(usual)}
-    changed = {
-        option: asked[option]
-        for option in part.options
-        if option in known and asked[option] is not None
-    }
+    changed = {option: asked[option] for option in part.options if asked[option] is not None}
     return _Planned(name, module, replace(usual, **changed))
 
 
@@ -312,9 +307,9 @@ def _header(
 ) -> dict[str, Any]:
     from benchmarks.machine import describe
 
-    settings: dict[str, Any] = {}
-    for part in planned:
-        settings.update(part.settings.header())
+    settings: dict[str, dict[str, Any]] = {
+        part.module.STUDY: _plain(part.settings) for part in planned
+    }
     if "persistence" in settings:
         settings["persistence"]["speed"] = choices.speed
     return {
@@ -329,6 +324,12 @@ def _header(
         "command": list(command),
         **describe(),
     }
+
+
+def _plain(settings: Any) -> dict[str, Any]:
+    """Settings as a journal gives them back: its tuples are lists, its paths text."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(settings), default=str))
+    return plain
 
 
 def _see_that_it_fits(journal: Journal, header: Mapping[str, Any], out: Path) -> None:
@@ -357,9 +358,7 @@ def _sense(header: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in values.items():
             if name not in _MAY_GROW:
                 found[f"{study} {name}"] = value
-    # As the journal gives them back: tuples are lists there.
-    plain: dict[str, Any] = json.loads(json.dumps(found))
-    return plain
+    return found
 
 
 def _shown(value: object) -> str:

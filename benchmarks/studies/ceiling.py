@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from benchmarks.samples import Sample
 from benchmarks.studies.runs import Context, chosen, overhead_s
@@ -63,13 +63,6 @@ class Settings:
         if not quick:
             return cls()
         return cls(sizes=QUICK_SIZES, seconds=1.0, messages=20, halvings=0, repetitions=1)
-
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        values = asdict(self)
-        values["sizes"] = list(self.sizes)
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
 
     def messages_at(self, rate: float) -> int:
         """Messages on each topic in a trial."""

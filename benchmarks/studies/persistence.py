@@ -32,10 +32,6 @@ class Settings(LogSettings):
         """Those of a full or of a quick run: the beginning of each log that is made, once."""
         return cls(seconds=QUICK_SECONDS, chosen=False, repetitions=1) if quick else cls()
 
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        return {STUDY: self.to_json()}
-
 
 def plan(context: Context, settings: Settings | None = None) -> list[Case]:
     """All runs in the order in which they are done, those of the journal included.

@@ -8,7 +8,7 @@ is wrong makes the sample a failure.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.loads.hcr_like import hcr_like
@@ -55,12 +55,6 @@ class Settings:
     def usual(cls, *, quick: bool) -> Settings:
         """Those of a full or of a quick run."""
         return cls(sessions=1, minutes=4.0, repetitions=1) if quick else cls()
-
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        values = asdict(self)
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
 
 
 def plan(context: Context, settings: Settings | None = None) -> list[Turn]:

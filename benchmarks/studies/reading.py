@@ -8,7 +8,7 @@ decoded from the load itself.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.loads.mit_like import mit_like
@@ -51,12 +51,6 @@ class Settings:
     def usual(cls, *, quick: bool) -> Settings:
         """Those of a full or of a quick run."""
         return cls(seconds=2.0, repetitions=1) if quick else cls()
-
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        values = asdict(self)
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
 
 
 def plan(context: Context, settings: Settings | None = None) -> list[Turn]:

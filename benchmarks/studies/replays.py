@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,14 +107,6 @@ class LogSettings:
     logs: Sequence[Path] = ()
     chosen: bool = True
     backends: Sequence[str] | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """As values that JSON can hold."""
-        values = asdict(self)
-        values["made"] = list(self.made)
-        values["logs"] = [str(path) for path in self.logs]
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return values
 
     def replays(self, seed: int) -> list[Replay]:
         """The logs.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from benchmarks.samples import Sample
 from benchmarks.studies.replays import MADE, LogSettings, Replay
@@ -60,10 +59,6 @@ class Settings(LogSettings):
             halvings=0,
             repetitions=1,
         )
-
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        return {STUDY: self.to_json()}
 
 
 def expected_seconds(context: Context, settings: Settings | None = None) -> float:

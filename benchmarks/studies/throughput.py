@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -52,13 +52,6 @@ class Settings:
         if not quick:
             return cls()
         return cls(sizes=QUICK_SIZES, rates=QUICK_RATES, messages=20, repetitions=1)
-
-    def header(self) -> dict[str, Any]:
-        """What a journal says of these settings."""
-        values = asdict(self)
-        values["sizes"], values["rates"] = list(self.sizes), list(self.rates)
-        values["backends"] = None if self.backends is None else list(self.backends)
-        return {STUDY: values}
 
 
 class Case(NamedTuple):

@@ -128,7 +128,7 @@ def test_settings_of_a_quick_run(tmp_path: Path) -> None:
     full, quick = (persistence.Settings.usual(quick=quick) for quick in (False, True))
     assert (full.seconds, full.repetitions) == (60, 3)
     assert (quick.seconds, quick.repetitions) == (5, 1)
-    assert full.header()["persistence"]["made"] == list(MADE)
+    assert full.made == MADE
     context = model(tmp_path, quick=True)
     assert len(persistence.plan(context)) == 4 * 2
 
