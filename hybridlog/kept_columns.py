@@ -367,8 +367,8 @@ def _joined(
     times, seqs, columns = zip(*parts, strict=True)
     log_time, seq = np.concatenate(times), np.concatenate(seqs)
     fields = {path: _own(concatenate([part[path] for part in columns])) for path in columns[0]}
-    order = np.lexsort((seq, log_time))
-    if (order[1:] < order[:-1]).any():
+    if (log_time[1:] <= log_time[:-1]).any():
+        order = np.lexsort((seq, log_time))
         log_time, seq = log_time[order], seq[order]
         fields = {path: take(column, order) for path, column in fields.items()}
     return TopicColumns(log_time, seq, fields)
