@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from benchmarks.report.book import MB, Book, ends
@@ -27,13 +27,16 @@ class _Found:
         backend: Name.
         size: Bytes of a message.
         searches: One or more.
-        offered: MB/s; 0 is that of a search in which every rate was too much.
     """
 
     backend: str
     size: int
     searches: Sequence[Ceiling]
-    offered: Value
+
+    @property
+    def offered(self) -> Value:
+        """MB/s; 0 is that of a search in which every rate was too much."""
+        return self.of(lambda one: one.offered_bytes_s / MB)
 
     @property
     def is_none(self) -> bool:
@@ -48,7 +51,9 @@ class _Found:
 
     def of(self, measure: Callable[[Ceiling], float]) -> Value:
         """One measure of the searches."""
-        return _value(self.searches, measure)
+        found = Value.of(map(measure, self.searches))
+        assert found is not None
+        return found
 
 
 _Text = Callable[[_Found], str | None]
@@ -112,16 +117,7 @@ def _ceilings(book: Book) -> list[_Found]:
     searches: dict[tuple[str, int], list[Ceiling]] = {}
     for one in found_in(one for one in book.all if one.status != "missing"):
         searches.setdefault((one.backend, one.size), []).append(one)
-    return [
-        _Found(backend, bytes_, of, _value(of, lambda one: one.offered_bytes_s / MB))
-        for (backend, bytes_), of in searches.items()
-    ]
-
-
-def _value(searches: Iterable[Ceiling], measure: Callable[[Ceiling], float]) -> Value:
-    found = Value.of(map(measure, searches))
-    assert found is not None
-    return found
+    return [_Found(backend, bytes_, of) for (backend, bytes_), of in searches.items()]
 
 
 def _pair(of_size: Sequence[_Found]) -> tuple[_Found, _Found] | None:

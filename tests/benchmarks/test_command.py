@@ -366,7 +366,10 @@ def test_every_part_has_what_a_campaign_needs() -> None:
     for name, part in PARTS.items():
         module = import_module(part.module)
         for quick in (True, False):
-            assert isinstance(module.Settings.usual(quick=quick), module.Settings), name
+            settings = module.Settings.usual(quick=quick)
+            plain = campaign._plain(settings)
+            assert json.loads(json.dumps(plain)) == plain, name
+            assert plain.keys() == module.Settings.__dataclass_fields__.keys(), name
         assert set(part.options) <= module.Settings.__dataclass_fields__.keys(), name
         assert isinstance(module.STUDY, str)
         assert callable(module.run)

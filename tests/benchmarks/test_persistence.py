@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from benchmarks.backends.mcap_file import McapFile
 from benchmarks.backends.nothing import Nothing
+from benchmarks.campaign import _plain
 from benchmarks.loads.base import Load
 from benchmarks.loads.hcr_like import RIGHT_GRIPPER, TF, WEBCAM
 from benchmarks.loads.mit_like import KINECT_DEPTH
@@ -128,7 +129,8 @@ def test_settings_of_a_quick_run(tmp_path: Path) -> None:
     full, quick = (persistence.Settings.usual(quick=quick) for quick in (False, True))
     assert (full.seconds, full.repetitions) == (60, 3)
     assert (quick.seconds, quick.repetitions) == (5, 1)
-    assert full.made == MADE
+    assert _plain(full)["made"] == list(MADE)
+    assert _plain(replace(full, logs=[tmp_path]))["logs"] == [str(tmp_path)]
     context = model(tmp_path, quick=True)
     assert len(persistence.plan(context)) == 4 * 2
 

@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.backends.base import Backend
 from benchmarks.backends.nothing import Nothing
+from benchmarks.campaign import _plain
 from benchmarks.harness.run import Outcome, Setting
 from benchmarks.loads.base import Load
 from benchmarks.progress import Steps
@@ -62,6 +63,7 @@ def test_a_quick_plan_has_the_extremes_and_says_so(tmp_path: Path) -> None:
     assert streams == {(5000, 4), (5000, 64), (640_000, 4), (640_000, 64)}
     assert {case.sample.case["messages"] for case in cases} == {20}
     assert throughput.expected_seconds(quick) < 60
+    assert _plain(throughput.Settings.usual(quick=True))["messages"] == 20
 
 
 def test_another_speed_is_another_case(tmp_path: Path) -> None:
@@ -188,7 +190,7 @@ def test_directories_of_killed_runs_are_removed_and_others_are_not(tmp_path: Pat
 # Ceilings.
 
 
-def trial(backend: str, rate: float, repetition: int = 0, **values: float) -> Sample:
+def trial(backend: str, rate: float, **values: float) -> Sample:
     of_trial: Mapping[str, float] = {
         "published": 100,
         "persisted": 100,
@@ -199,7 +201,7 @@ def trial(backend: str, rate: float, repetition: int = 0, **values: float) -> Sa
         "wall_s": 2.0,
     }
     case = {"size": 5000, "rate": rate}
-    return Sample("ceiling", case, backend, repetition, values={**of_trial, **values})
+    return Sample("ceiling", case, backend, 0, values={**of_trial, **values})
 
 
 def test_ceilings_are_computed_from_samples() -> None:
@@ -244,9 +246,9 @@ def test_each_search_has_a_ceiling_of_its_own() -> None:
     samples = [
         trial("some", 64),
         trial("some", 128, **lost),
-        trial("some", 64, repetition=1),
-        trial("some", 128, repetition=1),
-        trial("some", 256, repetition=1, **lost),
+        replace(trial("some", 64), repetition=1),
+        replace(trial("some", 128), repetition=1),
+        replace(trial("some", 256, **lost), repetition=1),
         trial("nothing", 192, **lost),
     ]
     found = [one for one in ceiling.ceilings(samples) if one.backend == "some"]
