@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.entries import build_entry, new_key, recording_metadata
 from hybridlog.indexing import ChunkIndexer, IndexWriter, Lag
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -82,7 +83,8 @@ class Capture:
         lag = None
         if behind is not None and renew is not None:
             lag = Lag(recording, behind, renew)
-        self.index = IndexWriter(self.indexer, database, lag=lag)
+        self._gatherer = FieldGatherer(recording)
+        self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
@@ -130,6 +132,7 @@ class Capture:
         self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries())
         failure = self.index.failure
         if failure is None:
+            self._gatherer.close(self.entry)
             self.catalog = Catalog(self.index.database)
             try:
                 self.catalog.put_losses(self.entry.id, self.entry.end.get("losses", []))
@@ -139,6 +142,7 @@ class Capture:
                 self.catalog.put_recording(self.entry)
             except DatabaseError as error:
                 failure = error
+        self._gatherer.discard()
         self._held.close()
         return failure
 
@@ -146,12 +150,14 @@ class Capture:
         """Stop at once; what was flushed stays, and the next opening of the store seals it."""
         self.writer.abort()
         self.index.abandon()
+        self._gatherer.discard()
         self._held.close()
 
     def forget(self) -> None:
         """Take the whole recording back."""
         self.writer.abort()
         self.index.abandon()
+        self._gatherer.discard()
         # If the database is away too, the next opening finds an entry without files.
         with suppress(DatabaseError):
             collections = {collection_of(c.topic) for c in self.writer.channels.values()}

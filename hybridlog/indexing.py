@@ -31,6 +31,7 @@ from hybridlog_storage.segment_writer import OPEN_SUFFIX, SEALED_SUFFIX, StoredC
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.columns.gatherer import FieldGatherer
     from hybridlog_storage.database import Database
 
 ARRAY_LIMIT = 32
@@ -233,6 +234,7 @@ class IndexWriter:
         database: Where they go.
         backlog: Most chunks in memory, waiting or under way, before `submit` waits.
         lag: With it `submit` never waits: chunks beyond the backlog are read back.
+        gatherer: Gets each chunk of which documents are made.
     """
 
     def __init__(
@@ -242,6 +244,7 @@ class IndexWriter:
         *,
         backlog: int = 8,
         lag: Lag | None = None,
+        gatherer: FieldGatherer | None = None,
     ) -> None:
         self.failure: DatabaseError | None = None
         self.indexed = 0
@@ -251,6 +254,7 @@ class IndexWriter:
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
         self._indexer = indexer
         self._lag = lag
+        self._gatherer = gatherer
         self._forgotten: deque[_Forgotten] = deque()
         self._database = database
         self._catalog = Catalog(database)
@@ -409,6 +413,8 @@ class IndexWriter:
         if self._lag is not None:
             self._lag.wait()
         documents, entry = self._indexer.documents_of(chunk, channels)
+        if self._gatherer is not None:
+            self._gatherer.add(chunk, channels)
         self._parcel.add(documents, entry, len(chunk.batch))
         parcel = self._parcel
         if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:

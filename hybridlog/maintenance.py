@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hybridlog import field_indexes
+from hybridlog.columns.gatherer import FieldGatherer
+from hybridlog.columns.stored import FieldColumns
+from hybridlog.columns.topic import is_small
 from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
 from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry, schema_hash
@@ -137,26 +140,38 @@ def catch_up(
         _drop_dangling(database, recording_id, summaries)
         entries = catalog.chunks(recording_id)
     done = {(c.segment, c.offset) for c in entries}
+    gatherer = FieldGatherer(directory.recording(recording_id))
     index = IndexWriter(indexer, database)
-    added = 0
+    missing = places - done
+    # What is indexed already is missing in the columns all the same.
+    wanted = dict.fromkeys(missing, True)
+    wanted.update({(c.segment, c.offset): False for c in entries if _is_small(c)})
     try:
-        for chunk, channels in _chunks(directory, recording_id, summaries, done, progress):
-            index.submit(chunk, channels)
-            added += 1
+        for chunk, channels in _chunks(directory, recording_id, summaries, wanted, progress):
+            gatherer.add(chunk, channels)
+            if (chunk.segment, chunk.offset) in missing:
+                index.submit(chunk, channels)
+        index.close()
+        if index.failure is not None:
+            raise index.failure
+        chunks = catalog.chunks(recording_id)
+        whole = build_entry(directory, indexer, recording_id, chunks, summaries)
+        gatherer.close(whole)
     except BaseException:
         index.abandon()
+        gatherer.discard()
         raise
-    index.close()
-    if index.failure is not None:
-        raise index.failure
-    chunks = catalog.chunks(recording_id)
-    whole = build_entry(directory, indexer, recording_id, chunks, summaries)
     for channel in channels_of(summaries.values()).values():
         if channel.schema is not None:
             catalog.put_schema(channel.schema)
     catalog.put_losses(recording_id, whole.end.get("losses", []))
     catalog.put_recording(whole)
-    return added
+    return len(missing)
+
+
+def _is_small(chunk: ChunkEntry) -> bool:
+    stats = chunk.stats.values()
+    return is_small(sum(s.payload_bytes for s in stats), sum(s.messages for s in stats))
 
 
 def _drop_dangling(
@@ -289,6 +304,12 @@ def _verify_recording(
         whole = build_entry(directory, check.indexer, recording_id, chunks)
         if known[recording_id] != whole:
             check.found("catalog", "its entry differs from the segments; run `hybridlog reindex`")
+    try:
+        FieldColumns(directory.recording(recording_id)).check(known[recording_id])
+    except FileNotFoundError:
+        pass  # there need not be any
+    except StoreError as error:
+        check.found("columns", str(error))
 
 
 class _Check:
@@ -418,19 +439,37 @@ def _chunks(
     directory: StoreDirectory,
     recording_id: str,
     summaries: Mapping[int, SegmentSummary],
-    done: set[tuple[int, int]],
+    wanted: Mapping[tuple[int, int], bool],
     progress: Progress | None,
 ) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
-    """The chunks of a recording that are not done yet."""
+    """Chunks of a recording, in order.
+
+    Args:
+        directory: The store.
+        recording_id: The recording.
+        summaries: Of its segments.
+        wanted: Which chunks, by segment and offset, and whether each must be readable.
+        progress: Called after each.
+
+    Raises:
+        SegmentError: One that must be readable is not; others are left out.
+    """
     total = sum(p.stat().st_size for _, p in directory.segments(recording_id))
     before = 0
     for number, path in directory.segments(recording_id):
         summary = summaries[number]
         with SegmentReader(path, number) as reader:
             for place in summary.chunks:
-                if (number, place.offset) in done:
+                is_needed = wanted.get((number, place.offset))
+                if is_needed is None:
                     continue
-                yield reader.read_chunk(place), summary.channels
+                try:
+                    chunk = reader.read_chunk(place)
+                except SegmentError:
+                    if is_needed:
+                        raise
+                    continue
+                yield chunk, summary.channels
                 if progress is not None:
                     progress(recording_id, before + place.offset + place.length, total)
         before += path.stat().st_size

@@ -1008,7 +1008,7 @@ class Query:
         if database is None:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
-        from hybridlog.column_answers import judged
+        from hybridlog.columns.answers import judged
 
         total = 0
         left: list[tuple[str, Target]] = []

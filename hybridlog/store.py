@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog import field_indexes, maintenance
+from hybridlog.columns.kept import KeptColumns
+from hybridlog.columns.stored import FieldColumns
 from hybridlog.field_indexes import FieldIndex
-from hybridlog.kept_columns import KeptColumns
 from hybridlog.query.chunk_lists import ChunkLists
 from hybridlog.query.topics import resolve
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
@@ -117,6 +118,7 @@ class Store:
         self._recordings: list[RecordingEntry] | None = None
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
+        self._columns: dict[str, FieldColumns | None] = {}
         self._chunk_lists = ChunkLists()
         self.kept = KeptColumns(self)
         self._lock = threading.Lock()
@@ -183,6 +185,7 @@ class Store:
             for reader in self._segments.values():
                 reader.close()
             self._segments.clear()
+        self._columns.clear()
         self.disconnect()
 
     def database_for(self, purpose: str) -> Database:
@@ -216,6 +219,7 @@ class Store:
         """Forget what was read of the catalog."""
         self._recordings = None
         self._lanes.clear()
+        self._columns.clear()  # closed by the last thread that reads from them
         self._chunk_lists.clear()
         self.kept.clear()
 
@@ -343,6 +347,15 @@ class Store:
                 path = self.directory.recording(recording) / f"{number:06d}.mcap"
                 reader = self._segments[key] = SegmentReader(path, number)
             return reader
+
+    def columns(self, recording: str) -> FieldColumns | None:
+        """The columns that lie beside the segments of a recording; None without good ones."""
+        if recording not in self._columns:
+            found = None
+            with suppress(FileNotFoundError, StoreError):  # the index has the same
+                found = FieldColumns(self.directory.recording(recording))
+            self._columns[recording] = found
+        return self._columns[recording]
 
     # Changing.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.column_answers import Judged, judged
+from hybridlog.columns.answers import Judged, judged
 from hybridlog.frames import TableBuilder
 from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
 from hybridlog.indexing import rows_by_channel

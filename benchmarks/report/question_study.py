@@ -42,9 +42,10 @@ def section(book: Book) -> Section | None:
         "front, within a time window of half a second to either side, as in the paper's code.",
         "hybridlog has four rows: the paper's own MongoDB queries, unchanged, through pymongo, and "
         "the same questions through its own API; each without and with the paper's indexes.",
-        "Its API keeps fields that are asked about again in memory, so that its medians are those "
-        "of somebody who explores; the table of first times is of somebody who asks once. Each "
-        "of its rows begins with nothing kept.",
+        "Its API keeps fields that were asked about in memory, so that its medians are those of "
+        "somebody who explores; the table of first times is of somebody who asks once. Each of "
+        "its rows begins with nothing kept: what it finds are documents, segments, and the "
+        "columns that were laid down beside those when the load was recorded.",
         "Every backend was closed and opened again before it was asked. Rows of one backend share "
         "its server, whose caches the first of them fills. What took more than ten seconds was "
         "asked once.",

@@ -3,7 +3,7 @@
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
-  recordings/<id>/      segments of one recording; writer.lock while it is written
+  recordings/<id>/      segments of one recording, and columns; writer.lock while it is written
   mongod/               data of the embedded MongoDB
 ```
 """

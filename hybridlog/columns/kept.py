@@ -1,35 +1,42 @@
 """Fields of whole topics as columns in memory, for who asks about them again and again.
 
 A recording that has ended does not change. So a field of all its messages can be kept as
-an array, and what is asked of it next takes a pass over numbers. Getting it costs as much
-as some questions to MongoDB do; it is got when as much has been spent on such questions,
-so that nobody pays for columns that are never looked at again.
+an array, and what is asked of it next takes a pass over numbers. Where it lies in a file
+of columns, getting it costs less than one question to MongoDB; elsewhere it costs as much
+as some, and is got when as much has been spent on such questions, so that nobody pays for
+columns that are never looked at again.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.frames.accumulate import flatten
+from hybridlog.columns.topic import (
+    SINGLE_READ,
+    TopicColumns,
+    UnfitError,
+    in_order,
+    is_small,
+    nbytes,
+    singles,
+    types_of,
+)
 from hybridlog.frames.bson import records_from_bson
-from hybridlog.frames.text import repaired
 from hybridlog.indexing import rows_by_channel
-from hybridlog.query.column_filter import Single, is_single
 from hybridlog.query.plan import Sweep
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.column import Records, Scalars, Strings, concatenate, take
+from hybridlog.schema.column import concatenate
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.column_filter import Single
     from hybridlog.query.plan import Counters, Lane
     from hybridlog.reader import Query
     from hybridlog.store import Store
@@ -37,43 +44,32 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 256 << 20
 """Most memory that the columns of a store take; getting some takes up to four times theirs."""
-_SINGLE_READ = {"ros1", "cdr"}
-"""Encodings of which every message has every field, so that payloads tell what the index does."""
-_SMALL = SegmentSettings().large_payload
 _RECORD_BYTES = 40  # that a message takes in a chunk besides its payload, about
 # What things cost, in seconds, on a small machine; only their ratios matter.
 _QUESTION_S = 1e-3
 _LOOK_S = 0.6e-6  # at a document, by MongoDB
 _DOCUMENT_S = 4e-6  # sent by MongoDB and made a row
 _BYTE_S = 1.3e-9  # of a chunk, uncompressed, read
+_OPEN_S = 2e-4  # to find out what a file of columns has
+_STORED_BYTE_S = 1e-9  # of it, read
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TopicColumns:
-    """Fields of all messages of a topic in a recording, by log time and arrival.
+class _Way(NamedTuple):
+    """A way to get columns: what it costs, about, in seconds."""
 
-    Attributes:
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        fields: Columns of n rows by dotted path.
-    """
-
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-    fields: Mapping[str, Single]
-
-    def __len__(self) -> int:
-        """Number of messages."""
-        return len(self.log_time)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that they take."""
-        return self.log_time.nbytes + self.seq.nbytes + sum(map(_nbytes, self.fields.values()))
+    price: float
+    load: Callable[[Query, Mapping[str, str], bool], TopicColumns]
 
 
-class _UnfitError(Exception):
-    """These messages cannot be kept as columns."""
+class _Wanted(NamedTuple):
+    """What a question needs of a topic: fields, and perhaps their order."""
+
+    fields: frozenset[str]
+    ordered: bool
+
+    def is_in(self, columns: TopicColumns) -> bool:
+        has_order = columns.order is not None or not self.ordered
+        return has_order and self.fields <= columns.fields.keys()
 
 
 class KeptColumns:
@@ -136,8 +132,7 @@ class KeptColumns:
             return None
         if lanes[0].is_reduced or not lanes[0].codec.indexed:
             return None
-        paths = lanes[0].codec.paths()
-        return {p.path: p.type for p in paths if not p.array and is_single(p.type)}
+        return types_of(lanes[0].codec)
 
     def find(
         self,
@@ -145,6 +140,7 @@ class KeptColumns:
         recordings: Sequence[RecordingEntry],
         fields: Collection[str],
         *,
+        ordered: bool,
         instead_s: float,
         counters: Counters,
     ) -> list[TopicColumns] | None:
@@ -154,10 +150,11 @@ class KeptColumns:
             topic: Full name.
             recordings: Those wanted, all of which `types` knows the fields of.
             fields: Paths.
+            ordered: Whether log times and arrival numbers are wanted, too.
             instead_s: What the answer costs without them, see `cost_s`.
             counters: Get what is read.
         """
-        wanted = frozenset(fields)
+        wanted = _Wanted(frozenset(fields), ordered)
         with self._lock:
             generation = self._generation
             found, missing = self._look(topic, recordings, wanted)
@@ -171,7 +168,7 @@ class KeptColumns:
                 for recording in missing:
                     try:
                         self._add(found, recording, topic, wanted, counters)
-                    except _UnfitError:
+                    except UnfitError:
                         with self._lock:
                             if generation == self._generation:
                                 self._unfit.add((recording.id, topic))
@@ -180,7 +177,7 @@ class KeptColumns:
         return [found[recording.id, topic] for recording in recordings]
 
     def _look(
-        self, topic: str, recordings: Sequence[RecordingEntry], wanted: frozenset[str]
+        self, topic: str, recordings: Sequence[RecordingEntry], wanted: _Wanted
     ) -> tuple[dict[tuple[str, str], TopicColumns], list[RecordingEntry]]:
         """What is kept, and recordings of which something is missing."""
         keys = [(recording.id, topic) for recording in recordings]
@@ -190,7 +187,7 @@ class KeptColumns:
         missing = [
             recording
             for recording, key in zip(recordings, keys, strict=True)
-            if key not in found or not wanted <= found[key].fields.keys()
+            if key not in found or not wanted.is_in(found[key])
         ]
         return found, missing
 
@@ -199,7 +196,7 @@ class KeptColumns:
         found: dict[tuple[str, str], TopicColumns],
         recording: RecordingEntry,
         topic: str,
-        wanted: frozenset[str],
+        wanted: _Wanted,
         counters: Counters,
     ) -> None:
         """Get what is missing of a recording."""
@@ -208,26 +205,27 @@ class KeptColumns:
         if kept is None:
             found[key] = self._load(recording, topic, wanted, counters)
             return
-        loaded = self._load(recording, topic, wanted - kept.fields.keys(), counters)
+        missing = _Wanted(wanted.fields - kept.fields.keys(), wanted.ordered and not kept.order)
+        loaded = self._load(recording, topic, missing, counters)
         fields = {**kept.fields, **loaded.fields}
-        if sum(map(_nbytes, fields.values())) > self.most_bytes / 2:
-            fields = {path: fields[path] for path in wanted}  # so that these at least have room
-        found[key] = TopicColumns(kept.log_time, kept.seq, fields)
+        if sum(map(nbytes, fields.values())) > self.most_bytes / 2:
+            fields = {path: fields[path] for path in wanted.fields}  # these at least have room
+        found[key] = TopicColumns(kept.rows, kept.order or loaded.order, fields)
 
     def _is_worth(
         self,
         topic: str,
         recordings: Sequence[RecordingEntry],
         missing: Sequence[RecordingEntry],
-        fields: Collection[str],
+        wanted: _Wanted,
         instead_s: float,
     ) -> bool:
         """Whether to get columns now: enough was spent, and all of them have room together."""
         if any((recording.id, topic) in self._unfit for recording in recordings):
             return False
-        if sum(self._size(r, topic, fields) for r in recordings) > self.most_bytes:
+        if sum(self._size(r, topic, wanted.fields) for r in recordings) > self.most_bytes:
             return False
-        price = sum(min(self._prices(recording, topic)) for recording in missing)
+        price = sum(self._ways(r, topic, wanted)[0].price for r in missing)
         # An answer that alone costs twice as much as the columns is worth them at once.
         if self._spent[topic] + instead_s / 2 < price:
             self._spent[topic] += instead_s
@@ -242,46 +240,51 @@ class KeptColumns:
         text = sum(s.payload_bytes for s in recording.stats_of(topic)) if has_text else 0
         return recording.messages_of(topic) * 8 * (2 + len(fields)) + text
 
-    def _prices(self, recording: RecordingEntry, topic: str) -> tuple[float, float]:
-        """What columns cost out of the segments, and out of the index, seconds."""
-        from_index = _QUESTION_S + _DOCUMENT_S * recording.messages_of(topic)
+    def _ways(self, recording: RecordingEntry, topic: str, wanted: _Wanted) -> list[_Way]:
+        """How columns can be got, the cheapest way first."""
+        messages = recording.messages_of(topic)
+        ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, _from_index)]
+        file, size = self._store.columns(recording.id), None
+        if file is not None:
+            size = file.size(topic, wanted.fields, messages, ordered=wanted.ordered)
+        if size is not None:
+            ways.append(_Way(_OPEN_S + _STORED_BYTE_S * size, _from_file))
         encodings = {lane.channel.message_encoding for lane in self._lanes(recording, topic)}
-        if not encodings <= _SINGLE_READ:
-            return np.inf, from_index
-        # Small messages of all topics share chunks, large ones have their own.
-        is_own = any(_is_large(stats) for stats in recording.stats_of(topic))
-        read = [
-            c.stats
-            for c in recording.channels
-            if c.topic == topic or not (is_own or _is_large(c.stats))
-        ]
-        size = sum(s.payload_bytes + _RECORD_BYTES * s.messages for s in read)
-        return _QUESTION_S + _BYTE_S * size, from_index
+        if encodings <= SINGLE_READ:
+            # Small messages of all topics share chunks, large ones have their own.
+            is_own = not all(map(_is_small, recording.stats_of(topic)))
+            read = [
+                c.stats
+                for c in recording.channels
+                if c.topic == topic or (_is_small(c.stats) and not is_own)
+            ]
+            size = sum(s.payload_bytes + _RECORD_BYTES * s.messages for s in read)
+            ways.append(_Way(_QUESTION_S + _BYTE_S * size, _from_segments))
+        return sorted(ways, key=lambda way: way.price)
 
     def _load(
         self,
         recording: RecordingEntry,
         topic: str,
-        fields: frozenset[str],
+        wanted: _Wanted,
         counters: Counters,
     ) -> TopicColumns:
-        from_segments, from_index = self._prices(recording, topic)
-        load = _from_segments if from_segments < from_index else _from_index
         known = self.types(recording, topic) or {}
-        if not fields <= known.keys():
-            raise _UnfitError  # all was forgotten meanwhile, and the recording is another one
+        if not wanted.fields <= known.keys():
+            raise UnfitError  # all was forgotten meanwhile, and the recording is another one
         assert recording.span is not None
         first, last = recording.span
         query = self._store.query([topic], [recording.id])
         if last + 1 < TIME_LIMIT:
             # The documents of other recordings need not be looked at.
             query = query.between(f"{first}ns", f"{last + 1}ns")
-        columns = load(query, {path: known[path] for path in fields})
+        load = self._ways(recording, topic, wanted)[0].load
+        columns = load(query, {path: known[path] for path in wanted.fields}, wanted.ordered)
         counters.bytes_read += query.counters.bytes_read
         counters.chunks_read += query.counters.chunks_read
         counters.documents_read += query.counters.documents_read
-        if len(columns) != recording.messages_of(topic) or columns.fields.keys() != fields:
-            raise _UnfitError
+        if len(columns) != recording.messages_of(topic) or columns.fields.keys() != wanted.fields:
+            raise UnfitError
         return columns
 
     def _keep(self, found: Mapping[tuple[str, str], TopicColumns], generation: int) -> None:
@@ -311,7 +314,21 @@ def cost_s(messages: float, *, windows: int = 1, as_rows: bool = False) -> float
     return _QUESTION_S * (1 + windows / 14) + messages * (_DOCUMENT_S if as_rows else _LOOK_S)
 
 
-def _from_segments(query: Query, types: Mapping[str, str]) -> TopicColumns:
+def _from_file(query: Query, types: Mapping[str, str], ordered: bool) -> TopicColumns:  # noqa: FBT001
+    """Columns that were laid down with the recording."""
+    (topic,), (recording,) = query.topics, query.recording_ids
+    file = query.store.columns(recording)
+    if file is None:
+        raise UnfitError
+    try:
+        columns = file.read(topic, types, ordered=ordered)
+    except StoreError as error:
+        raise UnfitError from error  # the index has what is damaged here
+    query.counters.bytes_read += file.size(topic, types, len(columns), ordered=ordered) or 0
+    return columns
+
+
+def _from_segments(query: Query, types: Mapping[str, str], _: object) -> TopicColumns:
     """Columns out of payloads."""
     plan = query.plan()
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Single]]] = []
@@ -323,14 +340,14 @@ def _from_segments(query: Query, types: Mapping[str, str]) -> TopicColumns:
                     batch.buffer, batch.offset, batch.length, types.keys()
                 )
                 if decoded.unreadable:
-                    raise _UnfitError
-                parts.append((batch.log_time, seq, _singles(decoded.records, types)))
+                    raise UnfitError
+                parts.append((batch.log_time, seq, singles(decoded.records, types)))
     except SegmentError as error:
-        raise _UnfitError from error  # the index has what is damaged here
+        raise UnfitError from error  # the index has what is damaged here
     return _joined(parts)
 
 
-def _from_index(query: Query, types: Mapping[str, str]) -> TopicColumns:
+def _from_index(query: Query, types: Mapping[str, str], _: object) -> TopicColumns:
     """Columns out of index documents."""
     projection = {"_id": 1, **dict.fromkeys(types, 1)}
     (topic,) = query.topics
@@ -339,55 +356,25 @@ def _from_index(query: Query, types: Mapping[str, str]) -> TopicColumns:
         for raw, _, _ in query.thinned_documents(topic, projection):
             found = records_from_bson(raw, types)
             if len(found) > 1:
-                raise _UnfitError  # some messages lack a field
+                raise UnfitError  # some messages lack a field
             for part in found:
-                singles = _singles(part.records, types)
-                parts.append((part.reference.t, part.reference.seq, singles))
+                fields = singles(part.records, types)
+                parts.append((part.reference.t, part.reference.seq, fields))
     except StoreError as error:
-        raise _UnfitError from error
+        raise UnfitError from error
     return _joined(parts)
-
-
-def _singles(records: Records, paths: Collection[str]) -> dict[str, Single]:
-    leaves = flatten(records)
-    found: dict[str, Single] = {}
-    for path in paths:
-        leaf = leaves.get(path)
-        if not isinstance(leaf, Single):
-            raise _UnfitError
-        found[path] = leaf
-    return found
 
 
 def _joined(
     parts: Sequence[tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Single]]],
 ) -> TopicColumns:
     if not parts:
-        raise _UnfitError
+        raise UnfitError
     times, seqs, columns = zip(*parts, strict=True)
     log_time, seq = np.concatenate(times), np.concatenate(seqs)
-    fields = {path: _own(concatenate([part[path] for part in columns])) for path in columns[0]}
-    if (log_time[1:] <= log_time[:-1]).any():
-        order = np.lexsort((seq, log_time))
-        log_time, seq = log_time[order], seq[order]
-        fields = {path: take(column, order) for path, column in fields.items()}
-    return TopicColumns(log_time, seq, fields)
+    fields = {path: concatenate([part[path] for part in columns]) for path in columns[0]}
+    return in_order(log_time, seq, fields)
 
 
-def _own(column: Single) -> Single:
-    """A column as the index has it: text that is UTF-8, and booleans of two bytes only."""
-    if isinstance(column, Strings):
-        return repaired(column)
-    if column.values.dtype == np.bool_:
-        return Scalars(column.values.view(np.uint8) != 0)
-    return column
-
-
-def _nbytes(column: Single) -> int:
-    if isinstance(column, Strings):
-        return column.data.nbytes + column.offset.nbytes
-    return column.values.nbytes
-
-
-def _is_large(stats: ChannelStats) -> bool:
-    return stats.payload_bytes >= _SMALL * max(stats.messages, 1)
+def _is_small(stats: ChannelStats) -> bool:
+    return is_small(stats.payload_bytes, stats.messages)

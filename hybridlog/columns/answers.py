@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.kept_columns import TopicColumns, cost_s
+from hybridlog.columns.kept import cost_s
+from hybridlog.columns.topic import TopicColumns
 from hybridlog.query.column_filter import ColumnFilter, column_filter
 from hybridlog.schema.column import ranges, take
 
@@ -102,7 +103,12 @@ def judged(
         wanted |= found.fields
         recordings.append(recording)
     columns = store.kept.find(
-        topic, recordings, wanted, instead_s=instead_s, counters=query.counters
+        topic,
+        recordings,
+        wanted,
+        ordered=as_rows or spans is not None,
+        instead_s=instead_s,
+        counters=query.counters,
     )
     if columns is None:
         return None

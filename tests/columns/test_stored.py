@@ -1,0 +1,296 @@
+"""Columns beside the segments: made with the recording, right or not there at all."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.columns import gatherer as gathering
+from hybridlog.columns.gatherer import FieldGatherer
+from hybridlog.columns.stored import NAME, FieldColumns
+from hybridlog.schema.column import Strings
+from hybridlog_storage import column_file
+from hybridlog_storage.catalog import CHUNKS, RECORDINGS
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.columns.test_kept import BASE, DEFINITION, SECOND, message, usual, write_log
+from tests.data import DATA, needs_data
+
+CHANNEL = Channel("/state", "ros1", Schema("test/State", "ros1msg", DEFINITION))
+OTHER = Channel("/other", "ros1", Schema("std_msgs/Int32", "ros1msg", b"int32 data"))
+
+SMALL_CHUNKS = SegmentSettings(chunk_size=1024)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        yield opened
+
+
+@pytest.fixture
+def recorded(store: hl.Store, tmp_path: Path) -> hl.Store:
+    """A recording of sixty messages of two topics, in many chunks."""
+    rows = [
+        (BASE + n % 7 * SECOND, "/other" if n % 5 == 0 else "/state", message(usual(i8=n % 3)))
+        for n in range(60)
+    ]
+    write_log(tmp_path / "log.mcap", rows)
+    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+    return store
+
+
+def file_of(store: hl.Store, recording: str = "log") -> Path:
+    return store.directory.recording(recording) / NAME
+
+
+def value_of(document: dict[str, Any], path: str) -> Any:
+    found: Any = document
+    for name in path.split("."):
+        found = found[name]
+    return found
+
+
+def alike(one: Any, other: Any) -> bool:
+    both_nan = one != one and other != other
+    return both_nan or one == other
+
+
+def compare_with_documents(store: hl.Store) -> int:
+    """Every column of every recording with what MongoDB has; returns how many there are."""
+    compared = 0
+    for entry in store.recordings():
+        columns = store.columns(entry.id)
+        if columns is None:
+            continue
+        for topic in {c.topic for c in entry.channels}:
+            types = store.kept.types(entry, topic)
+            messages = entry.messages_of(topic)
+            if not types or columns.size(topic, types, messages, ordered=True) is None:
+                continue
+            found = columns.read(topic, types, ordered=True)
+            documents = list(store.query([topic], [entry.id]).documents())
+            assert found.log_time.tolist() == [d["_meta"]["t"] for d in documents]
+            assert found.seq.tolist() == [d["_meta"]["seq"] for d in documents]
+            for path, column in found.fields.items():
+                want = [value_of(d, path) for d in documents]
+                have = texts(column) if isinstance(column, Strings) else column.values.tolist()
+                assert all(map(alike, have, want)), (topic, path)
+                assert len(have) == len(want)
+                compared += 1
+    return compared
+
+
+def texts(column: Strings) -> list[str]:
+    cells = zip(column.offset[:-1].tolist(), column.offset[1:].tolist(), strict=True)
+    return [column.data[a:b].tobytes().decode() for a, b in cells]
+
+
+REAL = ["auv_ros2.mcap", "robot_localization_test3.bag", "tilt_laser.bag"]
+
+
+@needs_data
+@pytest.mark.parametrize("name", REAL)
+def test_columns_of_real_logs_are_what_the_index_has(store: hl.Store, name: str) -> None:
+    (log,) = DATA.glob(f"**/{name}")
+    store.record(log, name="log")
+    assert compare_with_documents(store) > 5
+
+
+@pytest.mark.parametrize(
+    ("arena", "enough", "rows"),
+    [(2 << 20, 1 << 20, 1 << 18), (500, 400, 1 << 18), (500, 250, 3), (1, 1, 1)],
+)
+def test_columns_are_what_the_index_has(
+    store: hl.Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arena: int,
+    enough: int,
+    rows: int,
+) -> None:
+    monkeypatch.setattr(gathering, "_ARENA", arena)
+    monkeypatch.setattr(gathering, "_ENOUGH", enough)
+    monkeypatch.setattr(gathering, "_ROWS", rows)
+    said = [
+        (BASE + n * 7 % 11, "/other" if n % 4 == 0 else "/state", message(usual(i64=n)))
+        for n in range(40)
+    ]
+    write_log(tmp_path / "log.mcap", said)
+    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+    assert compare_with_documents(store) == 2 * 10
+
+
+def test_the_first_question_is_answered_from_the_file(recorded: hl.Store) -> None:
+    query = recorded.topic("/state").where("i8 == 1")
+    assert query.count() == 16
+    assert query.counters.bytes_read > 0
+    assert query.counters.documents_read == query.counters.chunks_read == 0
+    assert recorded.kept._kept
+
+
+def live(store: hl.Store, count: int = 50, **options: Any) -> str:
+    with store.start("live", **options) as recording:
+        for n in range(count):
+            recording.write(CHANNEL, message(usual(i64=n)), log_time=BASE + n)
+            recording.write(OTHER, n.to_bytes(4, "little"), log_time=BASE + n)
+    return recording.id
+
+
+def test_a_live_recording_has_columns(store: hl.Store) -> None:
+    live(store, flush_interval_s=0.01)
+    assert compare_with_documents(store) == 11
+
+
+def test_while_a_recording_goes_on_there_are_none(store: hl.Store) -> None:
+    with store.start("live") as recording:
+        recording.write(CHANNEL, message(usual()))
+        assert store.columns(recording.id) is None
+        assert not file_of(store, recording.id).exists()
+    assert store.columns(recording.id) is not None
+
+
+def test_a_recording_that_is_taken_back_leaves_nothing(store: hl.Store) -> None:
+    recording = store.start("live")
+    recording.write(CHANNEL, message(usual()))
+    recording.abort()
+    assert not list((store.directory.path / "recordings").iterdir())
+
+
+def test_reindex_makes_them_again(recorded: hl.Store) -> None:
+    before = file_of(recorded).read_bytes()
+    file_of(recorded).unlink()
+    recorded.refresh()
+    assert recorded.topic("/state").where("i8 == 1").count() == 16
+    recorded.reindex()
+    assert file_of(recorded).read_bytes() == before
+    assert compare_with_documents(recorded) == 20
+
+
+def test_what_a_crash_has_left_gets_all_its_columns(recorded: hl.Store) -> None:
+    database = recorded.database_for("This")
+    path = recorded.directory.path
+    before = file_of(recorded).read_bytes()
+    # As if the recorder had been killed: some chunks are indexed, and the end is missing.
+    half = recorded.catalog.chunks("log")[1::2]
+    for chunk in half:
+        database.delete(CHUNKS, {"_id.off": chunk.offset})
+    entry = database.find_one(RECORDINGS, {"_id": "log"})
+    assert entry is not None
+    database.replace(RECORDINGS, {"_id": "log"}, {**entry, "status": "open"})
+    file_of(recorded).rename(path / f"recordings/log/{NAME}.part")
+    recorded.close()
+    with hl.open(path, require_database=True) as again:
+        assert again.tended.indexed == {"log": len(half)}
+        assert file_of(again).read_bytes() == before
+        assert compare_with_documents(again) == 20
+    assert not list(path.glob("**/*.part"))
+
+
+def test_damage_is_found_told_and_mended(recorded: hl.Store) -> None:
+    file = file_of(recorded)
+    content = bytearray(file.read_bytes())
+    content[20] ^= 1
+    file.write_bytes(content)
+    recorded.refresh()
+    assert [recorded.topic("/state").where("i8 == 1").count() for _ in range(3)] == [16] * 3
+    assert recorded.topic("/state").fields("i8").to_pandas()["i8"].sum() == 48
+    (finding,) = recorded.verify().findings
+    assert finding.place == "columns"
+    assert str(file) in finding.problem
+    assert "hybridlog reindex" in finding.problem
+    recorded.reindex()
+    assert not recorded.verify().findings
+
+
+def test_columns_of_other_messages_are_not_believed(recorded: hl.Store, tmp_path: Path) -> None:
+    write_log(tmp_path / "more.mcap", [(BASE, "/state", message(usual(i8=1)))], "more")
+    recorded.record(tmp_path / "more.mcap", name="more")
+    shutil.copy(file_of(recorded, "more"), file_of(recorded))
+    recorded.refresh()
+    assert recorded.topic("/state").where("i8 == 1").count() == 17
+    (finding,) = recorded.verify().findings
+    assert "1 messages of /state, the segments 48" in finding.problem
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2])
+def test_no_room_for_columns_is_no_loss(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int
+) -> None:
+    write = column_file.durability.write_all
+    room = [writes]
+
+    def scarce(fd: int, parts: Any) -> int:
+        room[0] -= 1
+        if room[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(fd, parts)
+
+    class Scarce:
+        write_all = staticmethod(scarce)
+
+    monkeypatch.setattr(column_file, "durability", Scarce)
+    write_log(tmp_path / "log.mcap", [(BASE, "/state", message(usual(i8=1)))])
+    report = store.record(tmp_path / "log.mcap", name="log")
+    assert room[0] < 0
+    assert report.entry.status == "complete"
+    assert store.columns("log") is None
+    assert not list(store.directory.path.glob(f"**/{NAME}*"))
+    assert store.topic("/state").where("i8 == 1").count() == 1
+
+
+def test_topics_that_do_not_fit_have_no_columns(store: hl.Store, tmp_path: Path) -> None:
+    rows = [(BASE + n, "/state", message(usual())) for n in range(4)]
+    rows += [(BASE + 9, "/other", message(usual())), (BASE + 10, "/other", b"torn")]
+    write_log(tmp_path / "log.mcap", rows)
+    store.record(tmp_path / "log.mcap", name="log")
+    columns = FieldColumns(store.directory.recording("log"))
+    assert columns.size("/state", ["i8"], 4, ordered=False)
+    assert columns.size("/state", ["many"], 4, ordered=False) is None
+    assert columns.size("/state", ["i8"], 5, ordered=False) is None
+    assert columns.size("/other", ["i8"], 2, ordered=False) is None
+
+
+def test_a_topic_of_two_types_has_no_columns(store: hl.Store) -> None:
+    with store.start("live") as recording:
+        for n in range(3):
+            recording.write(CHANNEL, message(usual()), log_time=BASE + n)
+            recording.write(
+                Channel("/state", "ros1", OTHER.schema), bytes(4), log_time=BASE + 10 + n
+            )
+            recording.write(OTHER, bytes(4), log_time=BASE + 20 + n)
+    columns = FieldColumns(store.directory.recording(recording.id))
+    assert columns.size("/state", [], 6, ordered=False) is None
+    assert columns.size("/other", ["data"], 3, ordered=False)
+
+
+def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Path) -> None:
+    entry = recorded.recordings()[0]
+    place = tmp_path / "again"
+    place.mkdir()
+    gatherer = FieldGatherer(place)
+    channels = {lane.channel_id: lane.channel for lane in recorded.lanes(entry)}
+    for chunk in recorded.catalog.chunks("log"):
+        read = recorded.segment("log", chunk.segment).read_chunk(chunk.place)
+        gatherer.add(read, channels)
+        gatherer.add(read, channels)
+    gatherer.close(entry)
+    assert not list(place.iterdir())
+
+
+def test_large_messages_have_no_columns(store: hl.Store) -> None:
+    image = Channel(
+        "/image", "ros1", Schema("test/Image", "ros1msg", b"uint32 width\nuint8[] data")
+    )
+    with store.start("live") as recording:
+        for n in range(5):
+            payload = (640).to_bytes(4, "little") + (2000).to_bytes(4, "little") + bytes(2000)
+            recording.write(image, payload, log_time=BASE + n)
+    assert not file_of(store, recording.id).exists()
+    assert store.topic("/image").where("width == 640").count() == 5
