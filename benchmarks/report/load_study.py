@@ -25,7 +25,7 @@ from benchmarks.report.look import FLOORS, OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number, percent
 from benchmarks.samples import Sample
-from benchmarks.studies.search import Verdict, verdict
+from benchmarks.studies.search import Verdict, bracket, verdict
 
 STUDY = "persistence"
 FASTER = "speed-up"
@@ -110,14 +110,10 @@ def _bound(samples: Sequence[Sample]) -> str:
 
 
 def _greatest(trials: Sequence[Sample]) -> tuple[float, Verdict]:
-    """The greatest speed below the first that was not kept, 0 for none, and what ended it."""
-    greatest = 0.0
-    for (speed,), (trial, *_) in by_case(trials, SPEED).items():
-        found = verdict(trial)
-        if found != "kept":
-            return greatest, found
-        greatest = float(speed)
-    return greatest, "kept"
+    """The greatest speed below all that were not kept, 0 for none, and what ended it."""
+    verdicts = {float(trial.case[SPEED]): verdict(trial) for trial in trials}
+    greatest, lost = bracket({speed: found == "kept" for speed, found in verdicts.items()})
+    return greatest or 0.0, "kept" if lost is None else verdicts[lost]
 
 
 def findings(book: Book) -> list[str]:

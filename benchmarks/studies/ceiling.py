@@ -15,6 +15,7 @@ from benchmarks.studies.search import (
     Bounds,
     Search,
     Trial,
+    bracket,
     next_trial,
     take_turns,
     verdict,
@@ -120,18 +121,9 @@ def ceilings(samples: Iterable[Sample]) -> list[Ceiling]:
 def _ceiling(
     backend: str, size: int, repetition: int, trials: Sequence[Sample], harness: Sequence[Sample]
 ) -> Ceiling:
-    verdicts = {float(trial.case[_RATE]): verdict(trial) for trial in trials}
-    lost_rate = min((rate for rate, found in verdicts.items() if found != "kept"), default=None)
-    best = max(
-        (
-            trial
-            for trial in trials
-            if verdict(trial) == "kept"
-            and (lost_rate is None or float(trial.case[_RATE]) < lost_rate)
-        ),
-        key=lambda trial: float(trial.case[_RATE]),
-        default=None,
-    )
+    by_rate = {float(trial.case[_RATE]): trial for trial in trials}
+    verdicts = {rate: verdict(trial) for rate, trial in by_rate.items()}
+    rate, lost_rate = bracket({rate: found == "kept" for rate, found in verdicts.items()})
     limit: Literal["backend", "harness", "plan"] = "backend"
     if lost_rate is None:
         limit = "plan"
@@ -140,14 +132,14 @@ def _ceiling(
     ):
         # The harness with a backend that keeps nothing does no better.
         limit = "harness"
-    if best is None:
+    if rate is None:
         return Ceiling(backend, size, repetition, None, 0.0, 0.0, lost_rate, limit)
-    values = best.values
+    values = by_rate[rate].values
     return Ceiling(
         backend,
         size,
         repetition,
-        float(best.case[_RATE]),
+        rate,
         values["published_bytes"] / values["publish_s"],
         values["persisted_bytes"] / values["wall_s"],
         lost_rate,

@@ -87,6 +87,21 @@ def verdict(sample: Sample) -> Verdict:
     return "late" if late > _LATE_SHARE * values["due_s"] + _LATE_S else "kept"
 
 
+def bracket(kept: Mapping[float, bool]) -> tuple[float | None, float | None]:
+    """Between which rates the limit lies.
+
+    Args:
+        kept: Of the rates that were tried, whether all was kept.
+
+    Returns:
+        The greatest rate that was kept below all that were not, and the least that was
+        not; None for each that there is not. Luck above a loss does not count.
+    """
+    lost = min((rate for rate, good in kept.items() if not good), default=None)
+    below = (rate for rate, good in kept.items() if good and (lost is None or rate < lost))
+    return max(below, default=None), lost
+
+
 def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     """The rate to try next.
 
@@ -99,8 +114,7 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     """
     if not kept:
         return bounds.start
-    lost = min((rate for rate, good in kept.items() if not good), default=None)
-    best = max((r for r, good in kept.items() if good and (lost is None or r < lost)), default=None)
+    best, lost = bracket(kept)
     if lost is None:
         assert best is not None
         return best * 2 if best * 2 <= bounds.highest else None
