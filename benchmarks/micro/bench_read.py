@@ -72,6 +72,19 @@ def bench_again(case: str, store: Any, benchmark: Any) -> None:
     assert benchmark(ask, store) == answer
 
 
+@pytest.mark.parametrize("case", AGAIN)
+def bench_first(case: str, store: Any, benchmark: Any) -> None:
+    """The same when only the catalog was read before."""
+    ask = AGAIN[case]
+
+    def forget() -> None:
+        store.kept.clear()
+
+    answer = ask(store)
+    found = benchmark.pedantic(ask, (store,), setup=forget, rounds=30, warmup_rounds=1)
+    assert found == answer
+
+
 DECODED = {
     "imu": (IMU, "/imu/data", 5000),
     "scan": (DRIVE, "/scan", 80),

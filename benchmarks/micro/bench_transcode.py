@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.micro.inputs import DRIVE, SMALL, read
+from benchmarks.micro.inputs import DRIVE, IMU, SMALL, read
 from benchmarks.micro.isolation import need
 
 CASES = {
@@ -27,17 +27,8 @@ def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
     stream = read(bags / name, topic, count)
     codec_for = need("hybridlog.schema.codec", "codec_for").codec_for
     found = need("hybridlog_storage.index_documents", "DocumentAssembler", "Origin")
-    stored_chunk = need("hybridlog_storage.segment_writer", "StoredChunk").StoredChunk
     batch: Any = stream.batches(count)[0]
-    chunk = stored_chunk(
-        segment=1,
-        offset=4096,
-        length=len(batch.buffer),
-        trailer=0,
-        batch=batch,
-        seq=np.arange(count),
-        compressed_size=len(batch.buffer),
-    )
+    chunk = _chunk(batch)
     codec = codec_for(stream.channel())
     assembler = found.DocumentAssembler(found.Origin("recording", 1, topic, False))
 
@@ -50,3 +41,30 @@ def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
         return documents
 
     assert benchmark(transcode) == count
+
+
+def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:
+    """Fields of small messages to the columns beside the segments."""
+    stream = read(bags / IMU, "/imu/data", 5000)
+    found = need("hybridlog.columns.gatherer", "FieldGatherer")
+    batch: Any = stream.batches(5000)[0]
+    gatherer = found.FieldGatherer(tmp_path)
+    channels = dict.fromkeys(batch.channel.tolist(), stream.channel())
+    # So much is decoded at once, and not put together with more.
+    assert len(batch.buffer) > 1 << 20
+    benchmark.pedantic(gatherer.add, (_chunk(batch), channels), rounds=50, warmup_rounds=1)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) > 50 * 5000 * 8
+    gatherer.discard()
+
+
+def _chunk(batch: Any) -> Any:
+    """A chunk of these messages."""
+    return need("hybridlog_storage.segment_writer", "StoredChunk").StoredChunk(
+        segment=1,
+        offset=4096,
+        length=len(batch.buffer),
+        trailer=0,
+        batch=batch,
+        seq=np.arange(len(batch)),
+        compressed_size=len(batch.buffer),
+    )
