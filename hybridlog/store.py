@@ -219,7 +219,8 @@ class Store:
         """Forget what was read of the catalog."""
         self._recordings = None
         self._lanes.clear()
-        self._columns.clear()  # closed by the last thread that reads from them
+        with self._lock:
+            self._columns.clear()  # closed by the last thread that reads from them
         self._chunk_lists.clear()
         self.kept.clear()
 
@@ -350,12 +351,13 @@ class Store:
 
     def columns(self, recording: str) -> FieldColumns | None:
         """The columns that lie beside the segments of a recording; None without good ones."""
-        if recording not in self._columns:
-            found = None
-            with suppress(FileNotFoundError, StoreError):  # the index has the same
-                found = FieldColumns(self.directory.recording(recording))
-            self._columns[recording] = found
-        return self._columns[recording]
+        with self._lock:
+            if recording not in self._columns:
+                self._columns[recording] = None
+                with suppress(FileNotFoundError, StoreError):  # the index has the same
+                    found = FieldColumns(self.directory.recording(recording))
+                    self._columns[recording] = found
+            return self._columns[recording]
 
     # Changing.
 

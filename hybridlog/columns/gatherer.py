@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import errno
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.columns.stored import LOG_TIME, NAME, ORDERED, SEQ, values_of
-from hybridlog.columns.topic import SINGLE_READ, Order, UnfitError, is_small, singles, types_of
+from hybridlog.columns.stored import LOG_TIME, NAME, ORDERED, RECORDING, SEQ, values_of
+from hybridlog.columns.topic import (
+    SINGLE_READ,
+    Order,
+    UnfitError,
+    is_small,
+    nbytes,
+    singles,
+    types_of,
+)
 from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.schema.column import Scalars, Strings, concatenate
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.column_file import ColumnFileWriter
+from hybridlog_storage.column_file import ColumnFileWriter, Values, part_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.column_filter import Single
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segment_writer import StoredChunk
@@ -24,6 +38,9 @@ if TYPE_CHECKING:
 _ARENA = 2 << 20  # bytes of payloads that are put together to be decoded; caches hold no more
 _ENOUGH = 1 << 20  # a chunk of so many is decoded where it is
 _ROWS = 1 << 18  # messages that are put together
+_PENDING = 16 << 20  # bytes of columns that are laid down together: many small blocks cost memory
+_RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
+_log = logging.getLogger(__name__)
 
 
 class _Held(NamedTuple):
@@ -53,26 +70,46 @@ class _Topic:
         self.types = types_of(self.codec) if channel.message_encoding in SINGLE_READ else {}
         self.rows = 0
         self.is_ordered = True
+        self.pending: list[tuple[Order, dict[str, Single]]] = []
         self._last = -1, -1
+
+    def give_up(self) -> None:
+        """Have no columns of it."""
+        self.types = {}
+        self.pending.clear()
 
     def meet(self, channel: Channel) -> None:
         """A channel of the topic has messages."""
         if codec_for(channel) is not self.codec:
-            self.types = {}
+            self.give_up()
 
-    def add(self, order: Order) -> None:
-        """So many more of its messages have columns."""
+    def add(self, order: Order, fields: dict[str, Single]) -> None:
+        """More of its messages."""
+        self.pending.append((order, fields))
         self.rows += len(order.seq)
         first = int(order.log_time[0]), int(order.seq[0])
         self.is_ordered = self.is_ordered and self._last < first and order.is_kept
         self._last = int(order.log_time[-1]), int(order.seq[-1])
+
+    def take(self) -> dict[str, Values]:
+        """The columns that were not laid down yet."""
+        orders, fields = zip(*self.pending, strict=True)
+        self.pending.clear()
+        columns: dict[str, Values] = {
+            LOG_TIME: np.concatenate([order.log_time for order in orders]),
+            SEQ: np.concatenate([order.seq for order in orders]),
+        }
+        for path in self.types:
+            columns[path] = values_of(concatenate([part[path] for part in fields]))
+        return columns
 
 
 class FieldGatherer:
     """Collects the fields of a recording's small messages while it is indexed.
 
     Payloads are put together until there are enough of them to be decoded by columns. Where
-    anything does not fit, or there is no room on the disk, there are no columns of it.
+    anything does not fit there are no columns of a topic; where anything fails, or the disk
+    is nearly full, there are none at all. Neither is a loss: the index has the same.
 
     Args:
         recording: The recording's directory.
@@ -82,6 +119,7 @@ class FieldGatherer:
         self._path = recording / NAME
         self._writer: ColumnFileWriter | None = None
         self._ended = False
+        self._pending = 0
         self._arena: NDArray[np.uint8] | None = None
         self._filled = 0
         self._rows = 0
@@ -91,16 +129,64 @@ class FieldGatherer:
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Take what is in a chunk; its buffer is not needed any more afterwards."""
+        if not self._ended:
+            with self._harmless():
+                self._add(chunk, channels)
+
+    def close(self, entry: RecordingEntry) -> None:
+        """Keep the columns of all topics of which no message is missing.
+
+        Args:
+            entry: The whole recording.
+        """
+        with self._harmless():
+            self._decode()
+            self._flush()
+            whole = {
+                name: {ORDERED: topic.is_ordered, RECORDING: entry.key}
+                for name, topic in self._topics.items()
+                if topic.types and topic.rows == entry.messages_of(name)
+            }
+            if self._writer is not None:
+                self._writer.close(whole)
+            else:
+                self._path.unlink(missing_ok=True)
+        self.discard()
+
+    def discard(self) -> None:
+        """Make no columns, or no more."""
+        if self._writer is not None:
+            self._writer.discard()
+        else:
+            with suppress(OSError):
+                part_of(self._path).unlink()  # a crash may have left it
+        self._ended = True
+        self._writer = None
+        self._arena = None
+        self._held.clear()
+        self._topics.clear()
+
+    @contextmanager
+    def _harmless(self) -> Iterator[None]:
+        """Whatever goes wrong here, the recording goes on without columns."""
+        try:
+            yield
+        except Exception as error:
+            _log.warning("no columns in %s: %s", self._path.parent, error or repr(error))
+            self.discard()
+
+    def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch = chunk.batch
-        if self._ended or not is_small(batch.payload_bytes, len(batch)):
-            return
         self._channels.update(channels)
+        if not is_small(batch.payload_bytes, len(batch)):
+            # With some messages missing there is no use in the others.
+            for topic in self._topics_of(batch.channel).values():
+                topic.give_up()
+            return
         begin = int(batch.offset.min())
         size = int((batch.offset + batch.length).max()) - begin
         if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:
             self._decode()
-        if self._ended:
-            return
         data = np.frombuffer(batch.buffer, np.uint8, size, begin)
         self._held.append(
             # Copies: what is held must not keep the buffers of chunks from being used again.
@@ -121,42 +207,9 @@ class FieldGatherer:
         self._filled += size
         self._rows += len(batch)
 
-    def close(self, entry: RecordingEntry) -> None:
-        """Keep the columns of all topics of which no message is missing.
-
-        Args:
-            entry: The whole recording.
-        """
-        self._decode()
-        whole = {
-            name: {ORDERED: topic.is_ordered}
-            for name, topic in self._topics.items()
-            if topic.types and topic.rows == entry.messages_of(name)
-        }
-        try:
-            if self._writer is not None:
-                self._writer.close(whole)
-            else:
-                self._path.unlink(missing_ok=True)
-        except OSError:
-            self.discard()
-        self._end()
-
-    def discard(self) -> None:
-        """Make no columns."""
-        if self._writer is not None:
-            self._writer.discard()
-        self._end()
-
-    def _end(self) -> None:
-        self._ended = True
-        self._writer = None
-        self._arena = None
-        self._held.clear()
-
     def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
         """Make columns of what was collected."""
-        if self._ended or not self._held:
+        if not self._held:
             return
         if data is None:
             assert self._arena is not None
@@ -164,40 +217,61 @@ class FieldGatherer:
         held = _Held(*(np.concatenate(parts) for parts in zip(*self._held, strict=True)))
         self._held.clear()
         self._filled = self._rows = 0
-        numbers, names = self._by_topic(held.channel)
-        order = np.argsort(numbers, kind="stable")
-        bounds = np.searchsorted(numbers[order], np.arange(len(names) + 1)).tolist()
-        try:
-            for name, begin, end in zip(names, bounds[:-1], bounds[1:], strict=True):
-                self._write(name, held.take(order[begin:end]), data.data)
-        except OSError:
-            self.discard()  # no room: the index has everything
+        topics = self._topics_of(held.channel)
+        numbers = {topic: number for number, topic in enumerate(dict.fromkeys(topics.values()))}
+        table = np.zeros(int(held.channel.max()) + 1, np.int32)
+        table[list(topics)] = [numbers[topic] for topic in topics.values()]
+        number = table[held.channel]
+        order = np.argsort(number, kind="stable")
+        bounds = np.searchsorted(number[order], np.arange(len(numbers) + 1)).tolist()
+        for topic, begin, end in zip(numbers, bounds[:-1], bounds[1:], strict=True):
+            if topic.types:
+                self._read(topic, held.take(order[begin:end]), data)
+        if self._pending >= _PENDING:
+            self._flush()
 
-    def _by_topic(self, channel: NDArray[np.int32]) -> tuple[NDArray[np.int32], list[str]]:
-        """A number for the topic of each message, and the names of the topics."""
-        names: dict[str, int] = {}
-        table = np.zeros(int(channel.max()) + 1, np.int32)
+    def _topics_of(self, channel: NDArray[np.int32]) -> dict[int, _Topic]:
+        """The topics of messages, by the ids of their channels."""
+        found: dict[int, _Topic] = {}
         for number in np.flatnonzero(np.bincount(channel)).tolist():
-            found = self._channels[number]
-            topic = self._topics.setdefault(found.topic, _Topic(found))
-            topic.meet(found)
-            table[number] = names.setdefault(found.topic, len(names))
-        return table[channel], list(names)
+            of = self._channels[number]
+            if of.topic not in self._topics:
+                self._topics[of.topic] = _Topic(of)
+            found[number] = self._topics[of.topic]
+            found[number].meet(of)
+        return found
 
-    def _write(self, name: str, held: _Held, buffer: memoryview) -> None:
-        topic = self._topics[name]
-        if not topic.types:
-            return
-        decoded = topic.codec.columns(buffer, held.offset, held.length, topic.types.keys())
+    def _read(self, topic: _Topic, held: _Held, data: NDArray[np.uint8]) -> None:
+        decoded = topic.codec.columns(data.data, held.offset, held.length, topic.types.keys())
         try:
             if decoded.unreadable:
                 raise UnfitError
             fields = singles(decoded.records, topic.types)
         except UnfitError:
-            topic.types = {}
+            topic.give_up()
             return
+        fields = {path: _apart(column, data) for path, column in fields.items()}
+        topic.add(Order(held.log_time, held.seq), fields)
+        self._pending += held.seq.nbytes * 2 + sum(map(nbytes, fields.values()))
+
+    def _flush(self) -> None:
+        """Lay down what was decoded."""
+        self._pending = 0
+        waiting = [(name, topic) for name, topic in self._topics.items() if topic.pending]
+        if not waiting:
+            return
+        if shutil.disk_usage(self._path.parent).free < _RESERVE:
+            raise OSError(errno.ENOSPC, "the disk is nearly full")
         if self._writer is None:
             self._writer = ColumnFileWriter(self._path)
-        values = {path: values_of(column) for path, column in fields.items()}
-        self._writer.append(name, {LOG_TIME: held.log_time, SEQ: held.seq, **values})
-        topic.add(Order(held.log_time, held.seq))
+        for name, topic in waiting:
+            self._writer.append(name, topic.take())
+
+
+def _apart(column: Single, data: NDArray[np.uint8]) -> Single:
+    """A column that does not lie in the payloads it was read from: they will be others."""
+    if isinstance(column, Strings) and np.may_share_memory(column.data, data):
+        return Strings(column.data.copy(), column.offset)
+    if isinstance(column, Scalars) and np.may_share_memory(column.values, data):
+        return Scalars(column.values.copy(), column.kind)
+    return column

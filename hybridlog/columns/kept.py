@@ -244,10 +244,10 @@ class KeptColumns:
         """How columns can be got, the cheapest way first."""
         messages = recording.messages_of(topic)
         ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, _from_index)]
-        file, size = self._store.columns(recording.id), None
-        if file is not None:
-            size = file.size(topic, wanted.fields, messages, ordered=wanted.ordered)
-        if size is not None:
+        file, known = self._store.columns(recording.id), self.types(recording, topic) or {}
+        types = {path: kind for path, kind in known.items() if path in wanted.fields}
+        if file is not None and file.has(recording, topic, types):
+            size = file.size(topic, wanted.fields, ordered=wanted.ordered)
             ways.append(_Way(_OPEN_S + _STORED_BYTE_S * size, _from_file))
         encodings = {lane.channel.message_encoding for lane in self._lanes(recording, topic)}
         if encodings <= SINGLE_READ:
@@ -324,7 +324,7 @@ def _from_file(query: Query, types: Mapping[str, str], ordered: bool) -> TopicCo
         columns = file.read(topic, types, ordered=ordered)
     except StoreError as error:
         raise UnfitError from error  # the index has what is damaged here
-    query.counters.bytes_read += file.size(topic, types, len(columns), ordered=ordered) or 0
+    query.counters.bytes_read += file.size(topic, types, ordered=ordered)
     return columns
 
 

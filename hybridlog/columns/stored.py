@@ -12,10 +12,12 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from hybridlog.columns.topic import TopicColumns, in_order
+import numpy as np
+
+from hybridlog.columns.topic import Order, TopicColumns, in_order
 from hybridlog.query.column_filter import Single
 from hybridlog.schema.column import Scalars, Strings
-from hybridlog_storage.column_file import ColumnFile, Text, Values
+from hybridlog_storage.column_file import TEXT, ColumnFile, Text, Values
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
@@ -27,7 +29,9 @@ LOG_TIME: Final = ":log_time"
 SEQ: Final = ":seq"
 """Columns of a topic besides its fields, of which none has such a name."""
 ORDERED: Final = "ordered"
-"""What is noted of a topic whose rows are by log time and arrival."""
+"""Noted of a topic: whether its rows are by log time and arrival."""
+RECORDING: Final = "recording"
+"""Noted of a topic: the number of its recording."""
 
 
 class FieldColumns:
@@ -44,22 +48,34 @@ class FieldColumns:
     def __init__(self, recording: Path) -> None:
         self._file = ColumnFile(recording / NAME)
 
-    def size(
-        self, topic: str, fields: Collection[str], messages: int, *, ordered: bool
-    ) -> int | None:
+    def has(self, entry: RecordingEntry, topic: str, types: Mapping[str, str]) -> bool:
+        """Whether fields of all messages of a topic are there.
+
+        Args:
+            entry: The recording.
+            topic: Full name.
+            types: Of the fields, by path, as the definition says.
+        """
+        stored = self._file.types(topic)
+        wanted = {LOG_TIME: "int64", SEQ: "int64", **types}
+        if not all(_fits(stored.get(name), kind) for name, kind in wanted.items()):
+            return False
+        notes = self._file.notes(topic)
+        if notes.get(RECORDING) != entry.key or self._file.rows(topic) != entry.messages_of(topic):
+            return False
+        # What is no UTF-8 becomes three bytes; more text than that is not of these messages.
+        most = 3 * sum(stats.payload_bytes for stats in entry.stats_of(topic))
+        texts = (path for path, kind in types.items() if kind == "string")
+        return all(self._file.memory(topic, path) <= most for path in texts)
+
+    def size(self, topic: str, fields: Collection[str], *, ordered: bool) -> int:
         """Bytes to be read for fields of a topic.
 
         Args:
-            topic: Full name.
+            topic: Full name; it is there.
             fields: Paths.
-            messages: How many the topic has.
             ordered: Whether their order is wanted.
-
-        Returns:
-            None when not all of it is there.
         """
-        if self._file.rows(topic) != messages or not set(fields) <= self._file.columns(topic):
-            return None
         order = (LOG_TIME, SEQ) if self._needs_order(topic, ordered=ordered) else ()
         return self._file.size(topic, [*order, *fields])
 
@@ -67,8 +83,8 @@ class FieldColumns:
         """Fields of all messages of a topic.
 
         Args:
-            topic: Full name; `size` knows it.
-            types: By path, as the definition says.
+            topic: Full name.
+            types: By path; `has` knows of them.
             ordered: Whether their order is wanted.
 
         Raises:
@@ -77,14 +93,8 @@ class FieldColumns:
         fields = {path: _column(self._file.read(topic, path), kind) for path, kind in types.items()}
         if not self._needs_order(topic, ordered=ordered):
             return TopicColumns(self._file.rows(topic), None, fields)
-        times, seqs = (self._file.read(topic, name) for name in (LOG_TIME, SEQ))
-        if isinstance(times, Text) or isinstance(seqs, Text):
-            raise StoreError(f"The columns in {self._file.path} are damaged: times are text.")
-        return in_order(times, seqs, fields)
-
-    def _needs_order(self, topic: str, *, ordered: bool) -> bool:
-        """Whether the order has to be read, because it is wanted, or because it is not kept."""
-        return ordered or self._file.notes(topic).get(ORDERED) is not True
+        order = self._order(topic)
+        return in_order(order.log_time, order.seq, fields)
 
     def check(self, entry: RecordingEntry) -> None:
         """Read all of them.
@@ -97,11 +107,37 @@ class FieldColumns:
         """
         self._file.check()
         for topic in self._file.tables():
-            if self._file.rows(topic) != entry.messages_of(topic):
+            if not self.has(entry, topic, {}):
                 raise StoreError(
                     f"The columns in {self._file.path} have {self._file.rows(topic)} messages "
-                    f"of {topic}, the segments {entry.messages_of(topic)}. Run `hybridlog reindex`."
+                    f"of {topic}, the segments {entry.messages_of(topic)}; or they are of another "
+                    "recording. Run `hybridlog reindex`."
                 )
+            self._order(topic)
+
+    def _order(self, topic: str) -> Order:
+        times, seqs = self._file.read(topic, LOG_TIME), self._file.read(topic, SEQ)
+        assert not isinstance(times, Text)
+        assert not isinstance(seqs, Text)
+        order = Order(times, seqs)
+        if not self._needs_order(topic, ordered=False) and not order.is_kept:
+            raise StoreError(
+                f"The columns in {self._file.path} are damaged: messages of {topic} are not in "
+                "their order. Run `hybridlog reindex`; until then MongoDB answers."
+            )
+        return order
+
+    def _needs_order(self, topic: str, *, ordered: bool) -> bool:
+        """Whether the order has to be read, because it is wanted, or because it is not kept."""
+        return ordered or self._file.notes(topic).get(ORDERED) is not True
+
+
+def _fits(stored: str | None, kind: str) -> bool:
+    """Whether columns of a type hold what a definition calls so."""
+    if kind == "char":
+        return stored in {"|u1", "|i1"}  # in ROS 1 and in ROS 2
+    special = {"string": TEXT, "time": "<i8", "duration": "<i8"}
+    return stored == (special.get(kind) or np.dtype(kind).str)
 
 
 def values_of(column: Single) -> Values:

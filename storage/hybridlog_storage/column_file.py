@@ -34,6 +34,7 @@ TEXT: Final = "text"
 """Type of a column of strings; all others have a numpy type."""
 
 _TAIL = struct.Struct("<QQI")  # bytes of the directory, number of blocks, checksum of both
+_BLOCK = struct.Struct("<IIIIQQII")
 _ENTRY = np.dtype(
     [
         ("table", "<u4"),
@@ -49,6 +50,7 @@ _ENTRY = np.dtype(
 _TYPES = frozenset({"|b1", "|i1", "|u1", *(f"<{k}{n}" for k in "iu" for n in (2, 4, 8))})
 _KNOWN = _TYPES | {"<f4", "<f8", TEXT}
 _MOST_ROWS = 1 << 31  # of a block
+_MOST_DIRECTORY = 256 << 20  # bytes of directory and table of blocks
 _CURE = "Run `hybridlog reindex`; until then MongoDB answers."
 
 
@@ -80,12 +82,15 @@ class ColumnFileWriter:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._part = path.with_name(f"{path.name}.part")
-        self._fd = os.open(self._part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._part = part_of(path)
+        # What lies there under that name is a crash's, or nothing to be written to.
+        self._part.unlink(missing_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._fd = os.open(self._part, flags, 0o644)
         self._end = 0
         self._tables: dict[str, dict[str, str]] = {}
         self._numbers: dict[str, int] = {}
-        self._blocks: list[tuple[int, int, int, int, int, int, int, int]] = []
+        self._blocks = bytearray()
         try:
             self._write([MAGIC])
         except OSError:
@@ -117,7 +122,7 @@ class ColumnFileWriter:
             crc = 0
             for part in parts:
                 crc = crc32(part, crc)
-            self._blocks.append((number, place, rows, int(same), offset, size, crc, 0))
+            self._blocks += _BLOCK.pack(number, place, rows, same, offset, size, crc, 0)
             everything += parts
             offset += size
         self._write(everything)
@@ -133,8 +138,11 @@ class ColumnFileWriter:
         """
         kept = [name for name in self._tables if name in tables]
         numbers = {self._numbers[name]: place for place, name in enumerate(kept)}
-        blocks = np.array([b for b in self._blocks if b[0] in numbers], _ENTRY)
-        blocks["table"] = [numbers[number] for number in blocks["table"].tolist()]
+        blocks = np.frombuffer(self._blocks, _ENTRY)
+        renumbered = np.full(len(self._numbers), -1, np.int64)
+        renumbered[list(numbers)] = list(numbers.values())
+        blocks = blocks[renumbered[blocks["table"]] >= 0]
+        blocks["table"] = renumbered[blocks["table"]]
         directory = json.dumps(
             {
                 "tables": [
@@ -145,6 +153,8 @@ class ColumnFileWriter:
             separators=(",", ":"),
         ).encode()
         crc = crc32(blocks.tobytes(), crc32(directory))
+        if len(directory) + blocks.nbytes > _MOST_DIRECTORY:
+            kept = []
         try:
             if kept:
                 tail = _TAIL.pack(len(directory), len(blocks), crc)
@@ -156,15 +166,21 @@ class ColumnFileWriter:
             self.discard()
 
     def discard(self) -> None:
-        """Leave nothing of what was not given its name."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-            with suppress(FileNotFoundError):
+        """Leave nothing of what was not given its name, as far as the system lets us."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with suppress(OSError):  # of a file that nobody will read
+                os.close(fd)
+            with suppress(OSError):
                 self._part.unlink()
 
     def _write(self, parts: list[Any]) -> None:
         self._end += durability.write_all(self._fd, parts)
+
+
+def part_of(path: Path) -> Path:
+    """Name of a file of columns while it is written."""
+    return path.with_name(f"{path.name}.part")
 
 
 class ColumnFile:
@@ -199,10 +215,16 @@ class ColumnFile:
         found = self._tables.get(table)
         return 0 if found is None else found.rows
 
-    def columns(self, table: str) -> AbstractSet[str]:
-        """Names of a table's columns."""
+    def memory(self, table: str, column: str) -> int:
+        """Bytes that a column takes when it has been read, without where its strings begin."""
+        blocks = self._of(table, column)
+        times = np.where(blocks["same"] == 1, blocks["rows"], 1).astype(np.float64)
+        return int((times * blocks["size"]).sum())
+
+    def types(self, table: str) -> Mapping[str, str]:
+        """Types of a table's columns by name."""
         found = self._tables.get(table)
-        return frozenset() if found is None else found.types.keys()
+        return {} if found is None else found.types
 
     def notes(self, table: str) -> Mapping[str, object]:
         """What is noted of a table."""
@@ -254,7 +276,7 @@ class ColumnFile:
         tail = self._read(size - least + len(MAGIC), _TAIL.size + len(MAGIC))
         length, count, crc = _TAIL.unpack_from(tail)
         start = size - least + len(MAGIC) - length - count * _ENTRY.itemsize
-        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC):
+        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC) or length + count > _MOST_DIRECTORY:
             raise self._damaged("its end is missing")
         data = self._read(start, length + count * _ENTRY.itemsize)
         if crc32(data) != crc:
@@ -264,7 +286,7 @@ class ColumnFile:
             named = [
                 (
                     str(table["name"]),
-                    {str(name): str(kind) for name, kind in table["columns"]},
+                    [(str(name), str(kind)) for name, kind in table["columns"]],
                     dict(table["notes"]),
                 )
                 for table in json.loads(data[:length])["tables"]
@@ -275,22 +297,32 @@ class ColumnFile:
         beyond = (ends < blocks["offset"]) | (ends > start) | (blocks["rows"] >= _MOST_ROWS)
         if bool(beyond.any()):
             raise self._damaged("its directory names places outside of it")
+        key = blocks["table"].astype(np.int64) << 32 | blocks["column"]
+        order = np.argsort(key, kind="stable")
+        self._keys, blocks = key[order], blocks[order]
         tables: dict[str, _Table] = {}
-        for number, (name, types, notes) in enumerate(named):
-            if not types or not _KNOWN.issuperset(types.values()):
+        for number, (name, columns, notes) in enumerate(named):
+            types = dict(columns)
+            if not types or len(types) != len(columns) or name in tables:
+                raise self._damaged("its directory has a name twice, or none")
+            if not _KNOWN.issuperset(types.values()):
                 raise self._damaged("its directory has types that are not known")
-            first = (blocks["table"] == number) & (blocks["column"] == 0)
-            rows = int(blocks["rows"][first].sum(dtype=np.int64))
+            rows = int(blocks[self._range(number, 0)]["rows"].sum(dtype=np.int64))
             tables[name] = _Table(number, types, rows, notes)
         return tables, blocks
+
+    def _range(self, table: int, column: int) -> slice:
+        """Where the blocks of a column are among all."""
+        key = table << 32 | column
+        return slice(*np.searchsorted(self._keys, [key, key + 1]).tolist())
 
     def _of(self, table: str, column: str) -> NDArray[np.void]:
         """The blocks of a column, in order."""
         found = self._tables[table]
-        place = list(found.types).index(column)
-        wanted = (self._blocks["table"] == found.number) & (self._blocks["column"] == place)
-        found_blocks: NDArray[np.void] = self._blocks[wanted]
-        return found_blocks
+        blocks: NDArray[np.void] = self._blocks[
+            self._range(found.number, list(found.types).index(column))
+        ]
+        return blocks
 
     def _fill(self, entry: np.void, values: NDArray[Any]) -> None:
         """Rows of a block of numbers, read to where they belong."""

@@ -53,7 +53,8 @@ def test_intervals_as_json(store: Path, seen: list[Seen], speeds: list[tuple[int
     assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
     assert {r["recording"] for r in done.json} == {"robot"}
     assert done.err.endswith(" s\n")
-    assert "0 B read from disk" in done.err
+    assert "0 B of payload" in done.err
+    assert "0 index documents" in done.err
 
 
 def test_intervals_as_a_table(store: Path) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import hybridlog as hl
@@ -16,7 +20,8 @@ from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.columns.stored import NAME, FieldColumns
 from hybridlog.schema.column import Strings
 from hybridlog_storage import column_file
-from hybridlog_storage.catalog import CHUNKS, RECORDINGS
+from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog
+from hybridlog_storage.errors import DatabaseError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.columns.test_kept import BASE, DEFINITION, SECOND, message, usual, write_log
@@ -71,8 +76,7 @@ def compare_with_documents(store: hl.Store) -> int:
             continue
         for topic in {c.topic for c in entry.channels}:
             types = store.kept.types(entry, topic)
-            messages = entry.messages_of(topic)
-            if not types or columns.size(topic, types, messages, ordered=True) is None:
+            if not types or not columns.has(entry, topic, types):
                 continue
             found = columns.read(topic, types, ordered=True)
             documents = list(store.query([topic], [entry.id]).documents())
@@ -217,6 +221,160 @@ def test_columns_of_other_messages_are_not_believed(recorded: hl.Store, tmp_path
     assert recorded.topic("/state").where("i8 == 1").count() == 17
     (finding,) = recorded.verify().findings
     assert "1 messages of /state, the segments 48" in finding.problem
+    # Nor when there are as many.
+    recorded.remove("more")
+    (log,) = tmp_path.glob("log.mcap")
+    recorded.record(log, name="more", again=True)
+    shutil.copy(file_of(recorded, "more"), file_of(recorded))
+    recorded.refresh()
+    (finding,) = recorded.verify(["log"]).findings
+    assert "of another recording" in finding.problem
+
+
+@pytest.mark.parametrize("lie", ["ordered", "text", "times", "long"])
+def test_a_file_that_lies_is_not_believed(store: hl.Store, tmp_path: Path, lie: str) -> None:
+    said = [(BASE + 50 - n, "/state", message(usual(i8=n % 3))) for n in range(50)]
+    write_log(tmp_path / "log.mcap", said)
+    entry = store.record(tmp_path / "log.mcap", name="log").entry
+    query = store.topic("/state").where("i8 == 1")
+    late = query.between(BASE + 30, BASE + 40)
+    named = store.topic("/state").where({"name": "a"})
+    want = [query.count(), late.count(), named.count()]
+    assert want == [17, 3, 50]
+    columns: dict[str, Any] = {
+        ":log_time": np.array([time for time, *_ in said]),
+        ":seq": np.arange(50),
+        "i8": np.array([n % 3 for n in range(50)], np.int8),
+        "name": column_file.Text(np.full(50, ord("a"), np.uint8), np.arange(51)),
+    }
+    if lie == "text":
+        columns["i8"] = columns["name"]
+    elif lie == "times":
+        columns[":log_time"] = columns[":log_time"].astype(np.float64)
+    elif lie == "long":
+        cells = np.full(50 << 16, ord("b"), np.uint8)
+        columns["name"] = column_file.Text(cells, np.arange(51) << 16)
+    writer = column_file.ColumnFileWriter(file_of(store))
+    writer.append("/state", columns)
+    writer.close({"/state": {"recording": entry.key, "ordered": lie in {"ordered", "times"}}})
+    for turn in (query, late, named):
+        store.refresh()
+        assert [query.count(), late.count(), named.count()] == want
+        turn.count()
+    if lie in {"ordered", "times"}:
+        (finding,) = store.verify().findings
+        assert finding.place == "columns"
+
+
+def test_a_chunk_that_is_indexed_twice_is_no_two_chunks(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = Catalog.put_chunks
+    failures = iter([True])
+
+    def sometimes(catalog: Catalog, entries: Any) -> None:
+        if next(failures, False):
+            raise DatabaseError("for a moment")
+        put(catalog, entries)
+
+    monkeypatch.setattr(Catalog, "put_chunks", sometimes)
+    words = Channel("/words", "ros1", Schema("std_msgs/String", "ros1msg", b"string data"))
+    with store.start("live", flush_interval_s=0.05) as recording:
+        for word in (b"small", b"x" * 5000):
+            for n in range(10):
+                payload = len(word).to_bytes(4, "little") + word
+                recording.write(words, payload, log_time=BASE + n)
+            time.sleep(2.5)
+    assert store.topic("/words").where('data == "small"').count() == 10
+    assert store.columns(recording.id) is None
+
+
+def test_a_link_in_the_place_of_the_file_leads_nowhere(recorded: hl.Store, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    file = file_of(recorded)
+    file.with_name(f"{NAME}.part").symlink_to(victim)
+    recorded.reindex()
+    assert victim.read_text() == "mine"
+    assert compare_with_documents(recorded) == 20
+    assert not list(file.parent.glob("*.part"))
+
+
+@pytest.mark.parametrize("kind", ["directory", "fifo", "empty", "loop"])
+def test_other_things_in_the_place_of_the_file(
+    recorded: hl.Store, caplog: pytest.LogCaptureFixture, kind: str
+) -> None:
+    file = file_of(recorded)
+    file.unlink()
+    if kind == "directory":
+        file.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(file)
+    elif kind == "empty":
+        file.touch()
+    else:
+        file.symlink_to(file)
+    recorded.refresh()
+    assert recorded.topic("/state").where("i8 == 1").count() == 16
+    assert len(recorded.verify().findings) == 1
+    recorded.reindex()
+    assert recorded.topic("/state").where("i8 == 1").count() == 16
+    # A directory may hold something of somebody's: that is said, and left alone.
+    assert len(recorded.verify().findings) == (kind == "directory")
+    assert ("no columns in" in caplog.text) == (kind == "directory")
+
+
+def test_the_last_room_is_the_segments_alone(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gathering, "_RESERVE", 1 << 62)
+    write_log(tmp_path / "log.mcap", [(BASE, "/state", message(usual(i8=1)))])
+    store.record(tmp_path / "log.mcap", name="log")
+    assert not list(store.directory.path.glob(f"**/{NAME}*"))
+    assert store.topic("/state").where("i8 == 1").count() == 1
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ValueError("odd"), OSError(errno.EIO, "no")])
+@pytest.mark.parametrize("place", ["append", "close"])
+def test_whatever_fails_the_recording_goes_on(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(column_file.ColumnFileWriter, place, fail)
+    write_log(tmp_path / "log.mcap", [(BASE, "/state", message(usual(i8=1)))])
+    assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
+    assert not list(store.directory.path.glob(f"**/{NAME}*"))
+
+
+def test_columns_are_opened_while_all_is_forgotten(recorded: hl.Store) -> None:
+    def ask() -> None:
+        for _ in range(300):
+            assert recorded.columns("log") is not None
+
+    with ThreadPoolExecutor(2) as pool:
+        asked = [pool.submit(ask) for _ in range(2)]
+        while not all(one.done() for one in asked):
+            recorded.refresh()
+        for one in asked:
+            one.result()
+
+
+@pytest.mark.parametrize("pending", [1, 300])
+def test_columns_laid_down_a_little_at_a_time(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pending: int
+) -> None:
+    monkeypatch.setattr(gathering, "_ARENA", 500)
+    monkeypatch.setattr(gathering, "_PENDING", pending)
+    name = "long" * 700
+    rows = [
+        (BASE + n, "/state" if n % 7 else "/other", message(usual(i64=n, name=name[: n * 60])))
+        for n in range(40)
+    ]
+    write_log(tmp_path / "log.mcap", rows)
+    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+    compare_with_documents(store)
 
 
 @pytest.mark.parametrize("writes", [0, 1, 2])
@@ -250,11 +408,13 @@ def test_topics_that_do_not_fit_have_no_columns(store: hl.Store, tmp_path: Path)
     rows += [(BASE + 9, "/other", message(usual())), (BASE + 10, "/other", b"torn")]
     write_log(tmp_path / "log.mcap", rows)
     store.record(tmp_path / "log.mcap", name="log")
-    columns = FieldColumns(store.directory.recording("log"))
-    assert columns.size("/state", ["i8"], 4, ordered=False)
-    assert columns.size("/state", ["many"], 4, ordered=False) is None
-    assert columns.size("/state", ["i8"], 5, ordered=False) is None
-    assert columns.size("/other", ["i8"], 2, ordered=False) is None
+    columns, (entry,) = FieldColumns(store.directory.recording("log")), store.recordings()
+    assert columns.has(entry, "/state", {"i8": "int8", "name": "string", "at": "time"})
+    assert not columns.has(entry, "/state", {"many": "float32"})
+    assert not columns.has(entry, "/state", {"i8": "string"})
+    assert not columns.has(entry, "/state", {"name": "int8"})
+    assert not columns.has(entry, "/state", {"f32": "float64"})
+    assert not columns.has(entry, "/other", {"i8": "int8"})
 
 
 def test_a_topic_of_two_types_has_no_columns(store: hl.Store) -> None:
@@ -265,9 +425,9 @@ def test_a_topic_of_two_types_has_no_columns(store: hl.Store) -> None:
                 Channel("/state", "ros1", OTHER.schema), bytes(4), log_time=BASE + 10 + n
             )
             recording.write(OTHER, bytes(4), log_time=BASE + 20 + n)
-    columns = FieldColumns(store.directory.recording(recording.id))
-    assert columns.size("/state", [], 6, ordered=False) is None
-    assert columns.size("/other", ["data"], 3, ordered=False)
+    columns, (entry,) = FieldColumns(store.directory.recording(recording.id)), store.recordings()
+    assert not columns.has(entry, "/state", {})
+    assert columns.has(entry, "/other", {"data": "int32"})
 
 
 def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import zlib
 from itertools import chain
@@ -116,10 +117,10 @@ def test_what_was_written_is_read(
     assert list(file.tables()) == ["one", "two"]
     assert file.notes("one") == {"of": 1}
     assert file.rows("dropped") == 0
-    assert not file.columns("dropped")
+    assert not file.types("dropped")
     other = plain(path)
     for name, parts in (("one", one), ("two", two)):
-        assert list(file.columns(name)) == list(parts[0])
+        assert list(file.types(name)) == list(parts[0])
         for column in parts[0]:
             read = file.read(name, column)
             want = [bits(part[column]) for part in parts]
@@ -188,6 +189,9 @@ def test_every_changed_byte_and_every_cut_is_noticed(tmp_path: Path) -> None:
         b'{"tables":[{"name":"a","columns":[["x","O"]],"notes":{}}]}',
         b'{"tables":[{"name":"a","columns":[["x",["<f8"]]],"notes":{}}]}',
         b'{"tables":[{"name":"a","columns":[],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8"],["x","<f8"]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8"]],"notes":{}},'
+        b'{"name":"a","columns":[["x","<f8"]],"notes":{}}]}',
         b"\xff",
     ],
 )
@@ -221,6 +225,17 @@ def test_hostile_blocks_are_refused(tmp_path: Path, entry: tuple[int, ...]) -> N
     path.write_bytes(magic + bytes(8) + directory + blocks + tail + magic)
     with pytest.raises(StoreError, match="damaged"):
         ColumnFile(path).read("a", "x" if entry[1] == 0 else "s")
+
+
+def test_a_directory_of_terabytes_is_not_read(tmp_path: Path) -> None:
+    path, magic = tmp_path / "some", b"\x89HLC1\r\n\n"
+    with path.open("wb") as file:
+        file.write(magic)
+        file.truncate(1 << 40)
+        file.seek(0, os.SEEK_END)
+        file.write(struct.pack("<QQI", (1 << 40) - 8, 0, 0) + magic)
+    with pytest.raises(StoreError, match="damaged"):
+        ColumnFile(path)
 
 
 def test_without_a_table_there_is_no_file(tmp_path: Path) -> None:
