@@ -125,6 +125,7 @@ class FieldGatherer:
         self._rows = 0
         self._held: list[_Held] = []
         self._channels: dict[int, Channel] = {}
+        self._large: set[int] = set()  # channels of which messages were seen among large ones
         self._topics: dict[str, _Topic] = {}
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
@@ -177,12 +178,16 @@ class FieldGatherer:
 
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch = chunk.batch
-        self._channels.update(channels)
         if not is_small(batch.payload_bytes, len(batch)):
             # With some messages missing there is no use in the others.
-            for topic in self._topics_of(batch.channel).values():
-                topic.give_up()
+            large = set(batch.channel.tolist()) - self._large
+            if large:
+                self._channels.update(channels)
+                for topic in self._topics_of(batch.channel).values():
+                    topic.give_up()
+                self._large |= large
             return
+        self._channels.update(channels)
         begin = int(batch.offset.min())
         size = int((batch.offset + batch.length).max()) - begin
         if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:

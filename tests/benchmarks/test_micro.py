@@ -56,8 +56,8 @@ def test_every_path_runs(prepared: Path) -> None:
     assert (found.skipped, found.failed) == ({}, {})
     kinds = {name.partition("[")[0] for name in found.timed}
     assert kinds == {
-        *("transcode", "append", "write", "pack", "insert"),
-        *("plan", "plan_first", "fetch", "again", "decode", "columns"),
+        *("transcode", "gather", "append", "write", "pack", "insert"),
+        *("plan", "plan_first", "fetch", "again", "first", "decode", "columns"),
     }
     assert {f"transcode[{kind}]" for kind in ("pose", "imu", "scan", "image", "tf")} <= set(
         found.timed
