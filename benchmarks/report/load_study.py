@@ -23,7 +23,7 @@ from benchmarks.report.book import (
 )
 from benchmarks.report.look import FLOORS, OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
-from benchmarks.report.numbers import listed, number, percent
+from benchmarks.report.numbers import listed, number
 from benchmarks.samples import Sample
 from benchmarks.studies.search import Verdict, bracket, verdict
 
@@ -162,7 +162,7 @@ def paper_says(book: Book) -> list[tuple[str, str]]:
         }
         if not shares:
             continue
-        shown = listed([f"{title(one)} {percent(share)} %" for one, share in shares.items()])
+        shown = listed([f"{title(one)} {percents(groups[one])} %" for one in shares])
         if prefix == "hcr":
             paper = "All three databases persisted 100 % of HCR"
             holds = all(is_whole(groups[one]) for one in shares)
