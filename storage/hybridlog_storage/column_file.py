@@ -107,6 +107,7 @@ class ColumnFileWriter:
 
         Raises:
             OSError: They cannot be written.
+            ValueError: Names or types are others than before.
         """
         types = {name: _type_of(values) for name, values in columns.items()}
         if self._tables.setdefault(table, types) != types:
@@ -275,10 +276,11 @@ class ColumnFile:
             raise self._damaged("it is too short, or no file of columns")
         tail = self._read(size - least + len(MAGIC), _TAIL.size + len(MAGIC))
         length, count, crc = _TAIL.unpack_from(tail)
-        start = size - least + len(MAGIC) - length - count * _ENTRY.itemsize
-        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC) or length + count > _MOST_DIRECTORY:
+        whole = length + count * _ENTRY.itemsize
+        start = size - least + len(MAGIC) - whole
+        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC) or whole > _MOST_DIRECTORY:
             raise self._damaged("its end is missing")
-        data = self._read(start, length + count * _ENTRY.itemsize)
+        data = self._read(start, whole)
         if crc32(data) != crc:
             raise self._damaged("the checksum of its directory differs")
         blocks = np.frombuffer(data[length:], _ENTRY)

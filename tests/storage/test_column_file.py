@@ -227,14 +227,15 @@ def test_hostile_blocks_are_refused(tmp_path: Path, entry: tuple[int, ...]) -> N
         ColumnFile(path).read("a", "x" if entry[1] == 0 else "s")
 
 
-def test_a_directory_of_terabytes_is_not_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("length", "count"), [((1 << 40) - 8, 0), (0, 1 << 27)])
+def test_a_directory_of_gigabytes_is_not_read(tmp_path: Path, length: int, count: int) -> None:
     path, magic = tmp_path / "some", b"\x89HLC1\r\n\n"
     with path.open("wb") as file:
         file.write(magic)
         file.truncate(1 << 40)
         file.seek(0, os.SEEK_END)
-        file.write(struct.pack("<QQI", (1 << 40) - 8, 0, 0) + magic)
-    with pytest.raises(StoreError, match="damaged"):
+        file.write(struct.pack("<QQI", length, count, 0) + magic)
+    with pytest.raises(StoreError, match="its end is missing"):
         ColumnFile(path)
 
 
