@@ -22,6 +22,7 @@ from hybridlog.columns.topic import (
     singles,
     types_of,
 )
+from hybridlog.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import Scalars, Strings, concatenate
 from hybridlog_storage.buffers import buffers
@@ -222,16 +223,13 @@ class FieldGatherer:
         held = _Held(*(np.concatenate(parts) for parts in zip(*self._held, strict=True)))
         self._held.clear()
         self._filled = self._rows = 0
-        topics = self._topics_of(held.channel)
-        numbers = {topic: number for number, topic in enumerate(dict.fromkeys(topics.values()))}
+        by_channel = self._topics_of(held.channel)
+        topics = list(dict.fromkeys(by_channel.values()))
         table = np.zeros(int(held.channel.max()) + 1, np.int32)
-        table[list(topics)] = [numbers[topic] for topic in topics.values()]
-        number = table[held.channel]
-        order = np.argsort(number, kind="stable")
-        bounds = np.searchsorted(number[order], np.arange(len(numbers) + 1)).tolist()
-        for topic, begin, end in zip(numbers, bounds[:-1], bounds[1:], strict=True):
-            if topic.types:
-                self._read(topic, held.take(order[begin:end]), data)
+        table[list(by_channel)] = [topics.index(topic) for topic in by_channel.values()]
+        for number, rows in rows_by_channel(table[held.channel]):
+            if topics[number].types:
+                self._read(topics[number], held.take(rows), data)
         if self._pending >= _PENDING:
             self._flush()
 

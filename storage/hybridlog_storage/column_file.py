@@ -34,7 +34,6 @@ TEXT: Final = "text"
 """Type of a column of strings; all others have a numpy type."""
 
 _TAIL = struct.Struct("<QQI")  # bytes of the directory, number of blocks, checksum of both
-_BLOCK = struct.Struct("<IIIIQQII")
 _ENTRY = np.dtype(
     [
         ("table", "<u4"),
@@ -115,6 +114,7 @@ class ColumnFileWriter:
         number = self._numbers.setdefault(table, len(self._numbers))
         offset = self._end
         everything: list[Any] = []
+        blocks: list[tuple[int, ...]] = []
         for place, values in enumerate(columns.values()):
             rows = _rows(values)
             same = rows > 1 and _is_same(values)
@@ -123,9 +123,10 @@ class ColumnFileWriter:
             crc = 0
             for part in parts:
                 crc = crc32(part, crc)
-            self._blocks += _BLOCK.pack(number, place, rows, same, offset, size, crc, 0)
+            blocks.append((number, place, rows, same, offset, size, crc, 0))
             everything += parts
             offset += size
+        self._blocks += np.array(blocks, _ENTRY).tobytes()
         self._write(everything)
 
     def close(self, tables: Mapping[str, Mapping[str, object]]) -> None:
