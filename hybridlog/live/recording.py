@@ -14,7 +14,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -23,11 +23,13 @@ import numpy as np
 
 from hybridlog.capture import Capture
 from hybridlog.live.budget import usual_budget
+from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
 from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
@@ -45,7 +47,8 @@ _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
 _TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
 _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
-_COPYING = 2  # threads that lay down large messages at the same time
+_COPYING = 2  # threads that copy large messages at the same time
+_NO_TURN = nullcontext()
 _CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
 _LATE_S = 0.01  # a large message that waits so long to be laid down is late: both happen, too,
 _LATE_TIMES = 20  # for so many times as long as it has waited
@@ -169,6 +172,7 @@ class LiveRecording:
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
+            self._held.enter_context(spared_objects)
             self._capture = Capture(
                 directory,
                 database,
@@ -478,19 +482,23 @@ class LiveRecording:
         """Lay a message into its chunk, and before it what has come before it.
 
         By the thread that brings it: handed on, it would wait in memory of its own, and new
-        memory is what a machine may be slow to give. A few at a time: many that run leave
-        those that write the chunks no turn at the interpreter.
+        memory is what a machine may be slow to give. What takes long to copy goes by turns,
+        a few at a time: many that run leave those that write the chunks no turn at the
+        interpreter.
         """
+        # What is copied at once keeps the interpreter, and others with it, until it is laid.
+        turn = self._turns if len(message.payload) >= COPIED_AT_ONCE else _NO_TURN
+        since = time.monotonic()
         try:
-            with self._turns as waited:
-                if waited > _LATE_S:
-                    self._be_late(waited)
+            with turn:
                 with self._laying:
+                    self._be_on_time(time.monotonic() - since)
                     self._check()
                     with self._failing():
                         self._take()
                         copy = self._place(message)
-                copy()
+                if copy is not None:
+                    copy()
         except BaseException:
             with self._lock:
                 self._taken[message.channel] -= 1
@@ -498,10 +506,11 @@ class LiveRecording:
         finally:
             self._make_room(len(message.payload))
 
-    def _be_late(self, waited: float) -> None:
-        """Spare the processors and the disk: a message has waited for its turn."""
-        for strain in (self._hurry, self._behind):
-            strain.go_on(min(_LATE_TIMES * waited, _CALM_S))
+    def _be_on_time(self, waited: float) -> None:
+        """Spare the processors and the disk when a message has waited long to be laid down."""
+        if waited > _LATE_S:
+            for strain in (self._hurry, self._behind):
+                strain.go_on(min(_LATE_TIMES * waited, _CALM_S))
 
     def _take(self) -> None:
         """Lay what was put down into chunks; by who holds `_laying`."""
@@ -517,11 +526,13 @@ class LiveRecording:
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
         (one,) = group
-        self._place(one)()
+        copy = self._place(one)
+        if copy is not None:
+            copy()
         return len(one.payload)
 
-    def _place(self, message: _Message) -> Callable[[], None]:
-        """Make a place in a chunk for a large message; what comes back copies it there."""
+    def _place(self, message: _Message) -> Callable[[], None] | None:
+        """Lay a large message into its chunk; what comes back, if anything, copies it there."""
         return self._capture.writer.place_one(
             self._channels[message.channel],
             message.payload,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from threading import Lock
 
@@ -21,18 +20,16 @@ class Turns:
         self._free = most
         self._waiting: deque[Lock] = deque()
 
-    def __enter__(self) -> float:
-        """Wait for a turn; returns the seconds that took."""
+    def __enter__(self) -> None:
+        """Wait for a turn."""
         with self._lock:
             if self._free:
                 self._free -= 1
-                return 0.0
+                return
             called = Lock()
             called.acquire()
             self._waiting.append(called)
-        since = time.monotonic()
         called.acquire()
-        return time.monotonic() - since
 
     def __exit__(self, *_: object) -> None:
         """Give the turn to who has waited longest."""

@@ -480,15 +480,6 @@ def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
     )
 
 
-def _pack_whole(
-    copying: Sequence[Lock], compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
-) -> PackedChunk:
-    """Pack a chunk once all payloads are there: the same microseconds, seldom more."""
-    for lock in copying:
-        lock.acquire()
-    return pack(compressor, batch, seq, size)
-
-
 _AS_IT_IS = Compressor("none")
 
 
@@ -613,12 +604,13 @@ class RecordingWriter:
 
     def place_one(
         self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
-    ) -> Callable[[], None]:
+    ) -> Callable[[], None] | None:
         """Take one message; for large payloads this costs less than a batch.
 
         Returns:
-            What copies the payload. It must be called once, on any thread, also while
-            others append; the message's chunk is not written before.
+            None when the payload was copied: one below `COPIED_AT_ONCE`. Else what copies
+            it. That must be called once, on any thread, also while others append; the
+            message's chunk is not written before.
 
         Raises:
             DiskFullError: no space; what was flushed before stays.
@@ -647,7 +639,8 @@ class RecordingWriter:
             try:
                 self._close_chunk(key)
             except BaseException:
-                copy()  # or who packs the chunk would wait for ever
+                if copy is not None:
+                    copy()  # or who packs the chunk would wait for ever
                 raise
         return copy
 
@@ -782,10 +775,8 @@ class RecordingWriter:
         if len(builder):
             copying = builder.copying
             batch, seq, size = builder.take()
-            hurried = self._hurry is not None and self._hurry()
-            compressor = _AS_IT_IS if hurried else self._compressor
             self._closed_bytes += size
-            packed = self._pool.submit(_pack_whole, copying, compressor, batch, seq, size)
+            packed = self._pool.submit(self._pack, copying, batch, seq, size)
             self._packed.append(packed)
             self._storing.append(self._disk.submit(self._store, packed))
             self._keep_pace(limit=AT_WORK)
@@ -798,6 +789,17 @@ class RecordingWriter:
         """Wait until at most `limit` chunks are still being packed and written."""
         while self._storing and (len(self._storing) > limit or self._storing[0].done()):
             self._storing.popleft().result()
+
+    def _pack(
+        self, copying: Sequence[Lock], batch: Batch, seq: NDArray[np.int64], size: int
+    ) -> PackedChunk:
+        """Pack a chunk once all payloads are there: the same microseconds, seldom more."""
+        for lock in copying:
+            lock.acquire()
+        # Only now: topics of one rate close their chunks at one time, and nobody is in a
+        # hurry before most of these wait here.
+        hurried = self._hurry is not None and self._hurry()
+        return pack(_AS_IT_IS if hurried else self._compressor, batch, seq, size)
 
     # What follows runs on the thread that writes, and on no other.
 

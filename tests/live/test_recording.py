@@ -22,6 +22,7 @@ from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_writer import (
@@ -268,21 +269,25 @@ def test_the_index_falls_behind_and_catches_up(
     assert store.verify().findings == []
 
 
+@pytest.mark.parametrize("size", [50_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
 ) -> None:
     monkeypatch.setattr(live, "_CALM_S", 3600)
     monkeypatch.setattr(live, "_LATE_TIMES", 36_000 if late else 0)
     own = channel("/talk")
     with store.start("talk", flush_interval_s=0.2) as recording:
-        thread = threading.Thread(target=recording.write, args=(own, text(os.urandom(50_000))))
+        thread = threading.Thread(target=recording.write, args=(own, text(os.urandom(size))))
         with ExitStack() as all_turns:
-            for _ in range(live._COPYING):
-                all_turns.enter_context(recording._turns)
+            if size < COPIED_AT_ONCE:
+                all_turns.enter_context(recording._laying)
+            else:
+                for _ in range(live._COPYING):
+                    all_turns.enter_context(recording._turns)
             thread.start()
-            wait_for(lambda: len(recording._turns._waiting) == 1)
-            time.sleep(2 * live._LATE_S)
+            wait_for(lambda: recording._taken == [1])
+            time.sleep(10 * live._LATE_S)
         thread.join()
         wait_for(lambda: recording.stored[0] == 1)
         if late:

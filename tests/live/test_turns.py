@@ -51,24 +51,6 @@ def test_who_has_waited_longest_is_next() -> None:
     assert order == list(range(20))
 
 
-def test_says_how_long_one_has_waited() -> None:
-    turns = Turns(1)
-    waited: list[float] = []
-
-    def work() -> None:
-        with turns as seconds:
-            waited.append(seconds)
-
-    thread = threading.Thread(target=work)
-    with turns as free:
-        thread.start()
-        wait_for(lambda: len(turns._waiting) == 1)
-        time.sleep(0.05)
-    thread.join()
-    assert free == 0
-    assert 0.05 <= waited[0] < 5
-
-
 def test_an_error_gives_the_turn_back() -> None:
     turns = Turns(1)
     for _ in range(3):

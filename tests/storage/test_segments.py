@@ -8,7 +8,7 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,9 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
@@ -91,19 +92,20 @@ def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
 def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None:
     """By any thread and in any order; the chunks keep theirs."""
     chunks: list[StoredChunk] = []
-    setup = SegmentSettings(chunk_size=250_000, compression="none")
+    setup = SegmentSettings(chunk_size=750_000, compression="none")
     writer = RecordingWriter(
         tmp_path, RECORDING, lambda c, _: chunks.append(c), setup, on_written=lambda: None
     )
-    payloads = [bytes([n]) * 100_000 for n in range(20)]
+    payloads = [bytes([n]) * (COPIED_AT_ONCE + n) for n in range(20)]
     copies = [
         writer.place_one(CHANNELS[n % 2], payload, n, n, n) for n, payload in enumerate(payloads)
     ]
     # All closed chunks but none can be packed, and whoever placed did not wait.
-    assert writer.waiting > 1_500_000
+    assert writer.waiting > 4_000_000
     time.sleep(0.05)
     assert not chunks
-    threads = [threading.Thread(target=copy) for copy in reversed(copies)]
+    threads = [threading.Thread(target=copy) for copy in reversed(copies) if copy is not None]
+    assert len(threads) == 20
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -116,6 +118,66 @@ def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None
     assert messages_in(path) == [
         (CHANNELS[n % 2].topic, n, payload) for n, payload in enumerate(payloads)
     ]
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 1, 40_000, COPIED_AT_ONCE - 1, COPIED_AT_ONCE, 400_000]),
+            st.sampled_from([bytes, bytearray, memoryview]),
+        ),
+        max_size=30,
+    )
+)
+def test_payloads_that_are_copied_at_once_and_those_that_are_not_share_chunks(
+    tmp_path_factory: pytest.TempPathFactory,
+    messages: list[tuple[int, Callable[[bytes], Buffer]]],
+) -> None:
+    tmp_path = tmp_path_factory.mktemp("segments")
+    writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None, on_written=lambda: None)
+    payloads = [bytes([n + 1]) * size for n, (size, _) in enumerate(messages)]
+    copies = []
+    for n, payload in enumerate(payloads):
+        buffer = messages[n][1](payload)
+        copy = writer.place_one(CHANNELS[0], buffer, n, n, n)
+        assert (copy is None) == (len(payload) < COPIED_AT_ONCE)
+        if copy is not None:
+            copies.append(copy)
+        elif isinstance(buffer, bytearray):
+            buffer[:] = bytes(len(buffer))  # it was copied, so this changes nothing
+    for copy in reversed(copies):
+        copy()
+    (path,) = writer.close()
+    assert messages_in(path) == [
+        (CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)
+    ]
+
+
+def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(tmp_path: Path) -> None:
+    """Also those that were closed before: topics of one rate close theirs at one time."""
+    chunks: list[StoredChunk] = []
+    hurried = False
+    writer = RecordingWriter(
+        tmp_path,
+        RECORDING,
+        lambda c, _: chunks.append(c),
+        SegmentSettings(chunk_size=500_000),
+        hurry=lambda: hurried,
+        on_written=lambda: None,
+    )
+    payloads = [bytes([n]) * 500_000 for n in range(8)]
+    copies = [writer.place_one(CHANNELS[0], p, n, n, n) for n, p in enumerate(payloads)]
+    for n, copy in enumerate(copies):
+        assert copy is not None
+        if n == 4:
+            while len(chunks) < 4:
+                time.sleep(0.001)
+            hurried = True
+        copy()
+    (path,) = writer.close()
+    assert [chunk.compressed_size < 10_000 for chunk in chunks] == [True] * 4 + [False] * 4
+    assert [data for _, _, data in messages_in(path)] == payloads
 
 
 def test_chunks_that_wait_are_written_together(
@@ -139,8 +201,8 @@ def test_chunks_that_wait_are_written_together(
     )
     payloads = [bytes([n]) * 100_000 for n in range(35)]
     for n, payload in enumerate(payloads):
-        writer.place_one(CHANNELS[0], payload, n, n, n)()
-    writer.place_one(CHANNELS[1], b"last", 99, 99, 99)()
+        writer.place_one(CHANNELS[0], payload, n, n, n)
+    writer.place_one(CHANNELS[1], b"last", 99, 99, 99)
     while not all(future.done() for future in writer._packed):
         time.sleep(0.01)
     go_on.set()
@@ -178,7 +240,7 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.Mo
 
     def until_refused() -> None:
         while True:
-            writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)()
+            writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
 
     with pytest.raises(DiskFullError):
         until_refused()
