@@ -402,6 +402,8 @@ class Store:
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
         """Start a recording that messages are written to as they come.
 
+        Until it is closed, the garbage collector passes over the objects that are there now.
+
         Args:
             name: Name of the recording.
             options: How.
