@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -114,6 +115,15 @@ class Forgetful(Nothing):
 
     def counts(self) -> Mapping[str, int]:
         return {topic: count - 1 for topic, count in super().counts().items()}
+
+
+class Stopped(Nothing):
+    """Refuses a message while the collector looks at what is older than the run."""
+
+    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        if gc.get_freeze_count() < 1000:
+            raise ValueError("all objects of the modules may be looked at")
+        super().insert(channel, log_time, payload)
 
 
 class Liar(Nothing):
@@ -315,6 +325,11 @@ def test_inserts_that_raise_are_counted(start: Runner) -> None:
     values = found.values
     assert (values["errors"], values["persisted"], values["lost"]) == (30, 60, 0)
     assert values["insert_error"] == "ValueError: the third one"
+
+
+def test_the_collector_spares_what_is_older_than_the_run(start: Runner) -> None:
+    found = start(Stopped)
+    assert (found.status, found.values["errors"]) == ("ok", 0)
 
 
 def test_lost_messages_are_seen_by_who_counts(start: Runner) -> None:
