@@ -46,9 +46,9 @@ def section(book: Book) -> Section | None:
         "somebody who explores; the table of first times is of somebody who asks once. Each of "
         "its rows begins with nothing kept: what it finds are documents, segments, and the "
         "columns that were laid down beside those when the load was recorded.",
-        "Every backend was closed and opened again before it was asked. Rows of one backend share "
-        "its server, whose caches the first of them fills. What took more than ten seconds was "
-        "asked once.",
+        "Each backend was closed, its server too, and opened again before it was asked for the "
+        "first time. Rows of one backend share its files, which the first of them brings into "
+        "the machine's memory. What took more than ten seconds was asked once.",
     ]
     wrong = differing(book)
     if wrong:

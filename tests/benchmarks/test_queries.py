@@ -109,6 +109,9 @@ def test_all_answers_are_true(name: str, work: Path, tmp_path: Path) -> None:
             assert sample.values["cold_ms"] > 0
             assert sample.values["load_s"] > 0
             assert sample.values["disk_bytes"] > 10_000
+        for question in QUESTIONS:
+            first_times = {s.values["cold_ms"] for s in found if s.case["question"] == question}
+            assert len(first_times) == SMALL.repetitions  # each of an opening of its own
         sized = {s.values["index_bytes"] for s in found if "index_bytes" in s.values}
         assert all(size > 1000 for size in sized)
     assert queries.expected_seconds(asked, SMALL) == 0
@@ -262,12 +265,33 @@ def test_what_is_slow_is_asked_once(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         result = {"row": "sqlite_udf", "question": name, "index_bytes": None, **slow}
         outcome = SimpleNamespace(values={})
         (sample,) = queries._samples(outcome, result, truth, SMALL)  # type: ignore[arg-type]
-        assert sample.values["ms"] == slow["cold_ms"]
+        assert [sample.values["ms"]] == [sample.values["cold_ms"]] == slow["cold_ms"]
         assert queries.expected_seconds(asked, SMALL) > 0
         asked.journal.add(sample)
     # One sample stands for all repetitions.
     assert queries.expected_seconds(asked, SMALL) == 0
     assert len(turn.samples) == 2 * len(QUESTIONS)
+
+
+def test_first_times_are_of_one_answer() -> None:
+    known: dict[str, Any] = {"answer": [7], "cold_ms": [1.0], "ms": [0.5]}
+    found = sides._first_again(lambda: [7], known)
+    assert found.keys() == {"cold_ms"}
+    assert found["cold_ms"][0] == 1.0
+    assert len(found["cold_ms"]) == 2
+    assert sides._first_again(lambda: [8], known) == {"error": "it answered [7], then [8]"}
+    assert sides._first_again(lambda: 1 // 0, known)["error"].startswith("ZeroDivisionError")
+
+
+def test_a_repetition_may_have_no_first_time() -> None:
+    """A side that is ended has told what it knew until then."""
+    outcome = SimpleNamespace(values={})
+    truth: dict[str, Any] = dict.fromkeys(QUESTIONS, 7)
+    result = {"row": "mine", "question": "Q1", "index_bytes": None, "answer": 7}
+    told = {**result, "cold_ms": [3.0], "ms": [1.0, 2.0]}
+    samples = list(queries._samples(outcome, told, truth, SMALL))  # type: ignore[arg-type]
+    assert [s.values["ms"] for s in samples] == [1.0, 2.0]
+    assert [s.values.get("cold_ms") for s in samples] == [3.0, None]
 
 
 # --- the questions themselves ---------------------------------------------------------
