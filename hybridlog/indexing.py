@@ -491,6 +491,9 @@ def _nothing() -> None:
 
 def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
     """Channel ids in a chunk, ascending, and the rows of each, in chunk order."""
+    if len(channel) and bool((channel == channel[0]).all()):
+        yield int(channel[0]), np.arange(len(channel))  # chunks of large messages are small
+        return
     order = np.argsort(channel, kind="stable")
     ids = channel[order]
     starts = np.flatnonzero(np.diff(ids, prepend=-1)).tolist()

@@ -6,7 +6,7 @@ mends the database, never the other way round.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -70,11 +70,23 @@ def recover(directory: StoreDirectory, recording_id: str) -> list[Recovered]:
     return results
 
 
-def tend(directory: StoreDirectory, database: Database, progress: Progress | None = None) -> Tended:
-    """Bring index and segments together after a crash, or after the database was lost."""
+def tend(
+    directory: StoreDirectory,
+    database: Database,
+    recordings: Sequence[RecordingEntry],
+    progress: Progress | None = None,
+) -> Tended:
+    """Bring index and segments together after a crash, or after the database was lost.
+
+    Args:
+        directory: The store.
+        database: The index.
+        recordings: All that the catalog has.
+        progress: Called while an index is brought up to date.
+    """
     tended = Tended()
     catalog = Catalog(database)
-    known = {r.id: r for r in catalog.recordings()}
+    known = {r.id: r for r in recordings}
     for recording_id in directory.recording_ids():
         try:
             _tend_one(

@@ -80,7 +80,11 @@ def open_store(
     store = Store(directory)
     try:
         store.connect(wanted or directory.settings.mongo or EMBEDDED)
-        store.tended = maintenance.tend(directory, store.database_for("This"), progress)
+        # What is read of the catalog here, the first question need not ask for.
+        database, recordings = store.database_for("This"), store.recordings()
+        store.tended = maintenance.tend(directory, database, recordings, progress)
+        if store.tended != maintenance.Tended():
+            store.refresh()
     except (DatabaseError, MissingDependencyError) as error:
         if require_database:
             store.close()

@@ -851,7 +851,7 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
     def made(self: StoreDirectory, name: str) -> str:
         recording = make(self, name)
         with hl.open(path, require_database=True) as other:
-            maintenance.tend(other.directory, other.database_for("This"))
+            maintenance.tend(other.directory, other.database_for("This"), other.recordings())
         return recording
 
     monkeypatch.setattr(StoreDirectory, "new_recording", made)

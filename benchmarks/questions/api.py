@@ -40,10 +40,6 @@ class _Stored:
 class ApiAsker(_Stored, Asker):
     """One chain of calls a question; Q4 is a join by time."""
 
-    def start(self, backend: Backend) -> None:
-        super().start(backend)
-        self.store.refresh()  # what another row has asked for is forgotten
-
     def index_bytes(self) -> int | None:
         return index_bytes(self.store)
 

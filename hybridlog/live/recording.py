@@ -44,7 +44,9 @@ if TYPE_CHECKING:
 _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
-_TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
+_TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
+_FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
+_FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
 _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
 _COPYING = 2  # threads that copy large messages at the same time
@@ -418,7 +420,7 @@ class LiveRecording:
         flushed = told = looked = time.monotonic()
         seen = 0
         interval = self._options.flush_interval_s
-        tick = min(_TICK_S, interval / 8)
+        tick = min(_TICK_S, interval / 16)
         with suppress(BaseException), self._failing():
             while True:
                 with suppress(Empty):
@@ -431,8 +433,9 @@ class LiveRecording:
                         return
                     now = time.monotonic()
                     if now - flushed >= tick:
-                        # What is laid down may have waited for a tick already.
-                        self._capture.writer.flush_older(interval * 3 / 4 - tick)
+                        # As late as can be: of slow topics a chunk costs more than what is in
+                        # it. What is laid down has waited for a tick, and does so once more.
+                        self._capture.writer.flush_older(interval * _FLUSHED - 2 * tick)
                         self._make_room()
                         flushed = now
                     if now - told >= interval / 4:
@@ -497,8 +500,7 @@ class LiveRecording:
                     with self._failing():
                         self._take()
                         copy = self._place(message)
-                if copy is not None:
-                    copy()
+                copy()
         except BaseException:
             with self._lock:
                 self._taken[message.channel] -= 1
@@ -521,18 +523,17 @@ class LiveRecording:
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""
-        if len(group) > 1:
+        channels = [self._channels[index] for index in {message.channel for message in group}]
+        if len(group) >= _FEW * self._capture.writer.count_chunks(channels):
             batch = _batch(group)
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
-        (one,) = group
-        copy = self._place(one)
-        if copy is not None:
-            copy()
-        return len(one.payload)
+        for message in group:
+            self._place(message)()
+        return sum(len(message.payload) for message in group)
 
-    def _place(self, message: _Message) -> Callable[[], None] | None:
-        """Lay a large message into its chunk; what comes back, if anything, copies it there."""
+    def _place(self, message: _Message) -> Callable[[], None]:
+        """Give a message its place in a chunk; what comes back copies it there."""
         return self._capture.writer.place_one(
             self._channels[message.channel],
             message.payload,

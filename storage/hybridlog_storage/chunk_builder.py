@@ -95,7 +95,7 @@ class ChunkBuilder:
         publish_time: int,
         sequence: int,
         seq: int,
-    ) -> Callable[[], None] | None:
+    ) -> Callable[[], None]:
         """Lay down one message: for payloads so large that a batch of one costs more.
 
         Args:
@@ -107,9 +107,9 @@ class ChunkBuilder:
             seq: Arrival number.
 
         Returns:
-            None when the payload is there: one below `COPIED_AT_ONCE`. Else what copies it
-            to its place. That must be called once, on any thread; several may be at the
-            same time, and while other messages are laid down.
+            What copies the payload to its place; one below `COPIED_AT_ONCE` is there already,
+            and nothing happens. It must be called once, on any thread; several may be at
+            the same time, and while other messages are laid down.
         """
         source = np.frombuffer(payload, np.uint8)
         length = len(source)
@@ -130,7 +130,7 @@ class ChunkBuilder:
         self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
         if length < COPIED_AT_ONCE:
             target.data[:] = source.data
-            return None
+            return _nothing
         copying = Lock()
         copying.acquire()
         self.copying.append(copying)
@@ -207,3 +207,7 @@ class ChunkBuilder:
         heads["log_time"] = batch.log_time
         heads["publish_time"] = batch.publish_time
         windows(self._buffer.data, _HEAD)[starts] = heads.view(f"V{_HEAD}")
+
+
+def _nothing() -> None:
+    """What is left to do for a payload that was copied at once."""

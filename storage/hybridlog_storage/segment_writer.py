@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -604,13 +604,13 @@ class RecordingWriter:
 
     def place_one(
         self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
-    ) -> Callable[[], None] | None:
+    ) -> Callable[[], None]:
         """Take one message; for large payloads this costs less than a batch.
 
         Returns:
-            None when the payload was copied: one below `COPIED_AT_ONCE`. Else what copies
-            it. That must be called once, on any thread, also while others append; the
-            message's chunk is not written before.
+            What copies the payload, unless that was done at once (one below
+            `COPIED_AT_ONCE`). It must be called once, on any thread, also while others
+            append; the message's chunk is not written before.
 
         Raises:
             DiskFullError: no space; what was flushed before stays.
@@ -639,10 +639,14 @@ class RecordingWriter:
             try:
                 self._close_chunk(key)
             except BaseException:
-                if copy is not None:
-                    copy()  # or who packs the chunk would wait for ever
+                copy()  # or who packs the chunk would wait for ever
                 raise
         return copy
+
+    def count_chunks(self, channels: Iterable[Channel]) -> int:
+        """In how many open chunks messages of some channels lie; of new ones each in its own."""
+        known = self._known
+        return len({known[c].cluster if c in known else c for c in channels})
 
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Keep an attachment or a metadata record of the source."""

@@ -10,9 +10,10 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -24,10 +25,11 @@ from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, UsageError
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segment_writer import (
     AT_WORK,
     PackedChunk,
+    RecordingWriter,
     SegmentFile,
     SegmentSettings,
     StoredChunk,
@@ -188,7 +190,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
 INTERRUPTED = """
 import signal, sys
 import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 sizes = [10, 40_000, 10, 100, 3000]
@@ -246,6 +248,46 @@ def test_what_is_written_can_be_asked_for_while_it_goes_on(store: hl.Store) -> N
         wait_for(lambda: store.database and store.database.count("talk", {"data": "first"}))
         recording.write(own, text(b"second"))
         wait_for(lambda: store.database and store.database.count("talk", {}) == 2)
+
+
+@pytest.mark.parametrize(
+    ("size", "topics", "messages", "batches"),
+    [(10, 30, 3, 1), (10, 30, 1, 1), (2000, 3, 30, 1), (2000, 30, 3, 0), (10, 1, 5, 0)],
+)
+def test_a_batch_is_for_chunks_that_get_many_messages(
+    store: hl.Store,
+    monkeypatch: pytest.MonkeyPatch,
+    size: int,
+    topics: int,
+    messages: int,
+    batches: int,
+) -> None:
+    """And the others, one by one, are stored just so."""
+    appended = Counter[str]()
+    append, place = RecordingWriter.append, RecordingWriter.place_one
+
+    def counted_append(self: RecordingWriter, batch: Batch, channels: Sequence[Channel]) -> None:
+        appended["batches"] += 1
+        append(self, batch, channels)
+
+    def counted_place(self: RecordingWriter, *message: Any) -> Callable[[], None]:
+        appended["single"] += 1
+        return place(self, *message)
+
+    own = [channel(f"/talk{n}") for n in range(topics)]
+    payloads = [text(b"%5d" % n + bytes(size)) for n in range(topics * messages)]
+    with store.start("talk") as recording:
+        for one in own:
+            recording.write(one, text(bytes(size)), log_time=0)
+        wait_for(lambda: recording.stored[0] == topics)
+        monkeypatch.setattr(RecordingWriter, "append", counted_append)
+        monkeypatch.setattr(RecordingWriter, "place_one", counted_place)
+        with recording._laying:  # so that they are laid down together
+            for n, payload in enumerate(payloads):
+                recording.write(own[n % topics], payload, log_time=n + 1)
+    assert appended == ({"batches": 1} if batches else {"single": len(payloads)})
+    for n, one in enumerate(own):
+        assert [m.raw for m in store.topic(one.topic)][1:] == payloads[n::topics]
 
 
 def test_the_index_falls_behind_and_catches_up(
@@ -365,7 +407,7 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.Monke
 KILLED = """
 import sys, time
 import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 with hl.open(sys.argv[1], create=True) as store:
