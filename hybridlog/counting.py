@@ -109,7 +109,7 @@ def _in_columns(query: Query, spans: NDArray[np.int64], found: NDArray[np.bool_]
     """Mark the spans in which a message lies, if columns tell it; whether they do."""
     instead_s = cost_s(_SEVERAL * len(spans), windows=len(spans)) / len(query.topics)
     for topic in query.topics:
-        parts = judged(query, topic, as_rows=True, instead_s=instead_s)
+        parts = judged(query, topic, as_rows=True, instead_s=lambda: instead_s)
         if parts is None:
             return False
         for part in parts:

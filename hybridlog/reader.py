@@ -18,7 +18,7 @@ import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, cast
@@ -291,10 +291,10 @@ class Query:
             WhereError: it cannot be understood, or is not allowed.
         """
         from hybridlog.query.filters import check_filter
-        from hybridlog.query.where import compile_filter
 
+        compiled: Mapping[str, object]
         if isinstance(predicate, str):
-            compiled = compile_filter(predicate, field_types=self.field_types())
+            compiled = self.store.predicate(predicate, self.topics, self.recording_ids)
         else:
             compiled = check_filter(predicate)
         return self._with(_filters=(*self._filters, compiled))
@@ -723,7 +723,10 @@ class Query:
     # How.
 
     def _with(self, **changes: Any) -> Query:
-        return replace(self, counters=Counters(), **changes)
+        # What `replace` does, which asks about each field: a loop makes many questions.
+        other = object.__new__(Query)
+        vars(other).update(vars(self), counters=Counters(), **changes)
+        return other
 
     def _in(self, topics: Sequence[str], recordings: Sequence[str]) -> Query:
         """The same conditions on other topics and recordings."""
@@ -858,20 +861,15 @@ class Query:
     def plan(self) -> Plan:
         """What to read for this question; resets the counters."""
         lanes: list[Lane] = []
-        self._reset()
+        self.counters.reset()
         targets = self._targets(lanes)
         chooser = self._choose if self._filters else None
         return Plan(lanes, targets, self._clock, chooser, self._reverse, self.counters)
 
-    def _reset(self) -> None:
-        fresh = Counters()
-        for name in fresh.__dataclass_fields__:
-            setattr(self.counters, name, getattr(fresh, name))
-
     @contextmanager
     def costing(self) -> Iterator[None]:
         """Counts from zero, and takes the time, while an answer is made."""
-        self._reset()
+        self.counters.reset()
         started = time.monotonic()
         try:
             yield
@@ -989,13 +987,18 @@ class Query:
         return parts[::-1] if self._reverse else parts
 
     def _count(self) -> int:
-        self._reset()
-        lanes: list[Lane] = []
-        database = self.store.database
+        self.counters.reset()
         if self._filters:
-            database = self.store.database_for("A predicate")
+            self.store.database_for("A predicate")
+        has_index = self.store.database is not None
         is_plain = not self._filters and self.is_by_log_time
-        targets = self._targets(lanes, with_chunks=database is None and not is_plain)
+        total, left = 0, self.topics
+        if has_index and not is_plain:
+            total, left = self._count_in_columns()
+            if not left:
+                return total
+        lanes: list[Lane] = []
+        targets = self._targets(lanes, with_chunks=not has_index and not is_plain)
         if is_plain and self.is_unbounded:
             return sum(
                 channel.stats.messages
@@ -1005,32 +1008,30 @@ class Query:
             )
         if is_plain:
             return sum(map(self._count_between, targets))
-        if database is None:
+        if not has_index:
             plan = Plan(lanes, targets, self._clock, None, self._reverse, self.counters)
             return sum(len(p.batch) for p in Sweep(plan, self.store.segment).unordered())
-        from hybridlog.columns.answers import judged
-
-        total = 0
-        left: list[tuple[str, Target]] = []
-        for topic in sorted({topic for target in targets for topic in _topics_of(target)}):
-            found = judged(self, topic)
-            if found is None:
-                left.extend((topic, t) for t in targets if topic in _topics_of(t))
-            else:
-                total += sum(part.count() for part in found)
-        if not left:
-            return total
+        wanted = [(topic, t) for topic in left for t in targets if topic in _topics_of(t)]
         if not self.is_unbounded:
-            return total + self._count_documents(left)
+            return total + self._count_documents(wanted)
         from hybridlog.counting import in_all_times
 
         of_topic: dict[str, list[RecordingEntry]] = {}
-        for topic, target in left:
+        for topic, target in wanted:
             of_topic.setdefault(topic, []).append(target.recording)
         return total + sum(
             in_all_times(self.store, topic, recordings, self.filter)
             for topic, recordings in of_topic.items()
         )
+
+    def _count_in_columns(self) -> tuple[int, tuple[str, ...]]:
+        """Messages of the topics that columns answer, and the topics that they do not."""
+        from hybridlog.columns.answers import judged
+
+        parts = {topic: judged(self, topic) for topic in self.topics}
+        found = [part for of_topic in parts.values() for part in of_topic or ()]
+        left = tuple(topic for topic, of_topic in parts.items() if of_topic is None)
+        return sum(part.count() for part in found), left
 
     def _count_between(self, target: Target) -> int:
         """Messages of one recording in the range of log time, whatever is in them."""
@@ -1080,7 +1081,7 @@ class Query:
 
         database = self.store.database_for("Reading index documents")
         lanes: list[Lane] = []
-        self._reset()
+        self.counters.reset()
         found = self._targets(lanes, with_chunks=False)
         targets = [t for t in found if topic in _topics_of(t)]
         started = time.monotonic()

@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 DEFAULT_STORE = "hybridlog-store"
 EMBEDDED = "embedded"  # in place of a URI: the MongoDB that comes with hybridlog
 _MOST_OPEN_SEGMENTS = 256
+_MOST_WORDS = 128  # topics and predicates whose meaning is remembered
 
 
 def store_path(path: str | Path | None = None) -> Path:
@@ -126,6 +128,7 @@ class Store:
         self._chunk_lists = ChunkLists()
         self.kept = KeptColumns(self)
         self._lock = threading.Lock()
+        self._learn()
 
     def __enter__(self) -> Self:
         """The store itself."""
@@ -227,6 +230,15 @@ class Store:
             self._columns.clear()  # closed by the last thread that reads from them
         self._chunk_lists.clear()
         self.kept.clear()
+        self._learn()
+
+    def _learn(self) -> None:
+        """Remember from now on what words of questions mean: to find out takes half of a count.
+
+        Anew, not emptied: who looks something up at this moment looks into what was before.
+        """
+        self._resolved = lru_cache(_MOST_WORDS)(self._resolve)
+        self._compiled = lru_cache(_MOST_WORDS)(self._compile)
 
     def select(self, names: Sequence[str]) -> list[RecordingEntry]:
         """Recordings by id, by name, or by the beginning of an id when it is unambiguous.
@@ -297,9 +309,17 @@ class Store:
         Raises:
             TopicError: a name fits nothing, or several topics; lists the candidates.
         """
+        from hybridlog.reader import Query
+
+        return Query(self, *self._resolved(names))
+
+    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Full names of topics, and the recordings that have any of them."""
+        known = self.topics()
         if not names:
-            raise TopicError("Which topic? " + _listed(self.topics()))
-        return self.query(resolve(names, self.topics()))
+            raise TopicError("Which topic? " + _listed(known))
+        found = self.query(resolve(names, known))
+        return found.topics, found.recording_ids
 
     def all_topics(self) -> Query:
         """A question about everything."""
@@ -319,6 +339,26 @@ class Store:
         if wanted and not chosen:
             raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
         return Query(self, tuple(topics), chosen)
+
+    def predicate(
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
+    ) -> dict[str, object]:
+        """The MongoDB filter of a predicate on some topics of some recordings.
+
+        Raises:
+            WhereError: it cannot be understood, or does not fit the fields.
+        """
+        own: dict[str, object] = _copied(self._compiled(text, topics, recordings))
+        return own
+
+    def _compile(
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
+    ) -> dict[str, object]:
+        from hybridlog.query.where import compile_filter
+        from hybridlog.reader import Query
+
+        types = Query(self, topics, recordings).field_types()
+        return compile_filter(text, field_types=types)
 
     def chunks(
         self,
@@ -556,6 +596,13 @@ def check_claim(database: Database, store_id: str | None = None) -> bool:
             "another store. Name a database of its own in the URI: mongodb://host/NAME."
         )
     return mark is not None
+
+
+def _copied(value: Any) -> Any:
+    """A filter that whoever gets it may change."""
+    if isinstance(value, dict):
+        return {name: _copied(inner) for name, inner in value.items()}
+    return [_copied(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _listed(names: Sequence[str]) -> str:

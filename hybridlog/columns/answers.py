@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,7 +68,7 @@ def judged(
     fields: Collection[str] = (),
     *,
     as_rows: bool = False,
-    instead_s: float | None = None,
+    instead_s: Callable[[], float] | None = None,
 ) -> list[Judged] | None:
     """What columns say of one of a question's topics, of `limit` and `every` apart.
 
@@ -76,7 +77,7 @@ def judged(
         topic: One of its topics.
         fields: Paths of fields that are needed besides those of the predicate.
         as_rows: Whether the messages themselves are wanted, not only their number.
-        instead_s: What the answer costs without columns, if the caller knows it.
+        instead_s: Says what the answer costs without columns, if the caller knows better.
 
     Returns:
         One of each recording that has the topic; None if columns do not have it all, or
@@ -86,8 +87,6 @@ def judged(
     if store.database is None or not store.kept.most_bytes or not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)
-    if instead_s is None:
-        instead_s = _instead_s(query, topic, spans, as_rows=as_rows)
     predicate = query.filter
     filters, wanted, recordings = [], set(fields), []
     for recording in store.recordings():
@@ -107,7 +106,7 @@ def judged(
         recordings,
         wanted,
         ordered=as_rows or spans is not None,
-        instead_s=instead_s,
+        instead_s=instead_s or partial(_instead_s, query, topic, spans, as_rows=as_rows),
         counters=query.counters,
     )
     if columns is None:

@@ -141,7 +141,7 @@ class KeptColumns:
         fields: Collection[str],
         *,
         ordered: bool,
-        instead_s: float,
+        instead_s: Callable[[], float],
         counters: Counters,
     ) -> list[TopicColumns] | None:
         """Columns of fields of a topic, of each recording; None when they are not worth it.
@@ -151,14 +151,14 @@ class KeptColumns:
             recordings: Those wanted, all of which `types` knows the fields of.
             fields: Paths.
             ordered: Whether log times and arrival numbers are wanted, too.
-            instead_s: What the answer costs without them, see `cost_s`.
+            instead_s: Says what the answer costs without them, see `cost_s`.
             counters: Get what is read.
         """
         wanted = _Wanted(frozenset(fields), ordered)
         with self._lock:
             generation = self._generation
             found, missing = self._look(topic, recordings, wanted)
-            if missing and not self._is_worth(topic, recordings, missing, wanted, instead_s):
+            if missing and not self._is_worth(topic, recordings, missing, wanted, instead_s()):
                 return None
         if missing:
             # Of several who want the same at once, the first one gets it for all.

@@ -60,6 +60,12 @@ class Counters:
     reduced: int = 0
     elapsed_s: float = 0.0
 
+    def reset(self) -> None:
+        """Count from zero."""
+        self.messages = self.payload_bytes = self.bytes_read = self.chunks_read = 0
+        self.documents_read = self.reduced = 0
+        self.elapsed_s = 0.0
+
 
 def count_given(counters: Counters, batch: Batch) -> None:
     """Messages were given out."""
