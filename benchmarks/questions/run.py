@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.harness.child import ChildError, run_child
 from benchmarks.harness.run import Outcome
+from benchmarks.questions.base import SLOW_TIMES
 from benchmarks.samples import Sample
 from benchmarks.side import warm_cache
 from benchmarks.studies.runs import Context, run_directory
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 3600.0
 """A side is ended after it."""
-ONCE = "once"
-"""Value of a sample that stands for all repetitions: the question was slow."""
+SLOW = "slow"
+"""Value of the samples of a question that was slow, and has `SLOW_TIMES` of them at most."""
 
 Result = dict[str, Any]
 
@@ -52,9 +53,9 @@ def to_do(context: Context, turn: Turn) -> bool:
 
 def _stands_for(context: Context, wanted: Sample) -> bool:
     first = replace(wanted, repetition=0)
-    if context.to_do(first):
+    if wanted.repetition < SLOW_TIMES or context.to_do(first):
         return False
-    return bool(context.journal.samples[first.key].values.get(ONCE))
+    return bool(context.journal.samples[first.key].values.get(SLOW))
 
 
 def do(
@@ -125,12 +126,13 @@ def _run(
 def _note(context: Context, turn: Turn, outcome: Outcome, found: Iterable[Sample]) -> None:
     """Note what was found, and of what was not, why."""
     known = {sample.key: sample for sample in found}
-    once = {
-        replace(sample, repetition=0).key for sample in known.values() if sample.values.get(ONCE)
+    slow = {
+        replace(sample, repetition=0).key for sample in known.values() if sample.values.get(SLOW)
     }
     for wanted in turn.samples:
         sample = known.get(wanted.key)
-        if sample is None and replace(wanted, repetition=0).key in once:
+        is_extra = wanted.repetition >= SLOW_TIMES
+        if sample is None and is_extra and replace(wanted, repetition=0).key in slow:
             continue
         if sample is None:
             status = "failed" if outcome.status == "ok" else outcome.status

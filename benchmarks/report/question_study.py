@@ -48,7 +48,8 @@ def section(book: Book) -> Section | None:
         "columns that were laid down beside those when the load was recorded.",
         "Each backend was closed, its server too, and opened again before it was asked for the "
         "first time. Rows of one backend share its files, which the first of them brings into "
-        "the machine's memory. What took more than ten seconds was asked once.",
+        "the machine's memory. What took more than ten seconds was asked twice, both "
+        "times for the first time since it was opened.",
     ]
     wrong = differing(book)
     if wrong:

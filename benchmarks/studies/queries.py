@@ -42,7 +42,7 @@ class Settings:
         sessions: Of the load.
         minutes: Length of each session, at least 1.
         repetitions: Of each question, for the first time since the backend was opened, and
-            after one of those; what takes more than 10 s is asked once.
+            after one of those; what takes more than 10 s is asked twice in all.
         backends: Names of those that take part; None for all.
     """
 
@@ -130,7 +130,7 @@ def make_load(context: Context, settings: Settings) -> Load:
 def _samples(
     outcome: Outcome, result: turns.Result, truth: dict[str, Any], settings: Settings
 ) -> Iterable[Sample]:
-    """One sample a repetition; one in all of a question that was too slow to ask again."""
+    """One sample a repetition; of a question that was slow, one for each time it was asked."""
     question = result["question"]
     error = result.get("error", "")
     values = dict(outcome.values)
@@ -141,7 +141,7 @@ def _samples(
     if not error:
         values["answer"] = result["answer"]
     if not times:
-        values[turns.ONCE] = True
+        values[turns.SLOW] = True
         times = first_times or [0.0]
     for repetition, ms in enumerate(times):
         wanted = Sample(STUDY, _case(question, settings), result["row"], repetition)

@@ -124,7 +124,7 @@ def _sample(
     if not error:
         values |= {name: result[name] for name in _USUAL_MEASURES}
         if repetition == 0 and result["total_ms"] > SLOW_S * 1e3:
-            values[turns.ONCE] = True
+            values[turns.SLOW] = True
     wanted = Sample(STUDY, _case(task, settings), result["row"], repetition)
     return turns.judged(wanted, values, truth[task, repetition], error)
 

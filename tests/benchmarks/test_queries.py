@@ -9,6 +9,7 @@ import shutil
 import signal
 import sqlite3
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -244,7 +245,7 @@ def test_what_is_missing_is_said(work: Path, tmp_path: Path) -> None:
     assert queries.plan(context(tmp_path, work, backends=again)) == []
 
 
-def test_what_is_slow_is_asked_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_is_slow_is_asked_twice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls: list[int] = []
 
     def question() -> int:
@@ -257,20 +258,26 @@ def test_what_is_slow_is_asked_once(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     calls.clear()
     slow = sides._timed(question, 3)
     assert (len(calls), slow["ms"]) == (1, [])
+    assert not sides._has_enough(slow)
+    slow |= sides._first_again(question, slow)
+    assert (len(calls), sides._has_enough(slow), slow["ms"]) == (2, True, [])
 
     asked = context(tmp_path, backends={"sqlite_udf": able("sqlite_udf")})
-    (turn,) = queries.plan(asked, SMALL)
+    settings = replace(SMALL, repetitions=3)
+    (turn,) = queries.plan(asked, settings)
     truth: dict[str, Any] = dict.fromkeys(QUESTIONS, 7)
     for name in QUESTIONS:
         result = {"row": "sqlite_udf", "question": name, "index_bytes": None, **slow}
         outcome = SimpleNamespace(values={})
-        (sample,) = queries._samples(outcome, result, truth, SMALL)  # type: ignore[arg-type]
-        assert [sample.values["ms"]] == [sample.values["cold_ms"]] == slow["cold_ms"]
-        assert queries.expected_seconds(asked, SMALL) > 0
-        asked.journal.add(sample)
-    # One sample stands for all repetitions.
-    assert queries.expected_seconds(asked, SMALL) == 0
-    assert len(turn.samples) == 2 * len(QUESTIONS)
+        samples = list(queries._samples(outcome, result, truth, settings))  # type: ignore[arg-type]
+        assert [s.values["ms"] for s in samples] == slow["cold_ms"]
+        assert [s.values["cold_ms"] for s in samples] == slow["cold_ms"]
+        for sample in samples:
+            assert queries.expected_seconds(asked, settings) > 0
+            asked.journal.add(sample)
+    # Two samples stand for all repetitions.
+    assert queries.expected_seconds(asked, settings) == 0
+    assert len(turn.samples) == 3 * len(QUESTIONS)
 
 
 def test_first_times_are_of_one_answer() -> None:
@@ -385,7 +392,7 @@ def test_the_small_parts() -> None:
         assert tasks.checksum(odd) == tasks.checksum(np.array([1, 0, 0], np.float32))
 
 
-def test_a_task_that_is_slow_is_done_once(
+def test_a_task_that_is_slow_is_done_twice(
     monkeypatch: pytest.MonkeyPatch, work: Path, tmp_path: Path
 ) -> None:
     asked = context(tmp_path, work, backends={"sqlite_json1": able("sqlite_json1")})
@@ -399,19 +406,23 @@ def test_a_task_that_is_slow_is_done_once(
         backend="benchmarks.backends.sqlite:SqliteJson1",
         directory=str(tmp_path / "data"),
         rows=askers.READERS["sqlite_json1"],
-        repetitions=2,
+        repetitions=3,
         results=str(results),
     )
     assert (values["status"], values["reason"]) == ("ok", "")
     told = [json.loads(line) for line in results.read_text().splitlines()]
-    assert [(t["task"], t["repetition"]) for t in told] == [(name, 0) for name in tasks.TASKS]
-    truth = tasks.true_answers(load, 1)
-    assert reading.expected_seconds(asked, SHORT) > 0
+    assert [(t["task"], t["repetition"]) for t in told] == [
+        (name, repetition) for name in tasks.TASKS for repetition in range(2)
+    ]
+    truth = tasks.true_answers(load, 2)
+    settings = replace(SHORT, repetitions=3)
     for result in told:
+        assert reading.expected_seconds(asked, settings) > 0
         outcome = SimpleNamespace(values=values)
-        asked.journal.add(reading._sample(outcome, result, truth, SHORT))  # type: ignore[arg-type]
+        sample = reading._sample(outcome, result, truth, settings)  # type: ignore[arg-type]
+        asked.journal.add(sample)
     assert {s.status for s in asked.journal.samples.values()} == {"ok"}
-    assert reading.expected_seconds(asked, SHORT) == 0
+    assert reading.expected_seconds(asked, settings) == 0
 
 
 def test_slices_begin_and_end_between_scans(work: Path, tmp_path: Path) -> None:
