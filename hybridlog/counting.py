@@ -67,6 +67,14 @@ def in_all_times(
     return _counted(database, topic, recordings, own)
 
 
+def in_columns(query: Query, topics: Iterable[str]) -> tuple[int, list[str]]:
+    """Number of a query's messages of topics that columns answer, and the topics that are left."""
+    parts = {topic: judged(query, topic) for topic in topics}
+    found = [part for of_topic in parts.values() for part in of_topic or ()]
+    left = [topic for topic, of_topic in parts.items() if of_topic is None]
+    return sum(part.count() for part in found), left
+
+
 def any_in_each(query: Query, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
     """In which spans of log time of one recording any message of a question lies.
 

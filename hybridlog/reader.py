@@ -992,9 +992,11 @@ class Query:
             self.store.database_for("A predicate")
         has_index = self.store.database is not None
         is_plain = not self._filters and self.is_by_log_time
-        total, left = 0, self.topics
+        total, left = 0, list(self.topics)
         if has_index and not is_plain:
-            total, left = self._count_in_columns()
+            from hybridlog.counting import in_columns
+
+            total, left = in_columns(self, self.topics)
             if not left:
                 return total
         lanes: list[Lane] = []
@@ -1024,15 +1026,6 @@ class Query:
             for topic, recordings in of_topic.items()
         )
 
-    def _count_in_columns(self) -> tuple[int, tuple[str, ...]]:
-        """Messages of the topics that columns answer, and the topics that they do not."""
-        from hybridlog.columns.answers import judged
-
-        parts = {topic: judged(self, topic) for topic in self.topics}
-        found = [part for of_topic in parts.values() for part in of_topic or ()]
-        left = tuple(topic for topic, of_topic in parts.items() if of_topic is None)
-        return sum(part.count() for part in found), left
-
     def _count_between(self, target: Target) -> int:
         """Messages of one recording in the range of log time, whatever is in them."""
         has_index = self.store.database is not None
@@ -1056,8 +1049,14 @@ class Query:
                 if not has_index:
                     raise
                 counted = set()  # the index knows it without the segment
-        left = [(topic, target) for topic in topics if topic not in counted]
-        return total + self._count_documents(left) if left else total
+        others = [topic for topic in topics if topic not in counted]
+        if not others:
+            return total
+        from hybridlog.counting import in_columns
+
+        found, left = in_columns(self._with(recording_ids=(target.recording.id,)), others)
+        total += found
+        return total + self._count_documents([(topic, target) for topic in left]) if left else total
 
     def _count_documents(self, wanted: Sequence[tuple[str, Target]]) -> int:
         """What the index has of topics of recordings in the range, where the predicate holds."""

@@ -52,14 +52,23 @@ class Judged:
         """Messages in the ranges of which the predicate holds, in order."""
         if self.spans is None:
             return np.flatnonzero(self.holds())
-        bounds = np.array(self.spans, np.int64).reshape(-1, 2)
-        low, high = np.searchsorted(self.columns.log_time, bounds).T
+        low, high = self._within(self.spans)
         rows = ranges(low, high - low)
         return rows if self.predicate is None else rows[self.holds(rows)]
 
     def count(self) -> int:
         """Number of these messages."""
-        return int(np.count_nonzero(self.holds())) if self.spans is None else len(self.rows())
+        if self.spans is None:
+            return int(np.count_nonzero(self.holds()))
+        if self.predicate is None:
+            low, high = self._within(self.spans)
+            return int((high - low).sum())
+        return len(self.rows())
+
+    def _within(self, spans: Sequence[Span]) -> NDArray[np.intp]:
+        """First messages of ranges, and those behind their last ones: intp[2, n]."""
+        bounds = np.array(spans, np.int64).reshape(-1, 2)
+        return np.searchsorted(self.columns.log_time, bounds).T
 
 
 def judged(

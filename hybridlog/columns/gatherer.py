@@ -40,6 +40,7 @@ _ARENA = 2 << 20  # bytes of payloads that are put together to be decoded; cache
 _ENOUGH = 1 << 20  # a chunk of so many is decoded where it is
 _ROWS = 1 << 18  # messages that are put together
 _PENDING = 16 << 20  # bytes of columns that are laid down together: many small blocks cost memory
+_PART = 1000  # bytes that a part of a topic takes besides its columns
 _RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
 _log = logging.getLogger(__name__)
 
@@ -64,11 +65,12 @@ class _Held(NamedTuple):
 
 
 class _Topic:
-    """What is known of a topic; without `types` there are no columns of it."""
+    """What is known of a topic; without `types` there is nothing but the order of its messages."""
 
     def __init__(self, channel: Channel) -> None:
         self.codec: Codec = codec_for(channel)
         self.types = types_of(self.codec) if channel.message_encoding in SINGLE_READ else {}
+        self.is_wanted = True
         self.rows = 0
         self.is_ordered = True
         self.pending: list[tuple[Order, dict[str, Single]]] = []
@@ -76,8 +78,15 @@ class _Topic:
 
     def give_up(self) -> None:
         """Have no columns of it."""
+        self.is_wanted = False
         self.types = {}
         self.pending.clear()
+
+    def give_up_fields(self) -> None:
+        """Have only the order of its messages: of all of them, or of none."""
+        if self.types and self.rows:
+            self.give_up()
+        self.types = {}
 
     def meet(self, channel: Channel) -> None:
         """A channel of the topic has messages."""
@@ -106,7 +115,7 @@ class _Topic:
 
 
 class FieldGatherer:
-    """Collects the fields of a recording's small messages while it is indexed.
+    """Collects the order of a recording's messages, and fields of small ones, while it is indexed.
 
     Payloads are put together until there are enough of them to be decoded by columns. Where
     anything does not fit there are no columns of a topic; where anything fails, or the disk
@@ -126,7 +135,6 @@ class FieldGatherer:
         self._rows = 0
         self._held: list[_Held] = []
         self._channels: dict[int, Channel] = {}
-        self._large: set[int] = set()  # channels of which messages were seen among large ones
         self._topics: dict[str, _Topic] = {}
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
@@ -147,7 +155,7 @@ class FieldGatherer:
             whole = {
                 name: {ORDERED: topic.is_ordered, RECORDING: entry.key}
                 for name, topic in self._topics.items()
-                if topic.types and topic.rows == entry.messages_of(name)
+                if topic.is_wanted and topic.rows == entry.messages_of(name)
             }
             if self._writer is not None:
                 self._writer.close(whole)
@@ -179,16 +187,13 @@ class FieldGatherer:
 
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch = chunk.batch
-        if not is_small(batch.payload_bytes, len(batch)):
-            # With some messages missing there is no use in the others.
-            large = set(batch.channel.tolist()) - self._large
-            if large:
-                self._channels.update(channels)
-                for topic in self._topics_of(batch.channel).values():
-                    topic.give_up()
-                self._large |= large
-            return
         self._channels.update(channels)
+        if not is_small(batch.payload_bytes, len(batch)):
+            whole = _Held(batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq)
+            for topic, held in self._by_topic(whole):
+                topic.give_up_fields()
+                self._add_order(topic, held)
+            return
         begin = int(batch.offset.min())
         size = int((batch.offset + batch.length).max()) - begin
         if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:
@@ -223,15 +228,20 @@ class FieldGatherer:
         held = _Held(*(np.concatenate(parts) for parts in zip(*self._held, strict=True)))
         self._held.clear()
         self._filled = self._rows = 0
+        for topic, part in self._by_topic(held):
+            if topic.types:
+                self._read(topic, part, data)
+            else:
+                self._add_order(topic, part)
+
+    def _by_topic(self, held: _Held) -> Iterator[tuple[_Topic, _Held]]:
+        """Messages, those of each topic by themselves."""
         by_channel = self._topics_of(held.channel)
         topics = list(dict.fromkeys(by_channel.values()))
         table = np.zeros(int(held.channel.max()) + 1, np.int32)
         table[list(by_channel)] = [topics.index(topic) for topic in by_channel.values()]
         for number, rows in rows_by_channel(table[held.channel]):
-            if topics[number].types:
-                self._read(topics[number], held.take(rows), data)
-        if self._pending >= _PENDING:
-            self._flush()
+            yield topics[number], held.take(rows)
 
     def _topics_of(self, channel: NDArray[np.int32]) -> dict[int, _Topic]:
         """The topics of messages, by the ids of their channels."""
@@ -253,9 +263,17 @@ class FieldGatherer:
         except UnfitError:
             topic.give_up()
             return
-        fields = {path: _apart(column, data) for path, column in fields.items()}
+        self._lay(topic, held, {path: _apart(column, data) for path, column in fields.items()})
+
+    def _add_order(self, topic: _Topic, held: _Held) -> None:
+        if topic.is_wanted:
+            self._lay(topic, held, {})
+
+    def _lay(self, topic: _Topic, held: _Held, fields: dict[str, Single]) -> None:
         topic.add(Order(held.log_time, held.seq), fields)
-        self._pending += held.seq.nbytes * 2 + sum(map(nbytes, fields.values()))
+        self._pending += held.seq.nbytes * 2 + sum(map(nbytes, fields.values())) + _PART
+        if self._pending >= _PENDING:
+            self._flush()
 
     def _flush(self) -> None:
         """Lay down what was decoded."""

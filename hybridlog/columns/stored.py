@@ -1,9 +1,10 @@
-"""Columns of small messages in a file beside the segments, for who asks for the first time.
+"""Columns of messages in a file beside the segments, for who asks for the first time.
 
 To look at a document costs MongoDB 0.6 µs, whoever asks; a field of a million messages
 that lies in a file of its own is read in a few milliseconds. So while a recording is made,
-the fields of its small messages are laid down as columns, too. They follow from the
-segments, as the index does: where they are missing or damaged, the index answers.
+the fields of its small messages are laid down as columns, too, and the order of all. They
+follow from the segments, as the index does: where they are missing or damaged, the index
+answers.
 """
 
 from __future__ import annotations
@@ -134,8 +135,8 @@ class FieldColumns:
 
 def _fits(stored: str | None, kind: str) -> bool:
     """Whether columns of a type hold what a definition calls so."""
-    if kind == "char":
-        return stored in {"|u1", "|i1"}  # in ROS 1 and in ROS 2
+    if kind in {"byte", "char"}:
+        return stored in {"|u1", "|i1"}  # one in ROS 1, the other in ROS 2
     special = {"string": TEXT, "time": "<i8", "duration": "<i8"}
     return stored == (special.get(kind) or np.dtype(kind).str)
 

@@ -33,6 +33,7 @@ _KINDS: dict[str, _Kind] = {
     "float64": "float",
     "time": "integer",
     "duration": "integer",
+    "byte": "integer",
     "char": "integer",
     # uint64 is none of them: beyond int64 the index holds it as a float.
     **dict.fromkeys(("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32"), "integer"),

@@ -8,11 +8,14 @@ import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.columns import gatherer as gathering
@@ -21,7 +24,8 @@ from hybridlog.columns.stored import NAME, FieldColumns
 from hybridlog.schema.column import Strings
 from hybridlog_storage import column_file
 from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog
-from hybridlog_storage.errors import DatabaseError
+from hybridlog_storage.database import Database
+from hybridlog_storage.errors import DatabaseError, TimeError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.columns.test_kept import BASE, DEFINITION, SECOND, message, usual, write_log
@@ -444,13 +448,68 @@ def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Pa
     assert not list(place.iterdir())
 
 
-def test_large_messages_have_no_columns(store: hl.Store) -> None:
-    image = Channel(
-        "/image", "ros1", Schema("test/Image", "ros1msg", b"uint32 width\nuint8[] data")
-    )
+IMAGE = Channel("/image", "ros1", Schema("test/Image", "ros1msg", b"uint32 width\nuint8[] data"))
+
+
+def image(size: int) -> bytes:
+    return (640).to_bytes(4, "little") + size.to_bytes(4, "little") + bytes(size)
+
+
+def test_of_large_messages_there_is_their_order(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = [BASE + n for n in (0, 3, 1, 2, 4)]
     with store.start("live") as recording:
-        for n in range(5):
-            payload = (640).to_bytes(4, "little") + (2000).to_bytes(4, "little") + bytes(2000)
-            recording.write(image, payload, log_time=BASE + n)
-    assert not file_of(store, recording.id).exists()
-    assert store.topic("/image").where("width == 640").count() == 5
+        for time in times:
+            recording.write(IMAGE, image(2000), log_time=time)
+    assert columns_in(file_of(store, recording.id)) == {"/image": [":log_time", ":seq"]}
+    images = store.topic("/image")
+    assert images.where("width == 640").count() == 5
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "count_each", None)  # nobody asks the index
+        assert images.between(f"{BASE + 1}ns", f"{BASE + 4}ns").count() == 3
+    file = store.columns(recording.id)
+    assert file is not None
+    assert file.read("/image", {}, ordered=True).log_time.tolist() == sorted(times)
+    assert store.verify().findings == []
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["/image", "/other"]), st.sampled_from([0, 900, 3000]), st.booleans()
+        ),
+        max_size=40,
+    ),
+    st.lists(st.tuples(st.integers(-1, 41), st.integers(0, 42)), min_size=1, max_size=5),
+)
+def test_messages_of_any_size_are_counted_in_ranges(
+    tmp_path_factory: pytest.TempPathFactory,
+    messages: list[tuple[str, int, bool]],
+    ranges: list[tuple[int, int]],
+) -> None:
+    """Topics that are small in some chunks and large in others have columns of all or none."""
+    own = {name: Channel(name, "ros1", IMAGE.schema) for name in ("/image", "/other")}
+    where = tmp_path_factory.mktemp("sizes") / "store"
+    with hl.open(where, create=True, require_database=True) as store:
+        with store.start("live", settings=SegmentSettings(chunk_size=4096)) as recording:
+            for n, (topic, size, swapped) in enumerate(messages):
+                recording.write(own[topic], image(size), log_time=BASE + (n ^ swapped))
+        assert store.verify().findings == []
+        file = store.columns(recording.id)
+        for topic in {topic for topic, *_ in messages}:
+            times = [BASE + (n ^ s) for n, (t, _, s) in enumerate(messages) if t == topic]
+            if file is not None and file.has(recording.close().entry, topic, {}):
+                found = file.read(topic, {}, ordered=True).log_time.tolist()
+                assert found == sorted(times)
+            for begin, length in ranges:
+                first, last = BASE + begin, BASE + begin + length
+                with suppress(TimeError):
+                    count = store.topic(topic).between(f"{first}ns", f"{last}ns").count()
+                    assert count == sum(first <= time < last for time in times)
+
+
+def columns_in(path: Path) -> dict[str, list[str]]:
+    file = column_file.ColumnFile(path)
+    return {table: sorted(file.types(table)) for table in file.tables()}
