@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 from warnings import catch_warnings, filterwarnings
 
 from benchmarks.report.look import OURS, Look, look, ordered
-from benchmarks.report.model import Graph, Line, Panel
+from benchmarks.report.model import Graph, Line, Panel, Value
 from hybridlog.cli.output import printable
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ _WIDTH = 9.6
 _LEGEND_ROW = 0.22
 _APART = 1.015
 _MARGIN = 1.3
+_NOTHING = Value(math.nan, math.nan, math.nan, 0)
 _NAMES = 90
 """Letters that fit side by side below a figure."""
 _STYLE: dict[Any, Any] = {
@@ -133,7 +136,21 @@ def _lines(axes: Axes, panel: Panel) -> None:
     for line in sorted(panel.lines, key=lambda one: one.backend == OURS):
         if line.points:
             place = panel.lines.index(line) - (len(panel.lines) - 1) / 2
-            _line(axes, line, 1.0 if panel.offered else _APART**place)
+            _line(axes, _parted(panel, line), 1.0 if panel.offered else _APART**place)
+
+
+def _parted(panel: Panel, line: Line) -> Line:
+    """A line that ends and begins anew where the panel has places between two of its points.
+
+    Joined, they would say something of what was not measured.
+    """
+    measured = {_place(x) for one in panel.lines for x, _ in one.points}
+    points: list[tuple[float | str, Value]] = []
+    for x, value in line.points:
+        if points and any(_place(points[-1][0]) < other < _place(x) for other in measured):
+            points.append((x, _NOTHING))
+        points.append((x, value))
+    return replace(line, points=tuple(points))
 
 
 def _line(axes: Axes, line: Line, shift: float) -> None:

@@ -175,7 +175,8 @@ def _figure_4(samples: Sequence[Sample]) -> Graph:
     return Graph(
         "figure-4",
         "Figure 4: throughput over message size",
-        f"One graph a rate, one line a backend. {_how(samples)}",
+        "One graph a rate, one line a backend, broken where sizes between were not measured. "
+        f"{_how(samples)}",
         "lines",
         _panels([one for one in samples if one.backend != _POSTGRES[0]]),
         "message size",

@@ -23,7 +23,7 @@ from benchmarks.report.book import Book
 from benchmarks.report.build import report
 from benchmarks.report.look import look, ordered
 from benchmarks.report.markdown import escaped, markdown
-from benchmarks.report.model import Report, Section, Table, Value
+from benchmarks.report.model import Line, Panel, Report, Section, Table, Value
 from benchmarks.report.page import page
 from benchmarks.report.terminal import show
 from benchmarks.report.write import write
@@ -542,6 +542,16 @@ def test_the_page_is_one_whole_file(written: Path) -> None:
     assert text.count("<svg") == 8
     assert "prefers-color-scheme: dark" in text
     assert "width=device-width" in text
+
+
+def test_a_line_says_nothing_of_what_was_not_measured() -> None:
+    value = Value(1.0, 1.0, 1.0, 2)
+    whole = Line("hybridlog", tuple((x, value) for x in (1.0, 2.0, 3.0, 4.0)))
+    part = Line("mongo_json", ((1.0, value), (2.0, value), (4.0, value)))
+    panel = Panel("", (whole, part))
+    assert figures._parted(panel, whole) == whole
+    drawn = [(x, math.isnan(v.median)) for x, v in figures._parted(panel, part).points]
+    assert drawn == [(1.0, False), (2.0, False), (4.0, True), (4.0, False)]
 
 
 def test_figures_are_well_formed_and_the_same_again(written: Path, tmp_path: Path) -> None:
