@@ -67,7 +67,7 @@ def in_all_times(
     return _counted(database, topic, recordings, own)
 
 
-def in_columns(query: Query, topics: Iterable[str]) -> tuple[int, list[str]]:
+def count_in_columns(query: Query, topics: Iterable[str]) -> tuple[int, list[str]]:
     """Number of a query's messages of topics that columns answer, and the topics that are left."""
     parts = {topic: judged(query, topic) for topic in topics}
     found = [part for of_topic in parts.values() for part in of_topic or ()]

@@ -994,9 +994,9 @@ class Query:
         is_plain = not self._filters and self.is_by_log_time
         total, left = 0, list(self.topics)
         if has_index and not is_plain:
-            from hybridlog.counting import in_columns
+            from hybridlog.counting import count_in_columns
 
-            total, left = in_columns(self, self.topics)
+            total, left = count_in_columns(self, self.topics)
             if not left:
                 return total
         lanes: list[Lane] = []
@@ -1052,9 +1052,9 @@ class Query:
         others = [topic for topic in topics if topic not in counted]
         if not others:
             return total
-        from hybridlog.counting import in_columns
+        from hybridlog.counting import count_in_columns
 
-        found, left = in_columns(self._with(recording_ids=(target.recording.id,)), others)
+        found, left = count_in_columns(self._with(recording_ids=(target.recording.id,)), others)
         total += found
         return total + self._count_documents([(topic, target) for topic in left]) if left else total
 

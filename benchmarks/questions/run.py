@@ -53,9 +53,12 @@ def to_do(context: Context, turn: Turn) -> bool:
 
 def _stands_for(context: Context, wanted: Sample) -> bool:
     first = replace(wanted, repetition=0)
-    if wanted.repetition < SLOW_TIMES or context.to_do(first):
-        return False
-    return bool(context.journal.samples[first.key].values.get(SLOW))
+    return not context.to_do(first) and _is_spared(wanted, context.journal.samples[first.key])
+
+
+def _is_spared(wanted: Sample, first: Sample | None) -> bool:
+    """Whether a repetition is not asked for, since the first one was slow."""
+    return wanted.repetition >= SLOW_TIMES and first is not None and bool(first.values.get(SLOW))
 
 
 def do(
@@ -126,13 +129,9 @@ def _run(
 def _note(context: Context, turn: Turn, outcome: Outcome, found: Iterable[Sample]) -> None:
     """Note what was found, and of what was not, why."""
     known = {sample.key: sample for sample in found}
-    slow = {
-        replace(sample, repetition=0).key for sample in known.values() if sample.values.get(SLOW)
-    }
     for wanted in turn.samples:
         sample = known.get(wanted.key)
-        is_extra = wanted.repetition >= SLOW_TIMES
-        if sample is None and is_extra and replace(wanted, repetition=0).key in slow:
+        if sample is None and _is_spared(wanted, known.get(replace(wanted, repetition=0).key)):
             continue
         if sample is None:
             status = "failed" if outcome.status == "ok" else outcome.status
