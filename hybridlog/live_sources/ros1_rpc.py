@@ -175,12 +175,18 @@ class RpcServer:
             while True:
                 while len(self._clients) >= _MAX_CLIENTS:
                     await asyncio.wait(self._clients, return_when=asyncio.FIRST_COMPLETED)
+                await self._called()
                 try:
-                    client, _ = await loop.sock_accept(self._socket)
+                    # The loop's own `sock_accept` loses a caller whom it has taken when it
+                    # is cancelled in that moment; here nothing waits in between.
+                    client, _ = self._socket.accept()
+                except BlockingIOError:
+                    continue
                 except OSError:
                     # It was gone before we looked, or there are no descriptors left.
                     await asyncio.sleep(0.1)
                     continue
+                client.setblocking(False)
                 task = loop.create_task(self._answer(client))
                 self._clients.add(task)
                 task.add_done_callback(self._clients.discard)
@@ -191,6 +197,16 @@ class RpcServer:
             for task in tuple(self._clients):
                 task.cancel()
             await asyncio.gather(*self._clients, return_exceptions=True)
+
+    async def _called(self) -> None:
+        """Waits until somebody calls."""
+        loop = asyncio.get_running_loop()
+        called = asyncio.Event()
+        loop.add_reader(self._socket, called.set)
+        try:
+            await called.wait()
+        finally:
+            loop.remove_reader(self._socket)
 
     async def _answer(self, client: socket.socket) -> None:
         """Takes one call. Who does not speak as he should is hung up on."""

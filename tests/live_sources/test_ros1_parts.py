@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import random
 import select
 import socket
 import struct
 import time
+import warnings
 
 import pytest
 
@@ -14,6 +17,7 @@ from hybridlog.live_sources.base import Cause
 from hybridlog.live_sources.ros1_counting import Counting
 from hybridlog.live_sources.ros1_header import is_numbered
 from hybridlog.live_sources.ros1_network import PeerError, endpoint_of
+from hybridlog.live_sources.ros1_rpc import RpcServer
 from hybridlog.live_sources.ros1_stream import Stream
 from hybridlog.live_sources.ros1_wire import (
     WireError,
@@ -161,6 +165,34 @@ def test_addresses(uri: str, endpoint: tuple[str, int]) -> None:
 def test_what_is_no_address(uri: str) -> None:
     with pytest.raises(PeerError, match="no address"):
         endpoint_of(uri)
+
+
+# Being called
+
+
+@pytest.mark.parametrize("turns", range(6))
+def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
+    async def stopped_after_turns() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            listening.setblocking(False)
+            serving = asyncio.create_task(RpcServer(listening, {}).serve())
+            await asyncio.sleep(0.01)
+            with socket.create_connection(listening.getsockname()) as caller:
+                for _ in range(turns):
+                    await asyncio.sleep(0)
+                serving.cancel()
+                await asyncio.wait([serving])
+                gc.collect()
+                caller.settimeout(5)
+                try:
+                    assert caller.recv(1) == b""
+                except ConnectionResetError:
+                    pass  # nobody had taken the call yet
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        asyncio.run(stopped_after_turns())
+    assert [str(warning.message) for warning in told] == []
 
 
 # Counting
