@@ -19,6 +19,7 @@ from hybridlog.query.unequal import unequal
 from hybridlog.schema.column import Scalars
 from hybridlog_storage.bson_columns import split
 from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.index_documents import key_bound
 
@@ -98,7 +99,7 @@ def windows(query: Query, before: DurationLike, after: DurationLike) -> Interval
             continue
         for raw, rows, _ in query.thinned_documents(topic, _KEY):
             keys = key_columns(raw).take(rows)
-            numbers = np.unique(keys.recording).tolist()
+            numbers = distinct(keys.recording).tolist()
             parts.extend((number, keys.time[keys.recording == number]) for number in numbers)
     wide = Intervals.of(
         # Where windows begin together, those of the recording with the least key are first.

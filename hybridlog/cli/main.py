@@ -10,6 +10,7 @@ from typing import NoReturn, TextIO
 
 from hybridlog.cli import stopping
 from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
+from hybridlog.cli.spared import spare
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
@@ -18,6 +19,7 @@ __all__ = ["EXIT_CODES", "main"]
 def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
     stopping.install()
+    spare()
     for stream in (sys.stdout, sys.stderr):
         # A name that the terminal's encoding lacks is shown as an escape.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.plan import Counters
+from hybridlog_storage.distinct import distinct
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,7 +58,7 @@ def count_in_chunks(
     whole = touched & (begin <= first) & (last < end) & (messages > 0)
     total = int(messages[whole].sum())
     cut = np.flatnonzero(touched & ~whole)
-    for row in np.unique(number[cut]).tolist():
+    for row in distinct(number[cut]).tolist():
         chunk = chunks[row]
         wanted = {c: chunk.stats[c] for c in channel[cut[number[cut] == row]].tolist()}
         for times in _times(reader_of(chunk.segment), chunk, wanted, counters):

@@ -22,6 +22,7 @@ from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import StoredChunk
@@ -341,7 +342,7 @@ class Sweep:
             times = batch.publish_time
         else:
             times = np.full(len(batch), -1, np.int64)
-            for lane in np.unique(lane_of[mask]).tolist():
+            for lane in distinct(lane_of[mask]).tolist():
                 rows = np.flatnonzero(mask & (lane_of == lane))
                 part = batch.take(rows)
                 decoded = self._plan.lanes[lane].codec.columns(

@@ -17,6 +17,7 @@ from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
 from hybridlog.schema.wire_scan import MisfitError, Scanner
 from hybridlog.schema.wire_walk import Walker
+from hybridlog_storage.distinct import distinct
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -140,7 +141,7 @@ class WireReader:
         kind |= little.u1(begin, 1)
         if bool((kind == _LITTLE).all()):
             return self._read(little, rows, start, end, bad)
-        for code in np.unique(kind).tolist():
+        for code in distinct(kind).tolist():
             if code not in {_LITTLE, _BIG}:
                 name = _OTHER_ENCAPSULATIONS.get(code, "unknown")
                 bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]

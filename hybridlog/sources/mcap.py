@@ -17,6 +17,7 @@ from hybridlog.sources.base import (
     Source,
     cannot_open,
 )
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError, SourceError
 from hybridlog_storage.mcap_scan import (
     MAGIC,
@@ -237,7 +238,7 @@ class McapSource(Source):
         known = found != _UNDEFINED
         if not known.all():
             lost = len(found) - int(known.sum())
-            names = ", ".join(map(str, np.unique(rows.channel[~known]).tolist()[:5]))
+            names = ", ".join(map(str, distinct(rows.channel[~known]).tolist()[:5]))
             self._note(
                 offset, None, f"{lost} messages on channels that are not defined ({names})", lost
             )

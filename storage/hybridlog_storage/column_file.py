@@ -303,6 +303,11 @@ class ColumnFile:
         key = blocks["table"].astype(np.int64) << 32 | blocks["column"]
         order = np.argsort(key, kind="stable")
         self._keys, blocks = key[order], blocks[order]
+        # A table has as many rows as its first column.
+        first = np.arange(len(named), dtype=np.int64) << 32
+        begin, end = np.searchsorted(self._keys, [first, first + 1])
+        before = np.concatenate([np.zeros(1, np.int64), np.cumsum(blocks["rows"], dtype=np.int64)])
+        rows_of = (before[end] - before[begin]).tolist()
         tables: dict[str, _Table] = {}
         for number, (name, columns, notes) in enumerate(named):
             types = dict(columns)
@@ -310,8 +315,7 @@ class ColumnFile:
                 raise self._damaged("its directory has a name twice, or none")
             if not _KNOWN.issuperset(types.values()):
                 raise self._damaged("its directory has types that are not known")
-            rows = int(blocks[self._range(number, 0)]["rows"].sum(dtype=np.int64))
-            tables[name] = _Table(number, types, rows, notes)
+            tables[name] = _Table(number, types, rows_of[number], notes)
         return tables, blocks
 
     def _range(self, table: int, column: int) -> slice:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.messages import Batch, Buffer
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[
         ):
             view[to : to + size] = source[at : at + size]
         return
-    lengths = np.unique(batch.length)
+    lengths = distinct(batch.length)
     for length in lengths[lengths > 0].tolist():
         rows = slice(None) if len(lengths) == 1 else batch.length == length
         places = windows(target, length)

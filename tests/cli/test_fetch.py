@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -399,3 +400,27 @@ def test_json_is_asked_as_it_stands(store: Path) -> None:
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
     closing_line(Counters(messages=251, reduced=12), 0.1, count=False)
     assert capsys.readouterr().err.startswith("239 messages, ")
+
+
+LOADED = """
+import atexit, os, sys
+os._exit = sys.exit  # a command leaves without the interpreter's own end
+atexit.register(lambda: print("pandas" in sys.modules, file=sys.stderr))
+from hybridlog.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize("form", ["jsonl", "table", "csv", "parquet", "npz", "mcap"])
+def test_pandas_is_not_loaded(form: str, store: Path, tmp_path: Path) -> None:
+    """It takes three tenths of a short command's time."""
+    to = [] if form in {"jsonl", "table"} else ["-o", str(tmp_path / f"x.{form}")]
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, *SCAN, "-F", form, *to],
+        capture_output=True,
+        text=True,
+        env=environment(HYBRIDLOG_STORE=str(store)),
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "False"

@@ -19,12 +19,14 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from hybridlog.demo.write import write_bag
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
-from hybridlog_storage.errors import DiskFullError, UsageError
+from hybridlog_storage.database import Database
+from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segment_writer import (
     AT_WORK,
@@ -534,3 +536,69 @@ def test_a_recording_of_more_chunks_than_are_kept_is_counted_whole(
     assert (found.stats.messages, found.stats.first, found.stats.last) == (100, 10**18, 10**18 + 99)
     assert store.recordings()[0].channels == report.entry.channels
     assert store.verify().findings == []
+
+
+def test_a_database_that_is_away_is_asked_once_for_what_is_expected(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def away(self: Database, name: str) -> None:
+        asked.append(name)
+        raise DatabaseError("nobody answers")
+
+    with store.start("talk") as recording:
+        with monkeypatch.context() as patch:
+            patch.setattr(Database, "ensure_collection", away)
+            recording.expect(*(channel(f"/topic{number}") for number in range(5)))
+            recording._capture.index._maker.submit(len, ()).result()
+        assert len(asked) == 1
+        recording.write(channel("/topic1"), text(b"x"), log_time=1)
+    assert store.topic("/topic1").where("data == 'x'").count() == 1
+
+
+SPEAKS = """
+import json, sys, threading, time
+from pathlib import Path
+from rosbags.rosbag1 import Reader
+import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
+
+with Reader(Path(sys.argv[1])) as reader:
+    said = [(c, when, bytes(payload)) for c, when, payload in reader.messages()]
+channels = {
+    c.id: Channel(c.topic, "ros1", Schema(c.msgtype, "ros1msg", c.msgdef.data.encode()))
+    for c, _, _ in said
+}
+
+def speak():
+    for connection, when, payload in said:
+        recording.write(channels[connection.id], payload, log_time=when)
+
+with hl.open(sys.argv[2], create=True) as store, store.start("live") as recording:
+    recording.expect(*channels.values())
+    before = set(sys.modules)
+    speaker = threading.Thread(target=speak)
+    speaker.start()
+    speaker.join()
+    while recording.stored[0] < len(said) or recording.lag:
+        time.sleep(0.01)
+    print(json.dumps([len(said), sorted(set(sys.modules) - before)]))
+"""
+
+
+def test_nothing_is_loaded_while_messages_come(tmp_path: Path) -> None:
+    """What is imported then keeps the interpreter from all who bring messages."""
+    log = tmp_path / "robot.bag"
+    write_bag(log, duration_s=3)
+    done = subprocess.run(
+        [sys.executable, "-c", SPEAKS, str(log), str(tmp_path / "store")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    messages, loaded = json.loads(done.stdout)
+    assert messages > 500
+    assert loaded == []
