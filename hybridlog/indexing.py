@@ -268,6 +268,7 @@ class IndexWriter:
         self._crash: BaseException | None = None
         self._channels: Mapping[int, Channel] = {}
         self._retry_at = 0.0
+        self._is_away = False
         self._renewed: list[Database] = []
 
     @property
@@ -305,9 +306,14 @@ class IndexWriter:
         self._maker.submit(self._prepare, channel).add_done_callback(self._done)
 
     def _prepare(self, channel: Channel) -> None:
-        # A database that fails here fails again with the first documents, and is told then.
-        with suppress(DatabaseError):
+        if self._is_away:
+            return
+        try:
             self._ensure(collection_of(channel.topic))
+        except DatabaseError:
+            # It fails again with the first documents, and is told then. To find out that
+            # nobody answers takes seconds, and others stand behind this.
+            self._is_away = True
 
     def nudge(self) -> None:
         """Send what has been made so far, however little, once a sender is free."""
@@ -385,7 +391,7 @@ class IndexWriter:
                     self._latest.append(entry)
                 else:
                     self.indexed -= self._put_back(entry)
-            self.failure = None
+            self.failure, self._is_away = None, False
             waiting = len(self._forgotten)
         for _ in range(waiting):
             self._maker.submit(self._remember).add_done_callback(self._done)

@@ -42,6 +42,7 @@ _LOOK_S = 1.0
 _JUMP_S = 0.5
 _MOST_SAID = 1000
 _MOST_LANES = 4096  # channel objects whose lane is found at once
+_MOST_EXPECTED = 1000  # channels that get a collection before they have said anything
 _SEQUENCES = 1 << 32
 
 
@@ -160,6 +161,7 @@ class Recorder:
         self._present: dict[str, int] = {}
         self._lock = threading.Lock()
         self._said: set[str] = set()
+        self._expected = 0
         self._unended = len(sources)
         self._over = threading.Event()
         self._reason = ""
@@ -358,6 +360,16 @@ class Recorder:
             return True
         with self._lock:
             return self._options.matcher(topic)
+
+    def expect(self, channel: Channel) -> None:
+        """See `Sink.expect`."""
+        if isinstance(self._target, Snapshots):
+            return  # what is in the ring goes into no index before a trigger
+        with self._lock:
+            self._expected += 1
+            too_many = self._expected > _MOST_EXPECTED
+        if not too_many:
+            self._target.expect(channel)
 
     def take(
         self,

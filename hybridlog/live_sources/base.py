@@ -36,6 +36,16 @@ class Sink(Protocol):
         """
         ...
 
+    def expect(self, channel: Channel) -> None:
+        """Messages of a channel may come from now on: told before the first of them.
+
+        What that would have to wait for is done at once, and takes some milliseconds.
+
+        Args:
+            channel: As `take` will get it.
+        """
+        ...
+
     def take(
         self,
         channel: Channel,

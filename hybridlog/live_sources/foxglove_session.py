@@ -229,6 +229,7 @@ class Session:
         self._routes[number] = (offer.channel, numbers)
         self._topics[topic] = self._topics.get(topic, 0) + 1
         self._sink.topic_came(topic, offer.type_name, self._topics[topic])
+        self._sink.expect(offer.channel)
         since = self._missed.pop(topic, None)
         if since is not None:
             self._sink.lost(

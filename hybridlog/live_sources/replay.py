@@ -277,6 +277,7 @@ class _Player:
                 self._publishers[channel.topic] += 1
                 count = self._publishers[channel.topic]
                 self._sink.topic_came(channel.topic, type_name, count)
+                self._sink.expect(channel)
         return self._known[key]
 
     def _tell(self, damage: Damage) -> None:

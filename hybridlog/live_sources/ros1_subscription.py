@@ -117,7 +117,10 @@ class Subscription:
         if type_name and type_name != ANY and not self._takes(type_name, fields):
             return None
         key = tuple(sorted(fields.items()))
-        channel = self._channels.pop(key, None) or channel_of(self.topic, fields)
+        channel = self._channels.pop(key, None)
+        if channel is None:
+            channel = channel_of(self.topic, fields)
+            self._context.sink.expect(channel)
         self._channels[key] = channel
         if len(self._channels) > _MOST_CHANNELS:
             del self._channels[next(iter(self._channels))]

@@ -163,13 +163,15 @@ class Receiver:
         type_hash = _text(event, "hash")
         if type_hash:
             metadata["topic_type_hash"] = type_hash
-        self._channels[_number(event, "number")] = Channel(
+        number = _number(event, "number")
+        self._channels[number] = Channel(
             topic=topic,
             message_encoding="cdr",
             schema=Schema(_text(event, "type"), _text(event, "encoding"), definition),
             metadata=metadata,
             has_publish_time=True,
         )
+        self._sink.expect(self._channels[number])
         self.heard.add(topic)
         since = self._outages.pop(topic, None)
         if since is not None:

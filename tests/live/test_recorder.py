@@ -26,9 +26,11 @@ from hybridlog.live.door import choose, running, visit
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
 from hybridlog.live.recording import LiveRecording
+from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.losses import Cause
 from hybridlog.query.topics import matcher
 from hybridlog_storage import append_file
+from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import (
     DiskFullError,
     PayloadError,
@@ -541,3 +543,29 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stopped_for_disk
     assert "only 157 MB left" in robot.recorder.reason
     robot.rows()
+
+
+def test_what_is_expected_is_ready_before_its_first_message(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "_MOST_EXPECTED", 2)
+    database = store.database_for("This")
+    robot = Running(store)
+    channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]
+    for channel in channels:
+        robot.recorder.expect(channel)
+    said, silent, beyond = (collection_of(channel.topic) for channel in channels)
+    wait_for(lambda: {said, silent} <= set(database.list_collections()))
+    assert beyond not in database.list_collections()
+    robot.speaker.say(channels[0], text("x"))
+    (report,) = robot.recorder.stop()
+    assert [channel.topic for channel in report.entry.channels] == ["/said"]
+    assert store.topics() == ["/said"]
+    assert store.verify().findings == []
+
+
+def test_what_a_ring_expects_is_in_no_index(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=0, snapshots=SnapshotOptions(ring_s=5)))
+    robot.recorder.expect(text_channel("/said"))
+    assert robot.recorder.stop() == []
+    assert collection_of("/said") not in store.database_for("This").list_collections()

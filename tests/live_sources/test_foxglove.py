@@ -409,6 +409,7 @@ def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
     assert [taken.sent for taken in heard.taken] == list(range(len(payloads) + 1))
     assert {taken.sequence for taken in heard.taken} == {None}
     assert len({id(taken.channel) for taken in heard.taken}) == 1
+    assert (len(heard.expected), heard.unexpected) == (1, [])
     times = [taken.received for taken in heard.taken]
     assert before <= times[0]
     assert times == sorted(times)

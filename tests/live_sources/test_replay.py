@@ -103,6 +103,7 @@ def test_real_logs_come_as_other_readers_see_them(name: str) -> None:
     assert_same(heard, expected)
     assert heard.losses == []
     assert heard.ends == [""]
+    assert heard.unexpected == []
     came = {topic[0] for topic in heard.topics if len(topic) == 3}
     gone = {topic[0] for topic in heard.topics if len(topic) == 1}
     assert came == gone >= {seen.topic for seen in expected}

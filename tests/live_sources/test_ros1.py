@@ -93,7 +93,8 @@ def test_messages_come_as_they_were_sent() -> None:
     (asked,) = publisher.asked
     assert (asked["topic"], asked["type"], asked["md5sum"]) == ("/topic", "*", "*")
     assert sink.topics == [("/topic", "std_msgs/String", 1)]
-    assert sink.said == sink.losses == sink.ends == []
+    assert sink.expected == [channel]
+    assert sink.unexpected == sink.said == sink.losses == sink.ends == []
 
 
 def test_it_registers_under_its_name_and_leaves_no_trace() -> None:

@@ -75,6 +75,7 @@ def test_messages_and_events_reach_the_sink(tmp_path: Path) -> None:
     assert [taken.sequence for taken in memory.taken] == [7, 8, None]
     assert {taken.sent for taken in memory.taken} == {None}
     channel = memory.taken[0].channel
+    assert (memory.expected, memory.unexpected) == ([channel], [])
     assert (channel.topic, channel.message_encoding) == ("/a", "cdr")
     assert channel.has_publish_time
     assert channel.metadata == {
