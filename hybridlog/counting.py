@@ -133,11 +133,12 @@ def _asked_each(query: Query, entry: RecordingEntry, spans: NDArray[np.int64]) -
     topics = [t for t in query.topics if any(c.topic == t for c in entry.channels)]
     rows = np.flatnonzero(spans[:, 1] > spans[:, 0])
     found = np.zeros(len(spans), np.bool_)
+    predicate = query.filter
     for topic in topics:
         rows = rows[~found[rows]]
         conditions = [query.conditions(entry, (b, e)) for b, e in spans[rows].tolist()]
         asked: list[tuple[str, _Filter]] = [
-            (collection_of(topic), {"$and": [own, query.filter]} if query.filter else own)
+            (collection_of(topic), {"$and": [own, predicate]} if predicate else own)
             for own in conditions
         ]
         found[rows] = np.array(database.count_each(asked, most=1), np.bool_)

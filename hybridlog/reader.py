@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from hybridlog.counting import count_in_columns, in_all_times
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_counts import count_in_chunks
 from hybridlog.query.intervals import span_of
@@ -40,6 +41,7 @@ from hybridlog.query.plan import (
     Task,
     count_given,
 )
+from hybridlog.query.predicate import Predicate
 from hybridlog.query.times import (
     TIME_LIMIT,
     DurationLike,
@@ -249,7 +251,7 @@ class Query:
     recording_ids: tuple[str, ...]
     _bounds: tuple[TimeLike | None, TimeLike | None] | None = None
     _clock: Clock = "log"
-    _filters: tuple[Mapping[str, object], ...] = ()
+    _predicates: tuple[Predicate, ...] = ()
     _limit: int | None = None
     _every: int = 1
     _reverse: bool = False
@@ -259,6 +261,10 @@ class Query:
     """What the last answer has cost."""
 
     # Steps.
+
+    def again(self) -> Query:
+        """The same question, not asked yet: what it costs is counted anew."""
+        return self._with()
 
     def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
         """Only messages with `begin <= time < end`.
@@ -290,14 +296,13 @@ class Query:
         Raises:
             WhereError: it cannot be understood, or is not allowed.
         """
-        from hybridlog.query.filters import check_filter
-
-        compiled: Mapping[str, object]
         if isinstance(predicate, str):
-            compiled = self.store.predicate(predicate, self.topics, self.recording_ids)
+            checked = self.store.predicate(predicate, self.topics, self.recording_ids)
         else:
-            compiled = check_filter(predicate)
-        return self._with(_filters=(*self._filters, compiled))
+            from hybridlog.query.filters import check_filter
+
+            checked = Predicate(check_filter(predicate))
+        return self._with(_predicates=(*self._predicates, checked))
 
     def limit(self, count: int) -> Query:
         """At most so many messages.
@@ -659,7 +664,12 @@ class Query:
     @property
     def filter(self) -> dict[str, object]:
         """What was given to `where`, as one MongoDB filter; empty for everything."""
-        return self._filter({})
+        return _all_of([predicate.to_filter() for predicate in self._predicates if predicate])
+
+    @property
+    def predicates(self) -> Sequence[Predicate]:
+        """What was given to `where`; all must hold."""
+        return self._predicates
 
     def spans(self) -> list[tuple[RecordingEntry, tuple[int, int]]]:
         """Which log time `[begin, end)`, ns, of each recording is asked about.
@@ -863,7 +873,7 @@ class Query:
         lanes: list[Lane] = []
         self.counters.reset()
         targets = self._targets(lanes)
-        chooser = self._choose if self._filters else None
+        chooser = self._choose if self._predicates else None
         return Plan(lanes, targets, self._clock, chooser, self._reverse, self.counters)
 
     @contextmanager
@@ -907,10 +917,9 @@ class Query:
                 break
 
     def _filter(self, extra: Mapping[str, object]) -> dict[str, object]:
-        parts = [dict(f) for f in (extra, *self._filters) if f]
-        if not parts:
-            return {}
-        return parts[0] if len(parts) == 1 else {"$and": parts}
+        # Asked for once a range of time, so that a long list of values is not copied each time.
+        filters = (extra, *(predicate.query for predicate in self._predicates))
+        return _all_of([dict(part) for part in filters if part])
 
     def _choose(self, tasks: Sequence[Task]) -> Chosen:
         """Ask the index which messages of some chunks satisfy the predicate."""
@@ -988,14 +997,12 @@ class Query:
 
     def _count(self) -> int:
         self.counters.reset()
-        if self._filters:
+        if self._predicates:
             self.store.database_for("A predicate")
         has_index = self.store.database is not None
-        is_plain = not self._filters and self.is_by_log_time
+        is_plain = not self._predicates and self.is_by_log_time
         total, left = 0, list(self.topics)
         if has_index and not is_plain:
-            from hybridlog.counting import count_in_columns
-
             total, left = count_in_columns(self, self.topics)
             if not left:
                 return total
@@ -1016,8 +1023,6 @@ class Query:
         wanted = [(topic, t) for topic in left for t in targets if topic in _topics_of(t)]
         if not self.is_unbounded:
             return total + self._count_documents(wanted)
-        from hybridlog.counting import in_all_times
-
         of_topic: dict[str, list[RecordingEntry]] = {}
         for topic, target in wanted:
             of_topic.setdefault(topic, []).append(target.recording)
@@ -1052,8 +1057,6 @@ class Query:
         others = [topic for topic in topics if topic not in counted]
         if not others:
             return total
-        from hybridlog.counting import count_in_columns
-
         found, left = count_in_columns(self._with(recording_ids=(target.recording.id,)), others)
         total += found
         return total + self._count_documents([(topic, target) for topic in left]) if left else total
@@ -1144,6 +1147,12 @@ def _has_full_chunks(recording: RecordingEntry, topic: str) -> bool:
     last = max((s.last for s in stats if s.last is not None), default=0)
     chunks = (last - first) / max(1, *(s.longest for s in stats)) + 1
     return sum(s.messages for s in stats) > _FEW * chunks
+
+
+def _all_of(filters: list[dict[str, object]]) -> dict[str, object]:
+    if not filters:
+        return {}
+    return filters[0] if len(filters) == 1 else {"$and": filters}
 
 
 def _any_of(filters: list[dict[str, object]]) -> dict[str, object]:

@@ -15,7 +15,11 @@ from hybridlog.columns.kept import KeptColumns
 from hybridlog.columns.stored import FieldColumns
 from hybridlog.field_indexes import FieldIndex
 from hybridlog.query.chunk_lists import ChunkLists
+from hybridlog.query.plan import Lane
+from hybridlog.query.predicate import Predicate
 from hybridlog.query.topics import resolve
+from hybridlog.reader import Query
+from hybridlog.schema.codec import codec_for
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.directory import StoreDirectory
@@ -26,17 +30,15 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.query.plan import Lane
-    from hybridlog.reader import Query
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.segment_catalog import SegmentCatalog
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
-    from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
@@ -122,6 +124,7 @@ class Store:
         self._uri = EMBEDDED
         self._catalog: Catalog | SegmentCatalog | None = None
         self._recordings: list[RecordingEntry] | None = None
+        self._schemas: dict[str, Schema] = {}
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._columns: dict[str, FieldColumns | None] = {}
@@ -225,6 +228,7 @@ class Store:
     def refresh(self) -> None:
         """Forget what was read of the catalog."""
         self._recordings = None
+        self._schemas = {}
         self._lanes.clear()
         with self._lock:
             self._columns.clear()  # closed by the last thread that reads from them
@@ -268,34 +272,41 @@ class Store:
 
     def lanes(self, recording: RecordingEntry) -> list[Lane]:
         """The channels of a recording, with what reads them."""
-        from hybridlog.query.plan import Lane
-        from hybridlog.schema.codec import codec_for
-        from hybridlog_storage.messages import Channel
-
         lanes = self._lanes.get(recording.id)
         if lanes is None:
-            channels: dict[int, Channel]
-            if self.database is None:
-                from hybridlog.segment_catalog import channels_of_recording
-
-                channels = channels_of_recording(self.directory, recording.id)
-            else:
-                schemas = Catalog(self.database).schemas(
-                    {c.schema for c in recording.channels if c.schema is not None}
-                )
-                channels = {
-                    c.id: Channel(
-                        c.topic,
-                        c.message_encoding,
-                        schemas[c.schema] if c.schema is not None else None,
-                        c.metadata,
-                        has_publish_time=c.has_publish_time,
-                    )
-                    for c in recording.channels
-                }
+            channels = self._channels(recording)
             lanes = [Lane(recording, i, c, codec_for(c)) for i, c in sorted(channels.items())]
             self._lanes[recording.id] = lanes
         return lanes
+
+    def _channels(self, recording: RecordingEntry) -> dict[int, Channel]:
+        """The channels of a recording, by id; out of its segments when MongoDB lacks a schema."""
+        schemas = self._schemas_for(recording)
+        if not all(c.schema is None or c.schema in schemas for c in recording.channels):
+            from hybridlog.segment_catalog import channels_of_recording
+
+            return channels_of_recording(self.directory, recording.id)
+        return {
+            c.id: Channel(
+                c.topic,
+                c.message_encoding,
+                schemas[c.schema] if c.schema is not None else None,
+                c.metadata,
+                has_publish_time=c.has_publish_time,
+            )
+            for c in recording.channels
+        }
+
+    def _schemas_for(self, recording: RecordingEntry) -> dict[str, Schema]:
+        """Schemas by hash: those of a recording, as far as MongoDB has them, and of others."""
+        known = self._schemas
+        wanted = {c.schema for c in recording.channels if c.schema is not None}
+        if self.database is not None and not wanted <= known.keys():
+            # Recordings have most of them in common: those of all are asked for at once.
+            for other in self.recordings():
+                wanted.update(c.schema for c in other.channels if c.schema is not None)
+            known = self._schemas = Catalog(self.database).schemas(wanted)
+        return known
 
     # Asking.
 
@@ -309,17 +320,13 @@ class Store:
         Raises:
             TopicError: a name fits nothing, or several topics; lists the candidates.
         """
-        from hybridlog.reader import Query
+        return self._resolved(names).again()
 
-        return Query(self, *self._resolved(names))
-
-    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Full names of topics, and the recordings that have any of them."""
+    def _resolve(self, names: tuple[str, ...]) -> Query:
         known = self.topics()
         if not names:
             raise TopicError("Which topic? " + _listed(known))
-        found = self.query(resolve(names, known))
-        return found.topics, found.recording_ids
+        return self.query(resolve(names, known))
 
     def all_topics(self) -> Query:
         """A question about everything."""
@@ -327,8 +334,6 @@ class Store:
 
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all."""
-        from hybridlog.reader import Query
-
         wanted = set(topics)
         chosen = tuple(
             r.id
@@ -342,23 +347,21 @@ class Store:
 
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> dict[str, object]:
-        """The MongoDB filter of a predicate on some topics of some recordings.
+    ) -> Predicate:
+        """A predicate on some topics of some recordings.
 
         Raises:
             WhereError: it cannot be understood, or does not fit the fields.
         """
-        own: dict[str, object] = _copied(self._compiled(text, topics, recordings))
-        return own
+        return self._compiled(text, topics, recordings)
 
     def _compile(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> dict[str, object]:
+    ) -> Predicate:
         from hybridlog.query.where import compile_filter
-        from hybridlog.reader import Query
 
         types = Query(self, topics, recordings).field_types()
-        return compile_filter(text, field_types=types)
+        return Predicate(compile_filter(text, field_types=types))
 
     def chunks(
         self,
@@ -596,13 +599,6 @@ def check_claim(database: Database, store_id: str | None = None) -> bool:
             "another store. Name a database of its own in the URI: mongodb://host/NAME."
         )
     return mark is not None
-
-
-def _copied(value: Any) -> Any:
-    """A filter that whoever gets it may change."""
-    if isinstance(value, dict):
-        return {name: _copied(inner) for name, inner in value.items()}
-    return [_copied(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _listed(names: Sequence[str]) -> str:

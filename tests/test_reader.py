@@ -7,13 +7,14 @@ import gc
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import tracemalloc
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from hybridlog.demo.write import write_bag
 from hybridlog.latched import in_force
 from hybridlog.reader import Query
 from hybridlog.recorder import RecordOptions
+from hybridlog_storage.catalog import SCHEMAS, Catalog
 from hybridlog_storage.errors import (
     DatabaseError,
     DefinitionError,
@@ -979,3 +981,41 @@ def test_a_filter_may_be_changed_by_whoever_looks_at_it(store: hl.Store) -> None
     assert isinstance(conditions, list)
     conditions.clear()
     assert json.dumps(scans.where(predicate).filter) == expected
+
+
+def test_schemas_of_all_recordings_are_asked_for_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    schemas = Catalog.schemas
+
+    def counted(self: Catalog, hashes: Collection[str]) -> dict[str, Schema]:
+        asked.append(len(hashes))
+        return schemas(self, hashes)
+
+    with hl.open(tmp_path / "store", create=True) as store:
+        for number in range(5):
+            own = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n" + b"#" * number)
+            with store.start(f"run-{number}") as recording:
+                recording.write(Channel("/talk", "ros1", own), struct.pack("<i", number))
+    with hl.open(tmp_path / "store") as store:
+        monkeypatch.setattr(Catalog, "schemas", counted)
+        assert [store.topic("talk").where(f"data == {n}").count() for n in range(5)] == [1] * 5
+        assert asked == [5]
+        store.refresh()
+        assert store.topic("talk").where("data < 3").count() == 3
+        assert asked == [5, 5]
+
+
+def test_a_schema_that_mongodb_lacks_is_in_the_segments(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("talk") as recording:
+            schema = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
+            recording.write(Channel("/talk", "ros1", schema), struct.pack("<i", 7))
+        database = store.database_for("This")
+        assert database.delete(SCHEMAS, {}) == 1
+        store.refresh()
+        assert store.topic("talk").where("data == 7").count() == 1
+        (message,) = store.topic("talk")
+        assert message.decode().data == 7
+        assert store.verify().findings

@@ -20,7 +20,7 @@ from benchmarks.harness import usage
 from benchmarks.harness.logger import StoppedError, ended_by_signals
 from benchmarks.loads.base import Load
 from benchmarks.questions import tasks
-from benchmarks.questions.base import QUESTIONS, SLOW_S, SLOW_TIMES, Asker, Reading
+from benchmarks.questions.base import QUESTIONS, SLOW_S, SLOW_TIMES
 from benchmarks.side import Values
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def ask(
         for row, kind in rows.items():
             known: dict[str, dict[str, Any]] = {}
             for opening in range(repetitions):
-                with reopened() as system, closing(_asker(kind, system, channels)) as asker:
+                with reopened() as system, closing(_named(kind)(system, channels)) as asker:
                     size = asker.index_bytes() if not opening else None
                     for name in questions:
                         question = partial(QUESTIONS[name], asker)
@@ -99,7 +99,7 @@ def read(
 
     def use(reopened: _Opener, channels: Sequence[Channel], out: TextIO) -> None:
         for row, kind in rows.items():
-            with reopened() as system, closing(_reading(kind, system, channels)) as reading:
+            with reopened() as system, closing(_named(kind)(system, channels)) as reading:
                 for name, task in tasks.TASKS.items():
                     for repetition in range(repetitions):
                         found = _caught(partial(task, reading, opened, repetition))
@@ -217,16 +217,6 @@ def _caught(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def _tell(out: TextIO, result: dict[str, Any]) -> None:
     out.write(json.dumps(result) + "\n")
     out.flush()
-
-
-def _asker(kind: str, system: Backend, channels: Sequence[Channel]) -> Asker:
-    asker: Asker = _named(kind)(system, channels)
-    return asker
-
-
-def _reading(kind: str, system: Backend, channels: Sequence[Channel]) -> Reading:
-    reading: Reading = _named(kind)(system, channels)
-    return reading
 
 
 def _named(name: str) -> Any:

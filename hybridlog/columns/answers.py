@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlog.columns.kept import cost_s
 from hybridlog.columns.topic import TopicColumns
-from hybridlog.query.column_filter import ColumnFilter, column_filter
+from hybridlog.query.column_filter import ColumnFilter, combined
 from hybridlog.schema.column import ranges, take
 
 if TYPE_CHECKING:
@@ -96,7 +96,6 @@ def judged(
     if store.database is None or not store.kept.most_bytes or not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)
-    predicate = query.filter
     filters, wanted, recordings = [], set(fields), []
     for recording in store.recordings():
         if recording.id not in query.recording_ids or not recording.stats_of(topic):
@@ -104,11 +103,13 @@ def judged(
         types = store.kept.types(recording, topic)
         if types is None or not types.keys() >= set(fields):
             return None
-        found = column_filter(predicate, types)
-        if found is None:
-            return None
+        found = None
+        if query.predicates:
+            found = combined([predicate.on_columns(types) for predicate in query.predicates])
+            if found is None:
+                return None
+            wanted |= found.fields
         filters.append(found)
-        wanted |= found.fields
         recordings.append(recording)
     columns = store.kept.find(
         topic,
@@ -124,7 +125,7 @@ def judged(
         Judged(
             recording,
             own,
-            part if predicate else None,
+            part,
             None if spans is None else spans.get(recording.id, []),
         )
         for recording, own, part in zip(recordings, columns, filters, strict=True)

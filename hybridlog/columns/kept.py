@@ -86,7 +86,7 @@ class KeptColumns:
         self.most_bytes = MOST_BYTES
         self._store = store
         self._kept: OrderedDict[tuple[str, str], TopicColumns] = OrderedDict()
-        self._types: dict[tuple[str, str], dict[str, str] | None] = {}
+        self._types: dict[tuple[str, str], Mapping[str, str] | None] = {}
         self._unfit: set[tuple[str, str]] = set()
         self._spent: defaultdict[str, float] = defaultdict(float)
         self._generation = 0
@@ -102,7 +102,7 @@ class KeptColumns:
             self._unfit.clear()
             self._spent.clear()
 
-    def types(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
+    def types(self, recording: RecordingEntry, topic: str) -> Mapping[str, str] | None:
         """Fields that can be kept of a topic in a recording, and their types; None if none can.
 
         Messages that could not be read have no fields, and those of which little is left
@@ -119,7 +119,7 @@ class KeptColumns:
                 self._types[key] = types
         return types
 
-    def _types_of(self, recording: RecordingEntry, topic: str) -> dict[str, str] | None:
+    def _types_of(self, recording: RecordingEntry, topic: str) -> Mapping[str, str] | None:
         lanes = self._lanes(recording, topic)
         stats = recording.stats_of(topic)
         one_codec = len({id(lane.codec) for lane in lanes}) == 1
@@ -180,15 +180,16 @@ class KeptColumns:
         self, topic: str, recordings: Sequence[RecordingEntry], wanted: _Wanted
     ) -> tuple[dict[tuple[str, str], TopicColumns], list[RecordingEntry]]:
         """What is kept, and recordings of which something is missing."""
-        keys = [(recording.id, topic) for recording in recordings]
-        found = {key: self._kept[key] for key in keys if key in self._kept}
-        for key in found:
-            self._kept.move_to_end(key)
-        missing = [
-            recording
-            for recording, key in zip(recordings, keys, strict=True)
-            if key not in found or not wanted.is_in(found[key])
-        ]
+        found: dict[tuple[str, str], TopicColumns] = {}
+        missing = []
+        for recording in recordings:
+            key = recording.id, topic
+            kept = self._kept.get(key)
+            if kept is not None:
+                found[key] = kept
+                self._kept.move_to_end(key)
+            if kept is None or not wanted.is_in(kept):
+                missing.append(recording)
         return found, missing
 
     def _add(
