@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.columns.answers import Judged, judged
+from hybridlog.columns.answers import judged
+from hybridlog.columns.judged import Judged
 from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
 from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped, span_of
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration

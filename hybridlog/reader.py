@@ -667,7 +667,7 @@ class Query:
         return _all_of([predicate.to_filter() for predicate in self._predicates if predicate])
 
     @property
-    def predicates(self) -> Sequence[Predicate]:
+    def predicates(self) -> tuple[Predicate, ...]:
         """What was given to `where`; all must hold."""
         return self._predicates
 

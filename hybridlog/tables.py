@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.columns.answers import Judged, judged
+from hybridlog.columns.answers import judged
+from hybridlog.columns.judged import Judged
 from hybridlog.frames import TableBuilder
 from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
 from hybridlog.indexing import rows_by_channel

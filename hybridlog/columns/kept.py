@@ -36,14 +36,17 @@ from hybridlog_storage.errors import SegmentError, StoreError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.columns.judged import Judged
     from hybridlog.query.column_filter import Single
     from hybridlog.query.plan import Counters, Lane
+    from hybridlog.query.predicate import Predicate
     from hybridlog.reader import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 
 MOST_BYTES = 256 << 20
 """Most memory that the columns of a store take; getting some takes up to four times theirs."""
+_MOST_QUESTIONS = 128  # that are remembered
 _RECORD_BYTES = 40  # that a message takes in a chunk besides its payload, about
 # What things cost, in seconds, on a small machine; only their ratios matter.
 _QUESTION_S = 1e-3
@@ -59,6 +62,25 @@ class _Way(NamedTuple):
 
     price: float
     load: Callable[[Query, Mapping[str, str], bool], TopicColumns]
+
+
+class Asked(NamedTuple):
+    """What is asked of the messages of a topic, of ranges of time apart.
+
+    Attributes:
+        topic: Full name.
+        recording_ids: In which recordings.
+        predicates: All must hold. The same objects are the same predicates: `1` and `True`
+            are equal, and not the same.
+        fields: Paths of fields that are needed besides those of the predicates.
+        ordered: Whether log times and arrival numbers are needed.
+    """
+
+    topic: str
+    recording_ids: tuple[str, ...]
+    predicates: tuple[Predicate, ...]
+    fields: frozenset[str]
+    ordered: bool
 
 
 class _Wanted(NamedTuple):
@@ -86,6 +108,7 @@ class KeptColumns:
         self.most_bytes = MOST_BYTES
         self._store = store
         self._kept: OrderedDict[tuple[str, str], TopicColumns] = OrderedDict()
+        self._known: dict[Asked, tuple[Judged, ...]] = {}
         self._types: dict[tuple[str, str], Mapping[str, str] | None] = {}
         self._unfit: set[tuple[str, str]] = set()
         self._spent: defaultdict[str, float] = defaultdict(float)
@@ -98,6 +121,7 @@ class KeptColumns:
         with self._lock:
             self._generation += 1  # what is on its way is of the past
             self._kept.clear()
+            self._known.clear()
             self._types.clear()
             self._unfit.clear()
             self._spent.clear()
@@ -133,6 +157,26 @@ class KeptColumns:
         if lanes[0].is_reduced or not lanes[0].codec.indexed:
             return None
         return types_of(lanes[0].codec)
+
+    def recall(self, asked: Asked) -> tuple[Judged, ...] | None:
+        """What was remembered of a question; None once columns have come or gone since."""
+        with self._lock:
+            known = self._known.get(asked)
+            for part in known or ():
+                self._kept.move_to_end((part.recording.id, asked.topic))
+        return known
+
+    def remember(self, asked: Asked, parts: tuple[Judged, ...]) -> None:
+        """What a question means is not found out again as long as its columns are kept."""
+        with self._lock:
+            if any(
+                self._kept.get((part.recording.id, asked.topic)) is not part.columns
+                for part in parts
+            ):
+                return
+            if len(self._known) >= _MOST_QUESTIONS:
+                self._known.clear()
+            self._known[asked] = parts
 
     def find(
         self,
@@ -293,6 +337,7 @@ class KeptColumns:
         with self._lock:
             if generation != self._generation:
                 return
+            self._known.clear()
             for key, columns in found.items():
                 self._kept[key] = columns
                 self._kept.move_to_end(key)

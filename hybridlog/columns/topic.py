@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -106,9 +105,8 @@ def in_order(
     return TopicColumns(len(seq), order, fields)
 
 
-@lru_cache(maxsize=1024)
-def types_of(codec: Codec) -> Mapping[str, str]:
-    """The fields that can be columns, and their types; the same object for the same codec."""
+def types_of(codec: Codec) -> dict[str, str]:
+    """The fields that can be columns, and their types."""
     if not codec.indexed:
         return {}
     return {p.path: p.type for p in codec.paths() if not p.array and is_single(p.type)}

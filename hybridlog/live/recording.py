@@ -211,9 +211,15 @@ class LiveRecording:
 
         To understand a definition and to make a collection takes some ten milliseconds
         each, which are better spent while nothing comes yet.
+
+        Raises:
+            UsageError: The recording was closed.
+            DiskFullError: As `write` does.
         """
-        for channel in channels:
-            self._capture.index.prepare(channel)
+        with self._lock:
+            self._check()
+            for channel in channels:
+                self._capture.index.prepare(channel)
 
     def write(
         self,

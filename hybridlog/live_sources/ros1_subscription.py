@@ -194,7 +194,11 @@ class _Link:
                 if self._failures >= 2:
                     context.troubles.note(self._uri, topic, error)
             else:
-                channel = self._subscription.channel(fields)
+                try:
+                    channel = self._subscription.channel(fields)
+                except BaseException:
+                    connected.close()
+                    raise
                 if channel is None:
                     connected.close()
                     return

@@ -95,17 +95,6 @@ def column_filter(query: Mapping[str, object], types: Mapping[str, str]) -> Colu
     return ColumnFilter(frozenset(compiler.fields), found)
 
 
-def combined(filters: Sequence[ColumnFilter | None]) -> ColumnFilter | None:
-    """All of some filters, at least one; None if columns cannot answer one of them."""
-    parts = [part for part in filters if part is not None]
-    if len(parts) < len(filters):
-        return None
-    if len(parts) == 1:
-        return parts[0]
-    fields = frozenset().union(*(part.fields for part in parts))
-    return ColumnFilter(fields, _joined(np.logical_and, [part.mask for part in parts]))
-
-
 class _UnfitError(Exception):
     """The filter asks for what columns do not tell."""
 

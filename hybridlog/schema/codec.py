@@ -43,9 +43,6 @@ class BodyGroup(NamedTuple):
 class Codec(Protocol):
     """What can be done with the payloads of a channel. Thread safe."""
 
-    def __hash__(self) -> int:
-        """Of the object itself: what is worked out for a codec is remembered with it."""
-
     @property
     def indexed(self) -> bool:
         """False when only `_meta` goes into the index."""

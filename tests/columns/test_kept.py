@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import random
 import struct
 import time
-from collections.abc import Iterator, Sequence
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,9 +25,10 @@ from hybridlog import tables
 from hybridlog.columns import answers as column_answers
 from hybridlog.columns import kept as kept_columns
 from hybridlog.columns import stored
+from hybridlog.columns.judged import Judged
 from hybridlog.columns.kept import MOST_BYTES
 from hybridlog.columns.topic import TopicColumns
-from hybridlog.query.column_filter import column_filter
+from hybridlog.query.column_filter import ColumnFilter, column_filter
 from hybridlog.reader import Query
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -98,7 +101,7 @@ def write_log(path: Path, said: Sequence[tuple[int, str, bytes]], mark: str = ""
             (topic, place): writer.register_channel(
                 topic, "ros1", schema, {"mark": mark, "publisher": str(place)}
             )
-            for topic in ("/state", "/other")
+            for topic in sorted({"/state", "/other"} | {topic for _, topic, _ in said})
             for place in range(2)
         }
         for place, (time, topic, payload) in enumerate(said):
@@ -182,7 +185,7 @@ filters = st.recursive(
 )
 
 
-def _seqs(parts: list[column_answers.Judged]) -> list[int]:
+def _seqs(parts: Sequence[Judged]) -> list[int]:
     return [seq for part in parts for seq in part.columns.seq[part.rows()].tolist()]
 
 
@@ -395,6 +398,50 @@ def test_columns_take_no_more_memory_than_they_may(
         assert one.count() == 20
         assert two.count() == 16
     assert sum(c.nbytes for c in plain.kept._kept.values()) <= plain.kept.most_bytes
+
+
+def test_what_a_question_means_is_found_out_once(
+    plain: hl.Store, at_once: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def counted(query: Mapping[str, object], types: Mapping[str, str]) -> ColumnFilter | None:
+        made.append(query)
+        return column_filter(query, types)
+
+    monkeypatch.setattr(column_answers, "column_filter", counted)
+    for _ in range(3):
+        assert plain.topic("/state").where("i8 == 1").count() == 20
+        assert plain.topic("/state").where("i8 == 1").between("+3s", "+6s").count() == 5
+    assert len(made) == 2, "once without the order of messages, once with it"
+    # Equal in Python, and another question.
+    assert plain.topic("/state").where({"yes": 0}).count() == 0
+    assert plain.topic("/state").where({"yes": False}).count() == 60
+    plain.refresh()
+    assert plain.topic("/state").where("i8 == 1").count() == 20
+    assert made[-1] == {"i8": {"$eq": 1}}, "asked for anew"
+
+
+def test_columns_that_are_looked_at_stay_and_others_are_let_go(
+    store: hl.Store, at_once: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [(n % 12, topic, {"f64": float(n)}) for n in range(60) for topic in ("/a", "/b", "/c")]
+    recorded(store, {"one": rows})
+    # Two fields, log times and arrival numbers, of two of the three topics.
+    monkeypatch.setattr(store.kept, "most_bytes", 2 * 60 * 8 * 4 + 100)
+
+    def ask(topic: str) -> weakref.ref[Any]:
+        query = store.topic(topic).where("f64 >= 0 and i64 == 1").between("+1s", "+3s")
+        assert query.count() == 10
+        (columns,) = [c for key, c in store.kept._kept.items() if key[1] == topic]
+        return weakref.ref(columns.fields["f64"].values)
+
+    first, second = ask("/a"), ask("/b")
+    ask("/a")  # out of what is remembered of the question
+    ask("/c")
+    gc.collect()
+    assert first() is not None
+    assert second() is None, "nothing else holds it"
 
 
 def test_payloads_that_cannot_be_read_are_left_to_mongodb(store: hl.Store, each_way: None) -> None:

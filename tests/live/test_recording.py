@@ -455,6 +455,8 @@ def test_misuse(store: hl.Store) -> None:
     assert recording.close() is recording.close()
     with pytest.raises(UsageError, match="was closed"):
         recording.write(own, b"")
+    with pytest.raises(UsageError, match="was closed"):
+        recording.expect(own)
     with pytest.raises(UsageError, match="memory budget"):
         store.start("talk", budget_bytes=10)
     with pytest.raises(UsageError, match="flush interval"):
