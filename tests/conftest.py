@@ -13,6 +13,8 @@ from tests import real_peers
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
     os.environ.pop(name, None)
+# Hundreds of commands are run, which need not all be compiled anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A machine that is busy is no defect of what is tested, however long an example takes.
 settings.register_profile(
