@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.entries import build_entry, new_key, recording_metadata
-from hybridlog.indexing import ChunkIndexer, IndexWriter, Lag
+from hybridlog.indexing import BACKLOG, ChunkIndexer, IndexWriter, Lag
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, StoreError
@@ -42,6 +42,7 @@ class Capture:
         behind: Says whether it has so much more that the index waits, falls behind, and
             reads back later from the segments what is no longer in memory. None when
             whoever appends may wait for the index.
+        backlog: Most chunks that wait for the index in memory.
         renew: With `behind`: another connection to the index when one has failed.
         on_written: Called, on another thread, when less waits for the disk. With it whoever
             appends never waits, and looks at `writer.waiting` instead.
@@ -65,6 +66,7 @@ class Capture:
         settings: SegmentSettings,
         hurry: Callable[[], bool] | None = None,
         behind: Callable[[], bool] | None = None,
+        backlog: int = BACKLOG,
         renew: Callable[[], Database] | None = None,
         on_written: Callable[[], None] | None = None,
         check: Callable[[Catalog], None] | None = None,
@@ -84,7 +86,9 @@ class Capture:
         if behind is not None and renew is not None:
             lag = Lag(recording, behind, renew)
         self._gatherer = FieldGatherer(recording)
-        self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
+        self.index = IndexWriter(
+            self.indexer, database, backlog=backlog, lag=lag, gatherer=self._gatherer
+        )
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,

@@ -21,6 +21,7 @@ import numpy as np
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.index_documents import DocumentAssembler, Origin
@@ -41,6 +42,8 @@ _LAG_PAUSE_S = 0.002
 _RETRY_S = 2.0  # after the database has failed
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
+BACKLOG = 8
+"""Chunks that may wait for the index in memory, if nobody says."""
 _MOST_LATEST = 4096  # chunks: far more than a server that is killed has not in its journal
 
 
@@ -169,8 +172,18 @@ class Lag:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-reread")
         self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
 
-    def wait(self) -> None:
-        """Return once the recorder can spare the processor."""
+    def wait(self, size: int, messages: int) -> None:
+        """Return once the recorder can spare the processor for a chunk.
+
+        For large messages it always can: documents of them take little, and nearly none of
+        it under the interpreter's lock; what is let go must be read again, which takes more.
+
+        Args:
+            size: Bytes of the chunk.
+            messages: In the chunk.
+        """
+        if size >= COPIED_AT_ONCE * messages:
+            return
         while self._behind():
             time.sleep(_LAG_PAUSE_S)
 
@@ -218,6 +231,7 @@ class _Forgotten(NamedTuple):
     segment: int
     place: ChunkPlace
     messages: int
+    size: int
 
 
 class IndexWriter:
@@ -242,7 +256,7 @@ class IndexWriter:
         indexer: ChunkIndexer,
         database: Database,
         *,
-        backlog: int = 8,
+        backlog: int = BACKLOG,
         lag: Lag | None = None,
         gatherer: FieldGatherer | None = None,
     ) -> None:
@@ -357,7 +371,8 @@ class IndexWriter:
             int(chunk.batch.log_time.max()),
             (),
         )
-        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
+        size = len(chunk.batch.buffer)
+        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), size))
 
     def _tend(self) -> None:
         if self.failure is not None and time.monotonic() >= self._retry_at:
@@ -402,7 +417,7 @@ class IndexWriter:
         if self.failure is not None or not self._forgotten:
             return  # as many as there are then are asked for when it goes on
         place = self._forgotten.popleft()
-        self._lag.wait()
+        self._lag.wait(place.size, place.messages)
         chunk = self._lag.read(place)
         if self._forgotten:
             self._lag.read_ahead(self._forgotten[0])
@@ -417,7 +432,7 @@ class IndexWriter:
                     self.missed += len(chunk.batch)
             return
         if self._lag is not None:
-            self._lag.wait()
+            self._lag.wait(len(chunk.batch.buffer), len(chunk.batch))
         documents, entry = self._indexer.documents_of(chunk, channels)
         if self._gatherer is not None:
             self._gatherer.add(chunk, channels)
@@ -464,7 +479,8 @@ class IndexWriter:
     def _put_back(self, entry: ChunkEntry) -> int:
         """A chunk is to be indexed again; returns its messages."""
         count = sum(stats.messages for stats in entry.stats.values())
-        self._forgotten.append(_Forgotten(entry.segment, entry.place, count))
+        size = sum(stats.payload_bytes for stats in entry.stats.values())
+        self._forgotten.append(_Forgotten(entry.segment, entry.place, count, size))
         return count
 
     def _ensure(self, collection: str) -> None:

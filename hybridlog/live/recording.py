@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Capture
+from hybridlog.indexing import BACKLOG
 from hybridlog.live.budget import usual_budget
 from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
@@ -58,6 +59,7 @@ _AT_HAND = 128 << 20  # bytes of buffers that are there before the first message
 _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
 _LOOK_S = 0.25  # how often one looks how many that are
 _PAUSE_S = 0.005  # after each new one, since to get it takes as long
+_MOST_BACKLOG = 32
 _MOST_NS = 1 << 63
 
 
@@ -184,6 +186,7 @@ class LiveRecording:
                 settings=options.settings,
                 hurry=lambda: self._is_under(self._hurry),
                 behind=lambda: self._is_under(self._behind),
+                backlog=_backlog(options),
                 renew=renew,
                 on_written=self._make_room,
             )
@@ -547,6 +550,16 @@ class LiveRecording:
             message.publish_time,
             message.sequence,
         )
+
+
+def _backlog(options: LiveOptions) -> int:
+    """Chunks that may wait for the index in memory.
+
+    Topics of one rate and size close theirs at one time: what finds no room then must be
+    read again.
+    """
+    room = options.budget_bytes // 8 // options.settings.chunk_size
+    return max(BACKLOG, min(_MOST_BACKLOG, room))
 
 
 def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:

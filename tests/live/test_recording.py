@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
+from hybridlog.indexing import ChunkIndexer, Lag
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file
@@ -313,6 +314,41 @@ def test_the_index_falls_behind_and_catches_up(
     assert store.verify().findings == []
 
 
+def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much waits to be written; a chunk that is let go comes from its segment."""
+    monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: True)
+    read = []
+    real = Lag.read
+
+    def seen(self: Lag, chunk: Any) -> StoredChunk:
+        read.append(chunk)
+        return real(self, chunk)
+
+    monkeypatch.setattr(Lag, "read", seen)
+    real_documents = ChunkIndexer.documents_of
+    go_on = threading.Event()
+
+    def held_up(self: ChunkIndexer, *args: Any) -> Any:
+        go_on.wait(30)
+        return real_documents(self, *args)
+
+    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
+    own = channel("/talk")
+    payloads = [text(os.urandom(COPIED_AT_ONCE)) for _ in range(40)]
+    settings = SegmentSettings(chunk_size=COPIED_AT_ONCE)
+    with store.start("talk", settings=settings, budget_bytes=64 << 20) as recording:
+        for number, payload in enumerate(payloads):
+            recording.write(own, payload, log_time=number)
+        wait_for(lambda: recording._capture.writer.totals.chunks == 40)
+        go_on.set()
+        wait_for(lambda: recording.lag == 0)
+        assert len(read) == 40 - live._MOST_BACKLOG
+    assert [m.raw for m in store.topic("/talk")] == payloads
+    assert store.verify().findings == []
+
+
 @pytest.mark.parametrize("size", [50_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
@@ -334,12 +370,17 @@ def test_the_index_waits_while_messages_wait_for_their_turn(
             time.sleep(10 * live._LATE_S)
         thread.join()
         wait_for(lambda: recording.stored[0] == 1)
+        if size >= COPIED_AT_ONCE:
+            # Of large messages documents are made all the same, of others behind them not.
+            wait_for(lambda: recording.lag == 0)
+            recording.write(channel("/small"), text(b"x"))
+            wait_for(lambda: recording.stored[0] == 2)
         if late:
             time.sleep(1)
         else:
             wait_for(lambda: recording.lag == 0)
         assert recording.lag == late
-    assert recording.close().indexed == 1
+    assert recording.close().indexed == recording.stored[0]
 
 
 def in_segments_so_far(store: hl.Store, recording: str) -> list[Path]:
