@@ -172,18 +172,8 @@ class Lag:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-reread")
         self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
 
-    def wait(self, size: int, messages: int) -> None:
-        """Return once the recorder can spare the processor for a chunk.
-
-        For large messages it always can: documents of them take little, and nearly none of
-        it under the interpreter's lock; what is let go must be read again, which takes more.
-
-        Args:
-            size: Bytes of the chunk.
-            messages: In the chunk.
-        """
-        if size >= COPIED_AT_ONCE * messages:
-            return
+    def wait(self) -> None:
+        """Return once the recorder can spare the processor and the disk."""
         while self._behind():
             time.sleep(_LAG_PAUSE_S)
 
@@ -231,7 +221,6 @@ class _Forgotten(NamedTuple):
     segment: int
     place: ChunkPlace
     messages: int
-    size: int
 
 
 class IndexWriter:
@@ -371,8 +360,7 @@ class IndexWriter:
             int(chunk.batch.log_time.max()),
             (),
         )
-        size = len(chunk.batch.buffer)
-        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), size))
+        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
 
     def _tend(self) -> None:
         if self.failure is not None and time.monotonic() >= self._retry_at:
@@ -417,7 +405,7 @@ class IndexWriter:
         if self.failure is not None or not self._forgotten:
             return  # as many as there are then are asked for when it goes on
         place = self._forgotten.popleft()
-        self._lag.wait(place.size, place.messages)
+        self._lag.wait()
         chunk = self._lag.read(place)
         if self._forgotten:
             self._lag.read_ahead(self._forgotten[0])
@@ -431,8 +419,8 @@ class IndexWriter:
                 with self._lock:
                     self.missed += len(chunk.batch)
             return
-        if self._lag is not None:
-            self._lag.wait(len(chunk.batch.buffer), len(chunk.batch))
+        if self._lag is not None and not _is_large(chunk):
+            self._lag.wait()
         documents, entry = self._indexer.documents_of(chunk, channels)
         if self._gatherer is not None:
             self._gatherer.add(chunk, channels)
@@ -479,8 +467,7 @@ class IndexWriter:
     def _put_back(self, entry: ChunkEntry) -> int:
         """A chunk is to be indexed again; returns its messages."""
         count = sum(stats.messages for stats in entry.stats.values())
-        size = sum(stats.payload_bytes for stats in entry.stats.values())
-        self._forgotten.append(_Forgotten(entry.segment, entry.place, count, size))
+        self._forgotten.append(_Forgotten(entry.segment, entry.place, count))
         return count
 
     def _ensure(self, collection: str) -> None:
@@ -505,6 +492,14 @@ class IndexWriter:
         error = future.exception()
         if error is not None and self._crash is None:
             self._crash = error
+
+
+def _is_large(chunk: StoredChunk) -> bool:
+    """Whether documents of a chunk cost less than to let it go and read it again.
+
+    Of large messages they take little, and nearly none of it under the interpreter's lock.
+    """
+    return len(chunk.batch.buffer) >= COPIED_AT_ONCE * len(chunk.batch)
 
 
 def _nothing() -> None:

@@ -317,9 +317,10 @@ def test_the_index_falls_behind_and_catches_up(
 def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However much waits to be written; a chunk that is let go comes from its segment."""
-    monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: True)
-    read = []
+    """However much waits to be written; what is let go is read when the disk can spare it."""
+    busy = True
+    monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: busy)
+    read, made = [], []
     real = Lag.read
 
     def seen(self: Lag, chunk: Any) -> StoredChunk:
@@ -332,6 +333,7 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
 
     def held_up(self: ChunkIndexer, *args: Any) -> Any:
         go_on.wait(30)
+        made.append(args)
         return real_documents(self, *args)
 
     monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
@@ -343,6 +345,9 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
             recording.write(own, payload, log_time=number)
         wait_for(lambda: recording._capture.writer.totals.chunks == 40)
         go_on.set()
+        wait_for(lambda: len(made) == live._MOST_BACKLOG)
+        assert not read
+        busy = False
         wait_for(lambda: recording.lag == 0)
         assert len(read) == 40 - live._MOST_BACKLOG
     assert [m.raw for m in store.topic("/talk")] == payloads
