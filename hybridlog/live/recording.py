@@ -59,7 +59,7 @@ _AT_HAND = 128 << 20  # bytes of buffers that are there before the first message
 _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
 _LOOK_S = 0.25  # how often one looks how many that are
 _PAUSE_S = 0.005  # after each new one, since to get it takes as long
-_MOST_BACKLOG = 32
+_MOST_BACKLOG = 32  # chunks that wait for the index in memory, where the budget allows it
 _MOST_NS = 1 << 63
 
 
