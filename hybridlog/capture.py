@@ -140,9 +140,7 @@ class Capture:
             self.catalog = Catalog(self.index.database)
             try:
                 self.catalog.put_losses(self.entry.id, self.entry.end.get("losses", []))
-                for channel in self.writer.channels.values():
-                    if channel.schema is not None:
-                        self.catalog.put_schema(channel.schema)
+                self.catalog.put_schemas(self.writer.channels.values())
                 self.catalog.put_recording(self.entry)
             except DatabaseError as error:
                 failure = error

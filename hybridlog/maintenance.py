@@ -173,9 +173,7 @@ def catch_up(
         index.abandon()
         gatherer.discard()
         raise
-    for channel in channels_of(summaries.values()).values():
-        if channel.schema is not None:
-            catalog.put_schema(channel.schema)
+    catalog.put_schemas(channels_of(summaries.values()).values())
     catalog.put_losses(recording_id, whole.end.get("losses", []))
     catalog.put_recording(whole)
     return len(missing)

@@ -19,7 +19,6 @@ from hybridlog.query.plan import Lane
 from hybridlog.query.predicate import Predicate
 from hybridlog.query.topics import resolve
 from hybridlog.reader import Query
-from hybridlog.schema.codec import codec_for
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.directory import StoreDirectory
@@ -275,7 +274,7 @@ class Store:
         lanes = self._lanes.get(recording.id)
         if lanes is None:
             channels = self._channels(recording)
-            lanes = [Lane(recording, i, c, codec_for(c)) for i, c in sorted(channels.items())]
+            lanes = [Lane(recording, i, c) for i, c in sorted(channels.items())]
             self._lanes[recording.id] = lanes
         return lanes
 

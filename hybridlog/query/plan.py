@@ -13,13 +13,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
 from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
+from hybridlog.schema.codec import codec_for
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.copying import interleave
 from hybridlog_storage.distinct import distinct
@@ -74,7 +75,7 @@ def count_given(counters: Counters, batch: Batch) -> None:
     counters.payload_bytes += batch.payload_bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Lane:
     """One channel of one recording that a question is about.
 
@@ -82,13 +83,16 @@ class Lane:
         recording: Its recording.
         channel_id: Its id there.
         channel: Topic, type and so on.
-        codec: Reads its payloads.
     """
 
     recording: RecordingEntry
     channel_id: int
     channel: Channel
-    codec: Codec
+
+    @cached_property
+    def codec(self) -> Codec:
+        """Reads its payloads; of a hundred definitions a question needs one or two."""
+        return codec_for(self.channel)
 
     @property
     def is_reduced(self) -> bool:

@@ -193,15 +193,16 @@ class Catalog:
         found = [RecordingEntry.from_document(d) for d in self._db.find(RECORDINGS, {})]
         return sorted(found, key=lambda r: (r.span is None, r.span or (0, 0), r.id))
 
-    def put_schema(self, schema: Schema) -> str:
-        """Keep a schema; returns its hash, which is its key."""
-        digest = schema_hash(schema)
-        self._db.replace(
+    def put_schemas(self, channels: Iterable[Channel]) -> None:
+        """Keep the schemas of channels, each under its hash."""
+        self._db.replace_all(
             SCHEMAS,
-            {"_id": digest},
-            {"_id": digest, "name": schema.name, "encoding": schema.encoding, "data": schema.data},
+            [
+                {"_id": schema_hash(s), "name": s.name, "encoding": s.encoding, "data": s.data}
+                for s in {channel.schema for channel in channels}
+                if s is not None
+            ],
         )
-        return digest
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
         """Schemas by hash."""

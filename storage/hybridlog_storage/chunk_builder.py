@@ -45,6 +45,8 @@ class ChunkBuilder:
         self._rows: list[tuple[int, int, int, int, int, int, int]] = []
         self.copying: list[Lock] = []
         """A lock a message that was given a place; it is held until the payload is there."""
+        self.messages = 0
+        """Messages laid down so far."""
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
         self.opened = 0.0
@@ -71,6 +73,7 @@ class ChunkBuilder:
         self._lay_heads(batch, starts)
         copy_payloads(batch, self._buffer.data, starts + _HEAD)
         self._used = int(ends[-1])
+        self.messages += len(batch)
         self._pieces.append(
             (
                 Batch(
@@ -127,6 +130,7 @@ class ChunkBuilder:
         )
         target = self._buffer[start : start + length]
         self._used = start + length
+        self.messages += 1
         self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
         if length < COPIED_AT_ONCE:
             target.data[:] = source.data
@@ -153,7 +157,7 @@ class ChunkBuilder:
             the content's size in bytes (the batch's buffer may be longer).
         """
         self._settle()
-        self.copying = []
+        self.copying, self.messages = [], 0
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]

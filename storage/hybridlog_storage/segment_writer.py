@@ -73,6 +73,8 @@ AT_WORK = 8
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _SPARSE = 4  # times the usual span, for a chunk that holds little
+_FEW = 4  # messages: a chunk of fewer holds little, too,
+_LITTLE = 8  # with less than so many times the bytes of others: each costs more than a message
 _SYNC_STRIDE = 32 << 20  # bytes
 _WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
@@ -84,8 +86,9 @@ class SegmentSettings:
     Attributes:
         chunk_size: Bytes of uncompressed content at which a chunk closes.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
-        span_size: Bytes of content below which it may span four times as much: what is read too
-            much for a short slice is little then, and what a chunk costs is not.
+        span_size: Bytes of content below which it may span four times as much, or below eight
+            times these with fewer than four messages: what is read too much for a short slice
+            is little then, and what a chunk costs is not.
         large_payload: Mean payload bytes from which a channel gets chunks of its own.
         compression: Codec of chunks that can be compressed.
         level: zstd level.
@@ -621,7 +624,7 @@ class RecordingWriter:
         if len(builder):
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
-            is_far = away >= self._span_of(len(builder))
+            is_far = away >= self._span_of(len(builder), builder.messages)
             if (key != _SHARED and is_far) or size > self.settings.chunk_size:
                 self._close_chunk(key)
         copy = builder.place_one(
@@ -756,10 +759,10 @@ class RecordingWriter:
             if start < total or len(builder) >= self.settings.chunk_size:
                 self._close_chunk(key)
 
-    def _span_of(self, held: int) -> int:
-        """Most log time, ns, of a chunk of its own that holds so many bytes."""
-        settings = self.settings
-        return settings.chunk_span_ns * (1 if held >= settings.span_size else _SPARSE)
+    def _span_of(self, held: int, messages: int) -> int:
+        """Most log time, ns, of a chunk of its own with so many bytes and messages."""
+        little = self.settings.span_size * (_LITTLE if messages < _FEW else 1)
+        return self.settings.chunk_span_ns * (_SPARSE if held < little else 1)
 
     def _span_end(self, builder: ChunkBuilder, batch: Batch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
@@ -770,8 +773,9 @@ class RecordingWriter:
             return len(batch)
         sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
         held = np.cumsum(sizes) - sizes + len(builder)
-        is_sparse = held < self.settings.span_size
-        far = away >= np.where(is_sparse, self._span_of(0), self.settings.chunk_span_ns)
+        messages = np.arange(len(sizes)) + builder.messages
+        little = self.settings.span_size * np.where(messages < _FEW, _LITTLE, 1)
+        far = away >= self.settings.chunk_span_ns * np.where(held < little, _SPARSE, 1)
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:

@@ -156,8 +156,11 @@ def test_recordings_come_back_in_the_order_of_time(catalog: Catalog) -> None:
 
 def test_schemas(catalog: Catalog) -> None:
     one, other = Schema("a/B", "ros1msg", b"\xff\0int8 x"), Schema("a/B", "ros1msg", b"")
-    digests = [catalog.put_schema(one), catalog.put_schema(other), catalog.put_schema(one)]
-    assert digests[0] == digests[2] == schema_hash(one) != digests[1]
+    catalog.put_schemas(Channel(topic, "ros1", s) for topic, s in [("a", one), ("b", other)])
+    catalog.put_schemas([Channel("c", "ros1", one), Channel("d", "json", None)])
+    catalog.put_schemas([])
+    digests = [schema_hash(one), schema_hash(other)]
+    assert digests[0] != digests[1]
     assert catalog.schemas(set(digests)) == {digests[0]: one, digests[1]: other}
     assert catalog.schemas([digests[1], "nothing"]) == {digests[1]: other}
     assert catalog.schemas([]) == {}

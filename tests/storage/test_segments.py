@@ -332,7 +332,15 @@ def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("at_once", [1, 7, 100])
 def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> None:
     setup = SegmentSettings()
-    for place, size, hz in (("sparse", 2000, 8), ("usual", 20_000, 16), ("rare", 5000, 1)):
+    loads = {
+        "sparse": (2000, 8, 8),
+        "usual": (20_000, 16, 4),
+        "rare": (5000, 1, 1),
+        "few": (40_000, 4, 4),
+        "fewer": (160_000, 4, 2),
+        "large": (320_000, 4, 1),
+    }
+    for place, (size, hz, want) in loads.items():
         step = 10**9 // hz
         rows = many(100, size=size, step=step)
         batches = [rows[at : at + at_once] for at in range(0, len(rows), at_once)]
@@ -342,9 +350,9 @@ def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> N
         for chunk in chunks:
             span = int(chunk.batch.log_time.max() - chunk.batch.log_time.min())
             assert span < 4 * setup.chunk_span_ns
-            before = (len(chunk.batch) - 1) * (size + 31)
-            assert span - step < setup.chunk_span_ns or before - size < setup.span_size
-        want = {"sparse": 8, "usual": 4, "rare": 1}[place]
+            before = len(chunk.batch) - 1  # messages, when the last one was laid down
+            little = setup.span_size * (8 if before < 4 else 1)
+            assert span < setup.chunk_span_ns or before * (size + 31) < little
         assert set(counts[:-1]) == {want}, place
 
 
