@@ -133,7 +133,7 @@ class Capture:
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
-        self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.entries())
+        self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.totals())
         failure = self.index.failure
         if failure is None:
             self._gatherer.close(self.entry)

@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from hybridlog.losses import joined
 from hybridlog_storage.catalog import (
     ChannelEntry,
     ChannelStats,
-    ChunkEntry,
+    ChannelTotals,
     RecordingEntry,
     channel_entry,
 )
@@ -75,21 +76,31 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
     return channels
 
 
+class StoredSummaries:
+    """Summaries of a recording's sealed segments, in order; of a long one too many to hold."""
+
+    def __init__(self, directory: StoreDirectory, recording_id: str) -> None:
+        self._segments = directory.segments(recording_id)
+
+    def __iter__(self) -> Iterator[SegmentSummary]:
+        """Read one after the other."""
+        for number, path in self._segments:
+            with SegmentReader(path, number) as reader:
+                yield reader.summary()
+
+
 def read_summaries(directory: StoreDirectory, recording_id: str) -> dict[int, SegmentSummary]:
     """The summaries of a recording's sealed segments, by segment number."""
-    summaries = {}
-    for number, path in directory.segments(recording_id):
-        with SegmentReader(path, number) as reader:
-            summaries[number] = reader.summary()
-    return summaries
+    numbers = (number for number, _ in directory.segments(recording_id))
+    return dict(zip(numbers, StoredSummaries(directory, recording_id), strict=True))
 
 
 def build_entry(
     directory: StoreDirectory,
     indexer: ChunkIndexer,
     recording_id: str,
-    chunks: Iterable[ChunkEntry],
-    summaries: Mapping[int, SegmentSummary] | None = None,
+    totals: ChannelTotals,
+    summaries: Iterable[SegmentSummary] | None = None,
 ) -> RecordingEntry:
     """The whole entry of a sealed recording.
 
@@ -97,49 +108,58 @@ def build_entry(
         directory: The store.
         indexer: Knows which channels are indexed.
         recording_id: The recording.
-        chunks: Entries of all its chunks, in any order.
-        summaries: Summaries of its segments, if they are at hand.
+        totals: Statistics of its channels, as far as its chunks are indexed.
+        summaries: Summaries of its segments, in order, if they are at hand; may be gone
+            through twice.
+
+    Raises:
+        SegmentError: a segment cannot be read, or there is none.
     """
     if summaries is None:
-        summaries = read_summaries(directory, recording_id)
-    if not summaries:
+        summaries = StoredSummaries(directory, recording_id)
+    entry: RecordingEntry | None = None
+    channels: dict[int, Channel] = {}
+    counts: Counter[int] = Counter()
+    end: Mapping[str, Any] | None = None
+    lost: list[dict[str, Any]] = []
+    segments = chunks = 0
+    for summary in summaries:
+        entry = entry or entry_of(summary.recording)
+        channels.update(summary.channels)
+        counts.update(summary.counts)
+        end = summary.end if summary.end is not None else end
+        lost += summary.losses
+        segments += 1
+        chunks += len(summary.chunks)
+    if entry is None:
         raise SegmentError(f"Recording {recording_id!r} has no sealed segment.")
-    entry = entry_of(summaries[min(summaries)].recording)
     entry.id = recording_id
-    ends = [s.end for _, s in sorted(summaries.items()) if s.end is not None]
-    entry.status = str(ends[-1].get("status", "complete")) if ends else "recovered"
-    entry.end = dict(ends[-1]) if ends else {}
-    lost = [row for _, summary in sorted(summaries.items()) for row in summary.losses]
+    entry.status = str(end.get("status", "complete")) if end is not None else "recovered"
+    entry.end = dict(end) if end is not None else {}
     if lost:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost])
-    entries: dict[int, ChannelEntry] = {
-        channel_id: channel_entry(channel_id, channel, indexer.reason(channel_id, channel))
-        for channel_id, channel in sorted(channels_of(summaries.values()).items())
-    }
-    # Sums of floats depend on their order, so it is fixed.
-    for chunk in sorted(chunks, key=lambda c: (c.segment, c.offset)):
-        for channel_id, stats in chunk.stats.items():
-            entries[channel_id].stats.add(stats)
-    _fill_unindexed(entries, summaries)
-    entry.channels = list(entries.values())
-    entry.segments = len(summaries)
-    entry.chunks = sum(len(s.chunks) for s in summaries.values())
+    for channel_id, channel in sorted(channels.items()):
+        reason = indexer.reason(channel_id, channel)
+        entry.channels.append(channel_entry(channel_id, channel, reason))
+        entry.channels[-1].stats = totals.stats(channel_id)
+    _fill_unindexed(entry.channels, counts, summaries)
+    entry.segments, entry.chunks = segments, chunks
     entry.stored_bytes = sum(p.stat().st_size for _, p in directory.segments(recording_id))
     return entry
 
 
 def _fill_unindexed(
-    entries: Mapping[int, ChannelEntry], summaries: Mapping[int, SegmentSummary]
+    channels: Iterable[ChannelEntry],
+    counts: Mapping[int, int],
+    summaries: Iterable[SegmentSummary],
 ) -> None:
     """Where chunks have no entries (yet), say at least what the segments' summaries say."""
-    for channel_id, entry in entries.items():
-        counted = sum(s.counts.get(channel_id, 0) for s in summaries.values())
-        if counted > entry.stats.messages:
-            places = [c for s in summaries.values() for c in s.chunks if channel_id in c.channels]
-            entry.stats.add(
-                ChannelStats(
-                    messages=counted - entry.stats.messages,
-                    first=min(c.first for c in places),
-                    last=max(c.last for c in places),
-                )
-            )
+    short = {c.id: c.stats for c in channels if counts.get(c.id, 0) > c.stats.messages}
+    if not short:
+        return
+    for summary in summaries:
+        for chunk in summary.chunks:
+            for channel_id in short.keys() & chunk.channels:
+                short[channel_id].add(ChannelStats(first=chunk.first, last=chunk.last))
+    for channel_id, stats in short.items():
+        stats.messages = counts[channel_id]

@@ -20,7 +20,7 @@ import numpy as np
 
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import header_stamps
-from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry
+from hybridlog_storage.catalog import Catalog, ChannelStats, ChannelTotals, ChunkEntry
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
@@ -255,6 +255,7 @@ class IndexWriter:
         self.missed = 0
         """Messages that were skipped because the database had failed."""
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
+        self._totals: ChannelTotals | None = ChannelTotals()
         self._indexer = indexer
         self._lag = lag
         self._gatherer = gatherer
@@ -279,17 +280,14 @@ class IndexWriter:
         """Where documents go now."""
         return self._database
 
-    def entries(self) -> list[ChunkEntry]:
-        """Entries of the recording's chunks: of all as long as the database has not failed.
-
-        They are read back: a recording of a day has too many to keep them meanwhile.
-        """
-        if self.failure is None:
+    def totals(self) -> ChannelTotals:
+        """Statistics of the channels, of all chunks that are in the index."""
+        if self._totals is None and self.failure is None:
             try:
-                return self._catalog.chunks(self._indexer.recording)
+                self._totals = ChannelTotals.of(self._catalog.chunks(self._indexer.recording))
             except DatabaseError as error:
                 self.failure = error
-        return list(self._latest)
+        return self._totals or ChannelTotals()
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Index a chunk that is in its segment; waits while the backlog is full."""
@@ -394,6 +392,7 @@ class IndexWriter:
                     self._latest.append(entry)
                 else:
                     self.indexed -= self._put_back(entry)
+                    self._totals = None  # what was taken in cannot be taken out
             self.failure, self._is_away = None, False
             waiting = len(self._forgotten)
         for _ in range(waiting):
@@ -454,6 +453,9 @@ class IndexWriter:
             if failure is None:
                 self.indexed += parcel.messages
                 self._latest.extend(parcel.entries)
+                if self._totals is not None:
+                    for entry in parcel.entries:
+                        self._totals.add(entry)
                 return
             self.failure = failure
             self._retry_at = time.monotonic() + _RETRY_S

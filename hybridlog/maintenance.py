@@ -17,7 +17,14 @@ from hybridlog.columns.stored import FieldColumns
 from hybridlog.columns.topic import is_small
 from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
-from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog, RecordingEntry, schema_hash
+from hybridlog_storage.catalog import (
+    CHUNKS,
+    RECORDINGS,
+    Catalog,
+    ChannelTotals,
+    RecordingEntry,
+    schema_hash,
+)
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.index_documents import key_bound, recording_key
@@ -166,8 +173,8 @@ def catch_up(
         index.close()
         if index.failure is not None:
             raise index.failure
-        chunks = catalog.chunks(recording_id)
-        whole = build_entry(directory, indexer, recording_id, chunks, summaries)
+        totals = ChannelTotals.of(catalog.chunks(recording_id))
+        whole = build_entry(directory, indexer, recording_id, totals, summaries.values())
         gatherer.close(whole)
     except BaseException:
         index.abandon()
@@ -297,7 +304,7 @@ def _verify_recording(
     catalog = Catalog(database)
     check = _Check(database, recording_id, result)
     check.entries = {(c.segment, c.offset): c for c in catalog.chunks(recording_id)}
-    chunks = list(check.entries.values())
+    totals = ChannelTotals.of(check.entries.values())
     for number, path in directory.segments(recording_id):
         with SegmentReader(path, number) as reader:
             try:
@@ -311,7 +318,7 @@ def _verify_recording(
         check.found("catalog", "the recording is missing; run `hybridlog reindex`")
         return
     if check.indexer is not None and not check.damaged:
-        whole = build_entry(directory, check.indexer, recording_id, chunks)
+        whole = build_entry(directory, check.indexer, recording_id, totals)
         if known[recording_id] != whole:
             check.found("catalog", "its entry differs from the segments; run `hybridlog reindex`")
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import build_entry, entry_of, read_summaries
 from hybridlog.indexing import ChunkIndexer
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
+from hybridlog_storage.catalog import ChannelStats, ChannelTotals, ChunkEntry, RecordingEntry
 
 if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
@@ -33,7 +33,10 @@ class SegmentCatalog:
                 continue
             base = entry_of(summaries[min(summaries)].recording)
             indexer = ChunkIndexer(recording_id, base.key)
-            found.append(build_entry(self._directory, indexer, recording_id, (), summaries))
+            totals = ChannelTotals()  # what only the index knows
+            found.append(
+                build_entry(self._directory, indexer, recording_id, totals, summaries.values())
+            )
             self._chunks[recording_id] = [
                 ChunkEntry(
                     recording_id,

@@ -8,9 +8,10 @@ crash left out is found by comparing entries with the segment's own list of chun
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Final, cast
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Self, cast
 
 from hybridlog_storage.database import Database
 from hybridlog_storage.messages import Channel, Schema
@@ -172,6 +173,35 @@ class ChunkEntry:
         firsts = [s.first for s in stats if s.first is not None]
         lasts = [s.last for s in stats if s.last is not None]
         return (min(firsts), max(lasts)) if firsts and lasts else None
+
+
+class ChannelTotals:
+    """Statistics of channels, summed up chunk by chunk; the order makes no difference."""
+
+    def __init__(self) -> None:
+        self._stats: dict[int, ChannelStats] = {}
+        # Of floats the order would: these are exact, since a skew is a number of nanoseconds.
+        self._skews: Counter[int] = Counter()
+
+    @classmethod
+    def of(cls, chunks: Iterable[ChunkEntry]) -> Self:
+        """The totals of some chunks."""
+        totals = cls()
+        for chunk in chunks:
+            totals.add(chunk)
+        return totals
+
+    def add(self, chunk: ChunkEntry) -> None:
+        """Take in a chunk."""
+        for channel, stats in chunk.stats.items():
+            self._stats.setdefault(channel, ChannelStats()).add(stats)
+            self._skews[channel] += int(stats.skew_sum)
+
+    def stats(self, channel: int) -> ChannelStats:
+        """What is known of a channel: nothing, if no chunk had messages of it."""
+        return replace(
+            self._stats.get(channel, ChannelStats()), skew_sum=float(self._skews[channel])
+        )
 
 
 class Catalog:

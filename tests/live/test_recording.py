@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from mcap.reader import make_reader
@@ -25,7 +25,9 @@ from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema
@@ -545,6 +547,47 @@ def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.
     assert report.failure is None
     assert (report.indexed, report.missed) == (3, 0)
     assert store.topic("/speech").where("data == 'while'").count() == 1
+    assert not store.verify().findings
+
+
+def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
+    store: hl.Store,
+) -> None:
+    speech = channel("/speech")
+    with store.start("talk") as recording:
+        recording.write(speech, text(b"lost"), log_time=1)
+        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
+        database = store.database_for("This")
+        assert database.delete(CHUNKS, {"rec": recording.id}) == 1
+        assert database.delete(collection_of("/speech"), {"_meta.rec": recording.id}) == 1
+        kill_mongod(store.directory.path)
+        recording.write(speech, text(b"after"), log_time=2)
+        wait_for(lambda: recording.index_failure is not None)
+        wait_for(lambda: recording.index_failure is None and recording.lag == 0)
+        report = recording.close()
+    (found,) = report.entry.channels
+    assert (found.stats.messages, found.stats.payload_bytes) == (2, 8 + 9)
+    assert store.topic("/speech").where("data == 'lost'").count() == 1
+    assert not store.verify().findings
+
+
+def test_the_end_of_a_recording_asks_for_none_of_its_chunks(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a day's recording they are more than the memory holds."""
+
+    def asked(*_: object, **__: object) -> NoReturn:
+        raise AssertionError("the chunks of the whole recording")
+
+    recording = store.start("talk", flush_interval_s=0.05)
+    with monkeypatch.context() as patch:
+        patch.setattr(Catalog, "chunks", asked)
+        speech = channel("/speech")
+        for number in range(1, 6):
+            recording.write(speech, text(b"word"), log_time=number)
+            wait_for(lambda n=number: (recording.stored[0], recording.lag) == (n, 0))
+        report = recording.close()
+    assert (report.entry.messages, report.entry.chunks) == (5, 5)
     assert not store.verify().findings
 
 
