@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 RECORD_HEAD = struct.Struct("<BQ")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
 """Opcode and length of the content, at the start of every record."""
 
 MESSAGE_HEAD = np.dtype(
@@ -290,12 +291,33 @@ def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
     return records.MessageIndex(channel, entries), 6 + length
 
 
+def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
+    """As the mcap package does, which takes five times as long; a summary has thousands."""
+    first, last, start, length, offsets_size = _CHUNK_INDEX.unpack_from(content)
+    at = _CHUNK_INDEX.size + offsets_size
+    offsets = content[_CHUNK_INDEX.size : at]
+    index_length, name_size = struct.unpack_from("<QI", content, at)
+    name = content[at + 12 : at + 12 + name_size]
+    compressed, uncompressed = struct.unpack_from("<QQ", content, at + 12 + name_size)
+    record = records.ChunkIndex(
+        message_start_time=first,
+        message_end_time=last,
+        chunk_start_offset=start,
+        chunk_length=length,
+        message_index_offsets=dict(struct.iter_unpack("<HQ", offsets)),
+        message_index_length=index_length,
+        compression=str(name, "utf-8"),
+        compressed_size=compressed,
+        uncompressed_size=uncompressed,
+    )
+    return record, at + 28 + name_size
+
+
 _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.FOOTER: records.Footer.read,
     Opcode.SCHEMA: records.Schema.read,
     Opcode.CHANNEL: records.Channel.read,
-    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
     Opcode.ATTACHMENT: records.Attachment.read,
     Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
     Opcode.STATISTICS: records.Statistics.read,
@@ -325,6 +347,8 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
     try:
         if opcode == Opcode.MESSAGE_INDEX:
             return _read_message_index(content)
+        if opcode == Opcode.CHUNK_INDEX:
+            return _read_chunk_index(content)
         reader = _READERS.get(opcode)
         if reader is None:
             return None, 0

@@ -16,7 +16,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, MessageIndex, Schema
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Schema,
+)
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
@@ -288,6 +298,36 @@ def test_any_bytes_as_a_record_give_a_record_or_one_error(opcode: int, data: byt
     with contextlib.suppress(SegmentError):
         record, used = read_record(opcode, data)
         assert record is None or 0 < used <= len(data)
+
+
+_NUMBER = st.integers(0, (1 << 64) - 1)
+
+
+@given(
+    st.builds(
+        ChunkIndex,
+        chunk_length=_NUMBER,
+        chunk_start_offset=_NUMBER,
+        compression=st.text(max_size=5),
+        compressed_size=_NUMBER,
+        message_end_time=_NUMBER,
+        message_index_length=_NUMBER,
+        message_index_offsets=st.dictionaries(st.integers(0, 65535), _NUMBER, max_size=4),
+        message_start_time=_NUMBER,
+        uncompressed_size=_NUMBER,
+    ),
+    st.binary(max_size=3),
+)
+def test_an_index_of_a_chunk_is_read_as_the_mcap_package_writes_it(
+    written: ChunkIndex, more: bytes
+) -> None:
+    builder = RecordBuilder()
+    written.write(builder)
+    data = builder.end()[9:]
+    assert read_record(Opcode.CHUNK_INDEX, data + more) == (written, len(data))
+    for size in range(len(data)):
+        with pytest.raises(SegmentError, match="chunk index record is damaged"):
+            read_record(Opcode.CHUNK_INDEX, memoryview(data)[:size])
 
 
 @pytest.mark.parametrize("claim", [4, 1 << 31, (1 << 63) - 1, (1 << 64) - 1])
