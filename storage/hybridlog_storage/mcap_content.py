@@ -343,7 +343,6 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         SegmentError: Its fields do not fit into it, are no UTF-8, or its checksum
             differs.
     """
-    name = Opcode(opcode).name.replace("_", " ").lower() if opcode in _NAMED else ""
     try:
         if opcode == Opcode.MESSAGE_INDEX:
             return _read_message_index(content)
@@ -355,14 +354,12 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         stream = _Fields(content)
         record = reader(stream)
     except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
+        name = Opcode(opcode).name.replace("_", " ").lower()  # one that is read has a name
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
     if isinstance(record, records.Attachment):
         # The mcap package steps over the checksum, which is the last field.
         _check_attachment(content, stream.count)
     return record, stream.count
-
-
-_NAMED = frozenset(int(opcode) for opcode in Opcode)
 
 
 def _check_attachment(content: Buffer, used: int) -> None:
