@@ -284,7 +284,7 @@ class IndexWriter:
         """Statistics of the channels, of all chunks that are in the index."""
         if self._totals is None and self.failure is None:
             try:
-                self._totals = ChannelTotals.of(self._catalog.chunks(self._indexer.recording))
+                self._totals = ChannelTotals.of(self._catalog.every_chunk(self._indexer.recording))
             except DatabaseError as error:
                 self.failure = error
         return self._totals or ChannelTotals()
@@ -377,7 +377,8 @@ class IndexWriter:
             database = self._lag.renew()
             self._renewed.append(database)
             catalog = Catalog(database)
-            there = {(c.segment, c.offset) for c in catalog.chunks(self._indexer.recording)}
+            chunks = catalog.every_chunk(self._indexer.recording)
+            there = {(chunk.segment, chunk.offset) for chunk in chunks}
         except DatabaseError as error:
             self.failure = error
             self._retry_at = time.monotonic() + _RETRY_S

@@ -153,18 +153,17 @@ def catch_up(
     is_open = database.find_one(RECORDINGS, {"_id": recording_id, "status": "open"}) is not None
     indexer = ChunkIndexer(recording_id, entry.key)
     places = {(n, c.offset) for n, summary in summaries.items() for c in summary.chunks}
-    entries = catalog.chunks(recording_id)
-    if any((c.segment, c.offset) not in places for c in entries) or is_open:
+    done = _indexed(catalog, recording_id)
+    if not places.issuperset(done) or is_open:
         # A power cut may take back chunks whose index documents are on the disk already.
         _drop_dangling(database, recording_id, summaries)
-        entries = catalog.chunks(recording_id)
-    done = {(c.segment, c.offset) for c in entries}
+        done = _indexed(catalog, recording_id)
     gatherer = FieldGatherer(directory.recording(recording_id))
     index = IndexWriter(indexer, database)
-    missing = places - done
+    missing = places - done.keys()
     # What is indexed already is missing in the columns all the same.
     wanted = dict.fromkeys(missing, True)
-    wanted.update({(c.segment, c.offset): False for c in entries if _is_small(c)})
+    wanted.update((place, False) for place, has_small in done.items() if has_small)
     try:
         for chunk, channels in _chunks(directory, recording_id, summaries, wanted, progress):
             gatherer.add(chunk, channels)
@@ -173,7 +172,7 @@ def catch_up(
         index.close()
         if index.failure is not None:
             raise index.failure
-        totals = ChannelTotals.of(catalog.chunks(recording_id))
+        totals = ChannelTotals.of(catalog.every_chunk(recording_id))
         whole = build_entry(directory, indexer, recording_id, totals, summaries.values())
         gatherer.close(whole)
     except BaseException:
@@ -184,6 +183,11 @@ def catch_up(
     catalog.put_losses(recording_id, whole.end.get("losses", []))
     catalog.put_recording(whole)
     return len(missing)
+
+
+def _indexed(catalog: Catalog, recording_id: str) -> dict[tuple[int, int], bool]:
+    """The chunks with an entry, by segment and place: whether their messages are small."""
+    return {(c.segment, c.offset): _is_small(c) for c in catalog.every_chunk(recording_id)}
 
 
 def _is_small(chunk: ChunkEntry) -> bool:

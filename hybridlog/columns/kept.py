@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -202,7 +203,9 @@ class KeptColumns:
         with self._lock:
             generation = self._generation
             found, missing = self._look(topic, recordings, wanted)
-            if missing and not self._is_worth(topic, recordings, missing, wanted, instead_s()):
+            ways = {r.id: self._cheapest_way(r, topic, wanted) for r in missing}
+            price = sum(way.price for way in ways.values())
+            if missing and not self._is_worth(topic, recordings, wanted, price, instead_s()):
                 return None
         if missing:
             # Of several who want the same at once, the first one gets it for all.
@@ -210,8 +213,11 @@ class KeptColumns:
                 with self._lock:
                     found, missing = self._look(topic, recordings, wanted)
                 for recording in missing:
+                    way = ways.get(recording.id) or self._cheapest_way(recording, topic, wanted)
+                    load = partial(self._load, recording, topic, way, counters)
+                    key = recording.id, topic
                     try:
-                        self._add(found, recording, topic, wanted, counters)
+                        found[key] = self._completed(found.get(key), wanted, load)
                     except UnfitError:
                         with self._lock:
                             if generation == self._generation:
@@ -236,33 +242,28 @@ class KeptColumns:
                 missing.append(recording)
         return found, missing
 
-    def _add(
+    def _completed(
         self,
-        found: dict[tuple[str, str], TopicColumns],
-        recording: RecordingEntry,
-        topic: str,
+        kept: TopicColumns | None,
         wanted: _Wanted,
-        counters: Counters,
-    ) -> None:
-        """Get what is missing of a recording."""
-        key = recording.id, topic
-        kept = found.get(key)
+        load: Callable[[_Wanted], TopicColumns],
+    ) -> TopicColumns:
+        """What is kept of a recording, with what is missing."""
         if kept is None:
-            found[key] = self._load(recording, topic, wanted, counters)
-            return
+            return load(wanted)
         missing = _Wanted(wanted.fields - kept.fields.keys(), wanted.ordered and not kept.order)
-        loaded = self._load(recording, topic, missing, counters)
+        loaded = load(missing)
         fields = {**kept.fields, **loaded.fields}
         if sum(map(nbytes, fields.values())) > self.most_bytes / 2:
             fields = {path: fields[path] for path in wanted.fields}  # these at least have room
-        found[key] = TopicColumns(kept.rows, kept.order or loaded.order, fields)
+        return TopicColumns(kept.rows, kept.order or loaded.order, fields)
 
     def _is_worth(
         self,
         topic: str,
         recordings: Sequence[RecordingEntry],
-        missing: Sequence[RecordingEntry],
         wanted: _Wanted,
+        price: float,
         instead_s: float,
     ) -> bool:
         """Whether to get columns now: enough was spent, and all of them have room together."""
@@ -270,7 +271,6 @@ class KeptColumns:
             return False
         if sum(self._size(r, topic, wanted.fields) for r in recordings) > self.most_bytes:
             return False
-        price = sum(self._ways(r, topic, wanted)[0].price for r in missing)
         # An answer that alone costs twice as much as the columns is worth them at once.
         if self._spent[topic] + instead_s / 2 < price:
             self._spent[topic] += instead_s
@@ -285,8 +285,8 @@ class KeptColumns:
         text = sum(s.payload_bytes for s in recording.stats_of(topic)) if has_text else 0
         return recording.messages_of(topic) * 8 * (2 + len(fields)) + text
 
-    def _ways(self, recording: RecordingEntry, topic: str, wanted: _Wanted) -> list[_Way]:
-        """How columns can be got, the cheapest way first."""
+    def _cheapest_way(self, recording: RecordingEntry, topic: str, wanted: _Wanted) -> _Way:
+        """How columns are got for the least."""
         messages = recording.messages_of(topic)
         ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, _from_index)]
         file, known = self._store.columns(recording.id), self.types(recording, topic) or {}
@@ -305,14 +305,15 @@ class KeptColumns:
             ]
             size = sum(s.payload_bytes + _RECORD_BYTES * s.messages for s in read)
             ways.append(_Way(_QUESTION_S + _BYTE_S * size, _from_segments))
-        return sorted(ways, key=lambda way: way.price)
+        return min(ways, key=lambda way: way.price)
 
     def _load(
         self,
         recording: RecordingEntry,
         topic: str,
-        wanted: _Wanted,
+        way: _Way,
         counters: Counters,
+        wanted: _Wanted,
     ) -> TopicColumns:
         known = self.types(recording, topic) or {}
         if not wanted.fields <= known.keys():
@@ -323,8 +324,7 @@ class KeptColumns:
         if last + 1 < TIME_LIMIT:
             # The documents of other recordings need not be looked at.
             query = query.between(f"{first}ns", f"{last + 1}ns")
-        load = self._ways(recording, topic, wanted)[0].load
-        columns = load(query, {path: known[path] for path in wanted.fields}, wanted.ordered)
+        columns = way.load(query, {path: known[path] for path in wanted.fields}, wanted.ordered)
         counters.bytes_read += query.counters.bytes_read
         counters.chunks_read += query.counters.chunks_read
         counters.documents_read += query.counters.documents_read

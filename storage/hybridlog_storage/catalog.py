@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Self, cast
 
@@ -282,7 +282,6 @@ class Catalog:
             brief: Of each channel only how many messages there are, and their first and
                 last log time.
         """
-        query: dict[str, Any] = {"rec": recording}
         of_channel: dict[str, Any] = {}
         if channels is not None:
             of_channel["c"] = {"$in": list(channels)}
@@ -292,10 +291,16 @@ class Catalog:
             if longest is not None and clock == "log":
                 of_channel["first"]["$gte"] = max(bounds[0] - longest, 0)
             of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
-        if of_channel:
-            query["ch"] = {"$elemMatch": of_channel}
+        query = {"ch": {"$elemMatch": of_channel}} if of_channel else {}
+        return list(self._chunks({"rec": recording, **query}, brief=brief))
+
+    def every_chunk(self, recording: str) -> Iterator[ChunkEntry]:
+        """All chunks of a recording, one by one: of a long one too many to hold."""
+        return self._chunks({"rec": recording})
+
+    def _chunks(self, query: Mapping[str, Any], *, brief: bool = False) -> Iterator[ChunkEntry]:
         found = self._db.find(CHUNKS, query, _BRIEF if brief else None, batch_size=_CHUNK_ENTRIES)
-        return [_chunk_entry(document) for document in found]
+        return map(_chunk_entry, found)
 
     def remove_recording(self, recording: str, collections: Iterable[str]) -> None:
         """Remove every trace of a recording from the database."""

@@ -139,8 +139,8 @@ WAYS = {
 
 def get_by(patch: pytest.MonkeyPatch, way: str, price: float = 0.0) -> None:
     """Let columns be got in one way only, and cost so much."""
-    ways = [kept_columns._Way(price, WAYS[way])]
-    patch.setattr(kept_columns.KeptColumns, "_ways", lambda *_: ways)
+    only = kept_columns._Way(price, WAYS[way])
+    patch.setattr(kept_columns.KeptColumns, "_cheapest_way", lambda *_: only)
 
 
 @pytest.fixture

@@ -581,7 +581,7 @@ def test_the_end_of_a_recording_asks_for_none_of_its_chunks(
 
     recording = store.start("talk", flush_interval_s=0.05)
     with monkeypatch.context() as patch:
-        patch.setattr(Catalog, "chunks", asked)
+        patch.setattr(Catalog, "_chunks", asked)
         speech = channel("/speech")
         for number in range(1, 6):
             recording.write(speech, text(b"word"), log_time=number)
