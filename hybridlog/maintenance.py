@@ -308,7 +308,7 @@ def _verify_recording(
     catalog = Catalog(database)
     check = _Check(database, recording_id, result)
     check.entries = {(c.segment, c.offset): c for c in catalog.chunks(recording_id)}
-    totals = ChannelTotals.of(check.entries.values())
+    chunks = list(check.entries.values())
     for number, path in directory.segments(recording_id):
         with SegmentReader(path, number) as reader:
             try:
@@ -322,6 +322,7 @@ def _verify_recording(
         check.found("catalog", "the recording is missing; run `hybridlog reindex`")
         return
     if check.indexer is not None and not check.damaged:
+        totals = ChannelTotals.of(chunks)
         whole = build_entry(directory, check.indexer, recording_id, totals)
         if known[recording_id] != whole:
             check.found("catalog", "its entry differs from the segments; run `hybridlog reindex`")

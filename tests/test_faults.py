@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import resource
@@ -648,6 +649,7 @@ def test_segments_that_changed_places_are_found(store: hl.Store) -> None:
         lambda db: db["hybridlog.chunks"].delete_one({}),
         lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"first": 1}}),
         lambda db: db["hybridlog.chunks"].update_one({}, {"$inc": {"ch.0.messages": 1}}),
+        lambda db: db["hybridlog.chunks"].update_one({}, {"$set": {"ch.0.skew_sum": math.nan}}),
         lambda db: db["hybridlog.recordings"].update_one(
             {}, {"$inc": {"channels.0.stats.last": 9}}
         ),
@@ -660,8 +662,8 @@ def test_segments_that_changed_places_are_found(store: hl.Store) -> None:
     ids=[
         "deleted", "altered", "extended", "misplaced", "wrong-segment", "wrong-recording",
         "doubled", "stray", "collection-dropped", "chunk-deleted", "chunk-altered",
-        "chunk-statistics", "recording-statistics", "recording-name", "recording-channels",
-        "recording-deleted", "schema-deleted", "schema-altered",
+        "chunk-statistics", "chunk-skew", "recording-statistics", "recording-name",
+        "recording-channels", "recording-deleted", "schema-deleted", "schema-altered",
     ],
 )  # fmt: skip
 def test_an_altered_index_is_found_and_mended(

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 RECORD_HEAD = struct.Struct("<BQ")
-_CHUNK_INDEX = struct.Struct("<QQQQI")
 """Opcode and length of the content, at the start of every record."""
+_CHUNK_INDEX = struct.Struct("<QQQQI")  # as far as its map of message indexes
 
 MESSAGE_HEAD = np.dtype(
     [
