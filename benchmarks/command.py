@@ -21,6 +21,7 @@ _EXIT_CODES = (
     "    0  done\n"
     "    1  a run failed, or backends gave different answers\n"
     "    2  the question is wrong: an option, a name, a directory\n"
+    "    3  a log cannot be read\n"
     "  130  interrupted (Ctrl-C); the same command goes on where it stopped"
 )
 
@@ -226,8 +227,8 @@ def persistence(
 ) -> None:
     """Study 2: what is kept of whole logs.
 
-    Published as they were recorded, then faster until something is dropped. Without --logs:
-    made ones like the paper's, and the real ones that lie beside the checkout.
+    Published as they were recorded, then faster until something is dropped: made ones like
+    the paper's, and the real ones that lie beside the checkout, or those of --logs instead.
     """
     from benchmarks.campaign import Choices
 

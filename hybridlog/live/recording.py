@@ -16,6 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
+from operator import index as index_of
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.messages import Buffer
 
 _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
@@ -94,7 +96,7 @@ class _Message(NamedTuple):
     log_time: int
     publish_time: int
     sequence: int
-    payload: bytes
+    payload: Buffer
 
 
 class _Strain:
@@ -227,7 +229,7 @@ class LiveRecording:
     def write(
         self,
         channel: Channel,
-        payload: bytes,
+        payload: Buffer,
         *,
         log_time: int | None = None,
         publish_time: int | None = None,
@@ -238,7 +240,8 @@ class LiveRecording:
 
         Args:
             channel: The same object for all messages of a channel.
-            payload: The serialized message, of any size. It must not change afterwards.
+            payload: The serialized message, of any size: bytes, or memory that holds some and
+                must not change afterwards.
             log_time: When it was received, ns since the epoch; None for now.
             publish_time: When it was sent, ns since the epoch; None for the log time, which
                 is what a channel without publish times has.
@@ -251,11 +254,21 @@ class LiveRecording:
             Whether it was taken.
 
         Raises:
-            UsageError: A number is out of its range, or the recording was closed.
+            UsageError: The payload is not bytes, a number is not whole or out of its range,
+                or the recording was closed.
             DiskFullError: No space; what was flushed before stays.
         """
-        now = time.time_ns() if log_time is None else log_time
-        sent = now if publish_time is None else publish_time
+        # Found out later, it would end the recording of everything else.
+        if type(payload) is not bytes:
+            _check_payload(payload)
+        try:
+            now = time.time_ns() if log_time is None else index_of(log_time)
+            sent = now if publish_time is None else index_of(publish_time)
+            sequence = index_of(sequence)
+        except TypeError as error:
+            raise UsageError(
+                f"a time or the sequence number of a message is no whole number: {error}"
+            ) from error
         if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
             raise UsageError("a time or the sequence number of a message is out of its range")
         size = len(payload)
@@ -273,6 +286,8 @@ class LiveRecording:
             self._check()
             index = self._ids.get(channel)
             if index is None:
+                if not isinstance(channel, Channel):
+                    raise UsageError(f"{channel!r} is no Channel")
                 index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
                 self._taken.append(0)
@@ -550,6 +565,15 @@ class LiveRecording:
             message.publish_time,
             message.sequence,
         )
+
+
+def _check_payload(payload: object) -> None:
+    """Whether something that is not `bytes` can be laid down as if it were."""
+    if isinstance(payload, memoryview) and payload.c_contiguous and payload.format == "B":
+        return
+    if not isinstance(payload, bytes | bytearray):
+        kind = type(payload).__name__
+        raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
 
 
 def _backlog(options: LiveOptions) -> int:

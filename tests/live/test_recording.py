@@ -11,10 +11,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
@@ -509,6 +510,28 @@ def test_misuse(store: hl.Store) -> None:
         store.start("talk", budget_bytes=10)
     with pytest.raises(UsageError, match="flush interval"):
         store.start("talk", flush_interval_s=0)
+
+
+def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store) -> None:
+    own, large = channel("/talk"), b"x" * (1 << 16)
+    recording: Any = store.start("talk")
+    with closing(recording):
+        recording.write(own, text(b"before"), log_time=1)
+        wide = memoryview(bytes(8)).cast("H")
+        for wrong in ("text", None, 5, [1, 2], wide, memoryview(large)[::2]):
+            with pytest.raises(UsageError, match="payload of a message"):
+                recording.write(own, wrong, log_time=2)
+        for numbers in ({"log_time": 1.5e9}, {"publish_time": "1"}, {"sequence": None}):
+            for payload in (b"", large):
+                with pytest.raises(UsageError, match="no whole number"):
+                    recording.write(own, payload, **numbers)
+        with pytest.raises(UsageError, match="'/talk' is no Channel"):
+            recording.write("/talk", b"")
+        for number, memory in enumerate((bytearray, memoryview, bytes)):
+            recording.write(own, memory(text(b"after")), log_time=np.int64(3 + number))
+    assert [s[1] for s in in_segments(store, recording.id)] == [1, 3, 4, 5]
+    assert store.topic("/talk").where("data == 'after'").count() == 3
+    assert not store.verify().findings
 
 
 def test_abort_leaves_nothing(store: hl.Store) -> None:
