@@ -485,6 +485,8 @@ class Store:
             self.disconnect()
             self.connect(self._uri)
             maintenance.catch_up(self.directory, self.database_for("The index"), report.entry.id)
+            self.refresh()
+            (report.entry,) = self.select([report.entry.id])
         except DatabaseError as error:
             report.failure = error
             self.without_database = error

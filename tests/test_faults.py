@@ -17,9 +17,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import pymongo
 import pytest
+from mcap.opcode import Opcode
 
 import hybridlog as hl
 from hybridlog import maintenance
@@ -618,6 +620,24 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
         assert opened.verify([other]).findings == []
     done = run("ls", store=store.directory.path, code=0)
     assert "short cannot be brought into the index" in done.stderr
+
+
+@pytest.mark.parametrize("offset", [1 << 30, 1 << 62, (1 << 64) - 1])
+def test_a_chunk_that_is_said_to_lie_behind_the_end_is_found_at_once(
+    store: hl.Store, offset: int
+) -> None:
+    (_, path), *_ = store.directory.segments("short")
+    data = bytearray(path.read_bytes())
+    at = start = int(struct.unpack_from("<Q", data, len(data) - 28)[0])
+    while data[at] != Opcode.CHUNK_INDEX:
+        at += 9 + int(struct.unpack_from("<Q", data, at + 1)[0])
+    struct.pack_into("<Q", data, at + 9 + 16, offset)
+    struct.pack_into("<I", data, len(data) - 12, crc32(data[start:-12]))
+    path.write_bytes(data)
+    with reopened(store) as opened:
+        findings = [f for f in opened.verify().findings if path.name in f.place]
+    assert any(str(offset) in f.place + f.problem for f in findings)
+    assert len(findings) < 10
 
 
 def test_segments_that_changed_places_are_found(store: hl.Store) -> None:

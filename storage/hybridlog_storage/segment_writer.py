@@ -72,6 +72,7 @@ AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
 _MAX_CHANNELS = 65535
 _SHARED = -1
+_MOST_SPAN = 3600 * 10**9  # ns
 _SPARSE = 4  # times the usual span, for a chunk that holds little
 _FEW = 4  # messages: a chunk of fewer holds little, too,
 _LITTLE = 8  # with less than so many times the bytes of others: each costs more than a message
@@ -111,6 +112,8 @@ class SegmentSettings:
     def __post_init__(self) -> None:
         if not 1 << 10 <= self.chunk_size <= 1 << 28:
             raise UsageError("the chunk size must lie between 1 KiB and 256 MiB")
+        if not 0 < self.chunk_span_ns <= _MOST_SPAN:
+            raise UsageError("a chunk must last longer than no time, and an hour at most")
         if not 1 <= self.level <= 19:
             raise UsageError("the zstd level must lie between 1 and 19")
         if self.segment_span_s is not None and not self.segment_span_s > 0:

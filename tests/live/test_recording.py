@@ -409,6 +409,22 @@ def test_mongod_killed_while_messages_come(store: hl.Store) -> None:
     assert store.verify().findings == []
 
 
+def test_the_report_is_of_the_whole_recording_when_mongod_dies_before_its_end(
+    store: hl.Store,
+) -> None:
+    own = channel("/talk")
+    recording = store.start("talk")
+    recording.write(own, text(b"indexed"), log_time=1)
+    wait_for(lambda: (recording.stored[0], recording.lag) == (1, 0))
+    kill_mongod(store.directory.path)
+    recording.write(own, text(b"caught up"), log_time=2, publish_time=3)
+    report = recording.close()
+    assert (report.failure, report.missed, report.indexed) == (None, 0, 2)
+    assert store.recordings() == [report.entry]
+    (found,) = report.entry.channels
+    assert (found.stats.payload_bytes, found.stats.last_publish) == (11 + 13, 3)
+
+
 def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     own = channel("/talk")
     recording = store.start("talk", flush_interval_s=0.1)

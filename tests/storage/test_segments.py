@@ -21,7 +21,7 @@ from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
-from hybridlog_storage.errors import DiskFullError, SegmentError
+from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
@@ -507,3 +507,9 @@ def test_a_crash_between_a_schema_and_its_channel(tmp_path: Path) -> None:
     if recovered.path is not None:
         with SegmentCheck(recovered.path) as check:
             assert list(check.between_chunks()) == []
+
+
+@pytest.mark.parametrize("span", [0, -1, 1 << 62])
+def test_a_chunk_lasts_longer_than_no_time(span: int) -> None:
+    with pytest.raises(UsageError, match="a chunk must last"):
+        SegmentSettings(chunk_span_ns=span)
