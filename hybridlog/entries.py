@@ -23,6 +23,8 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.indexing import ChunkIndexer
     from hybridlog_storage.directory import StoreDirectory
 
@@ -85,14 +87,17 @@ class StoredSummaries:
     def __iter__(self) -> Iterator[SegmentSummary]:
         """Read one after the other."""
         for number, path in self._segments:
-            with SegmentReader(path, number) as reader:
-                yield reader.summary()
+            yield _summary(number, path)
 
 
 def read_summaries(directory: StoreDirectory, recording_id: str) -> dict[int, SegmentSummary]:
     """The summaries of a recording's sealed segments, by segment number."""
-    numbers = (number for number, _ in directory.segments(recording_id))
-    return dict(zip(numbers, StoredSummaries(directory, recording_id), strict=True))
+    return {number: _summary(number, path) for number, path in directory.segments(recording_id)}
+
+
+def _summary(number: int, path: Path) -> SegmentSummary:
+    with SegmentReader(path, number) as reader:
+        return reader.summary()
 
 
 def build_entry(

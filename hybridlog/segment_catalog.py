@@ -8,7 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import build_entry, entry_of, read_summaries
+from hybridlog.entries import (
+    StoredSummaries,
+    build_entry,
+    channels_of,
+    entry_of,
+    read_summaries,
+)
 from hybridlog.indexing import ChunkIndexer
 from hybridlog_storage.catalog import ChannelStats, ChannelTotals, ChunkEntry, RecordingEntry
 
@@ -78,7 +84,4 @@ class SegmentCatalog:
 
 def channels_of_recording(directory: StoreDirectory, recording_id: str) -> dict[int, Channel]:
     """The channels of a recording, from its segments."""
-    channels: dict[int, Channel] = {}
-    for summary in read_summaries(directory, recording_id).values():
-        channels.update(summary.channels)
-    return channels
+    return channels_of(StoredSummaries(directory, recording_id))

@@ -65,13 +65,12 @@ def _store(context: typer.Context) -> StoreDirectory:
 
 
 def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
-    from hybridlog.entries import read_summaries
+    from hybridlog.entries import StoredSummaries, channels_of
 
     return {
         channel.topic
         for recording in recordings
-        for summary in read_summaries(directory, recording).values()
-        for channel in summary.channels.values()
+        for channel in channels_of(StoredSummaries(directory, recording)).values()
     }
 
 

@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -65,6 +65,8 @@ from hybridlog_storage.segment_format import (
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    _Count = TypeVar("_Count", int, NDArray[np.int64])
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
@@ -762,10 +764,11 @@ class RecordingWriter:
             if start < total or len(builder) >= self.settings.chunk_size:
                 self._close_chunk(key)
 
-    def _span_of(self, held: int, messages: int) -> int:
+    def _span_of(self, held: _Count, messages: _Count) -> _Count:
         """Most log time, ns, of a chunk of its own with so many bytes and messages."""
-        little = self.settings.span_size * (_LITTLE if messages < _FEW else 1)
-        return self.settings.chunk_span_ns * (_SPARSE if held < little else 1)
+        # Of one number as of many: what is true counts as 1.
+        little = self.settings.span_size * (1 + (_LITTLE - 1) * (messages < _FEW))
+        return self.settings.chunk_span_ns * (1 + (_SPARSE - 1) * (held < little))
 
     def _span_end(self, builder: ChunkBuilder, batch: Batch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
@@ -777,8 +780,7 @@ class RecordingWriter:
         sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
         held = np.cumsum(sizes) - sizes + len(builder)
         messages = np.arange(len(sizes)) + builder.messages
-        little = self.settings.span_size * np.where(messages < _FEW, _LITTLE, 1)
-        far = away >= self.settings.chunk_span_ns * np.where(held < little, _SPARSE, 1)
+        far = away >= self._span_of(held, messages)
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:
