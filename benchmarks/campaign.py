@@ -8,10 +8,11 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -43,14 +44,14 @@ PARTS = {
         "benchmarks.studies.throughput", ("sizes", "rates", "messages", "topics", "repetitions")
     ),
     "ceilings": _Part("benchmarks.studies.ceiling", ("sizes", "topics", "seconds", "repetitions")),
-    "persistence": _Part("benchmarks.studies.persistence", ("logs", "repetitions")),
-    "speed-up": _Part("benchmarks.studies.speed_up", ("logs", "repetitions")),
+    "persistence": _Part("benchmarks.studies.persistence", ("logs", "made", "repetitions")),
+    "speed-up": _Part("benchmarks.studies.speed_up", ("logs", "made", "repetitions")),
     "queries": _Part("benchmarks.studies.queries", ("repetitions",)),
     "reading": _Part("benchmarks.studies.reading", ("repetitions",)),
 }
 """By the names of the command line, in the order in which they run."""
 
-_MAY_GROW = frozenset({"sizes", "rates", "backends", "repetitions", "logs"})
+_MAY_GROW = frozenset({"sizes", "rates", "backends", "repetitions", "logs", "made"})
 """Settings that say which runs there are, and nothing about what one run is."""
 
 
@@ -68,7 +69,8 @@ class Choices:
         messages: On each topic.
         topics: Number of topics.
         seconds: Of a trial that looks for a ceiling.
-        logs: Files to publish besides the usual ones.
+        logs: Files to publish instead of the real logs beside the checkout.
+        made: Whether to publish the logs that are made, too.
         speed: Times as fast as the logs were recorded.
         repetitions: Of every run.
         seed: Of all loads.
@@ -88,6 +90,7 @@ class Choices:
     topics: int | None = None
     seconds: float | None = None
     logs: Sequence[Path] = ()
+    made: bool = True
     speed: float = 1.0
     repetitions: int | None = None
     seed: int = 1
@@ -135,9 +138,12 @@ def run(choices: Choices, command: Sequence[str]) -> int:
             _run_parts(planned, choices, _context(journal, work, backends, choices), header)
         except Stopped as stopped:
             again = [word for word in command if word != "--restart"]
+            program = takewhile(lambda word: word not in {*PARTS, "all"}, command)
+            drawing = [*program, "report", "--out", str(choices.out)]
             stopped.consequence = (
-                f"{counted(_good(journal), 'run')} so far, kept in {journal.path}. "
-                f"To go on: {_as_typed(again)}"
+                f"{counted(_good(journal), 'run')} so far, kept in {journal.path}.\n"
+                f"To go on: {_as_typed(again)}\n"
+                f"To draw what is there: {_as_typed(drawing)}"
             )
             raise
         return _finish(journal, choices.out, write=choices.report, as_json=choices.as_json)
@@ -152,6 +158,7 @@ def draw(out: Path, *, as_json: bool) -> int:
     Raises:
         UsageError: There is no journal.
     """
+    _see_that_it_is_no_file(out)
     if not (out / NAME).is_file():
         raise UsageError(f"{out} holds no results ({NAME}); --out DIR says where they are.")
     return _finish(_read(out), out, write=True, as_json=as_json)
@@ -219,6 +226,7 @@ def _plan(name: str, choices: Choices) -> _Planned:
         "topics": choices.topics,
         "seconds": choices.seconds,
         "logs": _existing(choices.logs),
+        "made": None if choices.made else (),
         "repetitions": choices.repetitions,
     }
     changed = {option: asked[option] for option in part.options if asked[option] is not None}
@@ -254,11 +262,16 @@ def _existing(logs: Sequence[Path]) -> tuple[Path, ...] | None:
     return tuple(log.resolve() for log in logs) or None
 
 
+def _see_that_it_is_no_file(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; --out names a directory.")
+
+
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Nobody else writes into a directory of results while the block runs."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out names a directory.")
+    _see_that_it_is_no_file(out)
+    is_new = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(out, os.O_RDONLY | os.O_CLOEXEC)
@@ -274,6 +287,9 @@ def _locked(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+        if is_new:
+            with suppress(OSError):  # something was written
+                out.rmdir()
 
 
 def _opened(choices: Choices) -> Journal:
@@ -290,10 +306,10 @@ def _opened(choices: Choices) -> Journal:
 def _read(out: Path) -> Journal:
     try:
         return Journal(out)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except ValueError as error:
         raise UsageError(
-            f"{out / NAME} is no journal of these studies ({error}). --restart sets it aside, "
-            "--out names another directory."
+            f"{out / NAME} is no journal of these studies ({error}). Without that line it may be "
+            "one; --restart sets it aside, --out names another directory."
         ) from None
     except OSError as error:
         raise UsageError(f"{out / NAME} cannot be read: {error.strerror}.") from None

@@ -52,6 +52,9 @@ class Part(StrEnum):
     READING = "reading"
 
 
+_PARTS = f"[{'|'.join(Part)}]"
+
+
 QuickOption = Annotated[
     bool,
     typer.Option(
@@ -138,6 +141,10 @@ LogsOption = Annotated[
         readable=False,
     ),
 ]
+MadeOption = Annotated[
+    bool,
+    typer.Option("--made/--no-made", help="Publish the logs that are made like the paper's, too."),
+]
 CeilingsOption = Annotated[
     bool, typer.Option("--ceilings/--no-ceilings", help="Look for each backend's ceiling, too.")
 ]
@@ -216,6 +223,7 @@ def persistence(
     list_backends: ListOption = False,
     out: OutOption = Path("benchmark-results"),
     logs: LogsOption = None,
+    made: MadeOption = True,
     speed: SpeedOption = 1.0,
     speed_up: SpeedUpOption = True,
     repetitions: RepetitionsOption = None,
@@ -240,6 +248,7 @@ def persistence(
             quick=quick,
             backends=backends,
             logs=logs or (),
+            made=made,
             speed=speed,
             repetitions=repetitions,
             seed=seed,
@@ -298,7 +307,8 @@ def everything(
     list_backends: ListOption = False,
     out: OutOption = Path("benchmark-results"),
     only: Annotated[
-        list[Part] | None, typer.Option("--only", help="Only this part. Repeatable.")
+        list[Part] | None,
+        typer.Option("--only", help="Only this part. Repeatable.", metavar=_PARTS),
     ] = None,
     ceilings: CeilingsOption = True,
     speed_up: SpeedUpOption = True,
@@ -309,6 +319,7 @@ def everything(
     topics: TopicsOption = None,
     seconds: SecondsOption = None,
     logs: LogsOption = None,
+    made: MadeOption = True,
     speed: SpeedOption = 1.0,
     repetitions: RepetitionsOption = None,
     seed: SeedOption = 1,
@@ -340,6 +351,7 @@ def everything(
             topics=topics,
             seconds=seconds,
             logs=logs or (),
+            made=made,
             speed=speed,
             repetitions=repetitions,
             seed=seed,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -57,6 +57,10 @@ class Journal:
 
     Args:
         directory: Made when it is not there.
+
+    Raises:
+        ValueError: What lies there is no journal; the message names the line.
+        OSError: It cannot be read.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -67,12 +71,10 @@ class Journal:
         """By key, the last of each; of several that succeeded, that which the machine
         disturbed least."""
         self._successes: Counter[str] = Counter()
-        for line in self._lines():
-            kind = line.pop("kind")
-            if kind == "run":
-                self.headers.append(line)
-            elif kind == "sample":
-                self._keep(Sample(**line))
+        self._end = 0
+        """Of the last whole line. What is behind it was cut off in the middle, and goes when
+        the next one is written: not before, since another process may be writing it."""
+        self._read()
 
     def begin(self, header: Mapping[str, Any]) -> None:
         """Note that a run starts, with machine, versions, settings and seeds."""
@@ -118,22 +120,28 @@ class Journal:
 
     def _append(self, line: Mapping[str, Any]) -> None:
         data = json.dumps(line, allow_nan=False).encode() + b"\n"
-        descriptor = os.open(
-            self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644
-        )
-        try:
-            os.write(descriptor, data)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        with self.path.open("ab") as file:
+            file.truncate(self._end)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        self._end += len(data)
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def _read(self) -> None:
         if not self.path.is_file():
             return
         whole = self.path.read_bytes()
         kept = whole[: whole.rfind(b"\n") + 1]
-        if len(kept) != len(whole):
-            # A line that was cut off in the middle; the next one must start on its own.
-            os.truncate(self.path, len(kept))
-        for line in kept.splitlines():
-            yield json.loads(line)
+        self._end = len(kept)
+        for number, line in enumerate(kept.splitlines(), 1):
+            try:
+                self._take(json.loads(line))
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
+                raise ValueError(f"line {number}: {error}") from None
+
+    def _take(self, line: dict[str, Any]) -> None:
+        kind = line.pop("kind")
+        if kind == "run":
+            self.headers.append(line)
+        elif kind == "sample":
+            self._keep(Sample(**line))

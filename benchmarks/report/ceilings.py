@@ -65,10 +65,11 @@ def section(book: Book) -> Section | None:
     if not ceilings:
         return None
     text = (
-        "The rate is doubled until a message is dropped, then the gap is halved a few times. The "
-        "ceiling is the largest offered load of which everything was found in the backend "
-        "afterwards, known to about the last halving. Each trial is one run, and chance has a say "
-        "in the last ones, so the whole search is made anew for each repetition.",
+        "The rate is doubled until a message is dropped, then the gap is halved a few times, not "
+        "so in a quick run. The ceiling is the largest offered load of which everything was found "
+        "in the backend afterwards, known to about half of the last step. Each trial is one run, "
+        "and chance has a say in the last ones, so the whole search is made anew for each "
+        "repetition.",
         "A trial is short: what a backend can put off (dirty pages, a journal, work after the last "
         "message) helps it. “Stored” divides by the time until everything was on the disk.",
     )
@@ -138,12 +139,16 @@ def _graph(ceilings: Sequence[_Found]) -> Graph:
         points = [(float(one.size), one.offered) for one in sorted(of, key=lambda one: one.size)]
         lines.append(Line(name, tuple(points)))
     sizes = sorted({one.size for one in ceilings})
+    floor = (
+        " Where the line of “harness alone” is reached, the harness can offer no more."
+        if any(line.backend == "nothing" for line in lines)
+        else ""
+    )
     return Graph(
         "ceilings",
         "Largest load of which everything is kept",
         "Offered load over message size, both axes logarithmic. Median of "
-        f"{_searches(ceilings)}; the bars reach from the least to the greatest. Where the line of "
-        "“harness alone” is reached, the harness can offer no more.",
+        f"{_searches(ceilings)}; the bars reach from the least to the greatest.{floor}",
         "lines",
         (Panel("", tuple(lines)),),
         "message size",

@@ -113,8 +113,9 @@ def systems(headers: Sequence[Mapping[str, Any]]) -> Section | None:
         "Backends", ("name", "in the figures", "kind", "what it is, and its settings"), rows
     )
     text = (
-        "A plain MCAP file and a backend that keeps nothing (“harness alone”) stand beside the "
-        "databases: no index can beat the first, the second is what the harness itself can carry.",
+        "Where they took part, a plain MCAP file and a backend that keeps nothing (“harness "
+        "alone”) stand beside the databases: no index can beat the first, the second is what the "
+        "harness itself can carry.",
         "In all tables a cell is the median, with the least and the greatest repetition behind it; "
         "a spread of less than 1 % is left out. “—” was not measured.",
     )
@@ -205,7 +206,7 @@ def _command(header: Mapping[str, Any]) -> str:
 
 def _text(part: object) -> str:
     if isinstance(part, Mapping):
-        return ", ".join(f"{name} {_text(one)}" for name, one in part.items())
+        return ", ".join(f"{name} {_text(one)}" for name, one in part.items() if one is not None)
     if isinstance(part, list | tuple):
         return ", ".join(map(_text, part))
     if isinstance(part, bool):

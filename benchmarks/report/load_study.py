@@ -21,7 +21,7 @@ from benchmarks.report.book import (
     value,
     with_meaning,
 )
-from benchmarks.report.look import FLOORS, OURS, databases, title
+from benchmarks.report.look import OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number
 from benchmarks.samples import Sample
@@ -69,7 +69,8 @@ def speed_up(book: Book) -> Section | None:
         return None
     text = (
         "The same logs, played faster until a message is dropped: the speed is doubled, then the "
-        "gap is halved. Each trial is one run; the whole search is made anew for each repetition.",
+        "gap is halved, not so in a quick run. Each trial is one run; the whole search is made "
+        "anew for each repetition.",
     )
     logs = _logs(samples)
     rows: list[tuple[Cell, ...]] = []
@@ -139,11 +140,7 @@ def findings(book: Book) -> list[str]:
     if any(DISTURBED in text for text in found):
         found.append(MEANING)
     for (log,), group in _logs(_trials(book)).items():
-        bounds = [
-            f"{title(name)} {_bound(of)}"
-            for name, of in by_backend(group).items()
-            if name not in FLOORS
-        ]
+        bounds = [f"{title(name)} {_bound(of)}" for name, of in by_backend(group).items()]
         if bounds:
             found.append(f"Played faster, {log} was kept whole at: {listed(bounds)}.")
     return found

@@ -12,7 +12,7 @@ from benchmarks.loads.base import Load
 from benchmarks.loads.cut import cut
 from benchmarks.loads.logs import from_log, log_name
 from hybridlog.sources.detect import open_source
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
     from benchmarks.studies.runs import Context
@@ -76,6 +76,7 @@ def replays(
 
     Raises:
         SourceError: There is no log at a path.
+        UsageError: None is left.
         ValueError: A name in `made` is not known, or `seconds` is not above 0.
     """
     if not seconds > 0:
@@ -87,6 +88,8 @@ def replays(
         replay = _real(log, seconds, names)
         names.add(replay.name)
         found.append(replay)
+    if not found:
+        raise UsageError("No log is left to be published; name one with --logs.")
     return found
 
 
@@ -98,7 +101,8 @@ class LogSettings:
         seconds: Most of each log that is published, in its own time.
         made: Names of the logs that are made.
         logs: Real logs, files and directories.
-        chosen: With some of the real logs that lie beside the checkout, if there are any.
+        chosen: Where `logs` is empty, some of those that lie beside the checkout, if there
+            are any.
         backends: Names of those that take part; None for all.
     """
 
@@ -115,7 +119,7 @@ class LogSettings:
             SourceError: There is no log at a path.
             ValueError: A name in `made` is not known, or `seconds` is not above 0.
         """
-        logs = [*(chosen_logs() if self.chosen else ()), *self.logs]
+        logs = self.logs or (chosen_logs() if self.chosen else ())
         return replays(seed, self.seconds, logs, self.made)
 
 

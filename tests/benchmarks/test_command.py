@@ -26,6 +26,7 @@ from benchmarks.progress import Steps, short
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies.runs import Context
 from hybridlog.cli.stopping import Stopped
+from hybridlog_storage.errors import SourceError
 from tests.imports import ROOT
 
 VALUES = {
@@ -171,6 +172,10 @@ def test_the_same_command_goes_on(
     assert "interrupted" in said
     assert "2 runs so far" in said
     (again,) = re.findall(r"To go on: python -m benchmarks (.+)$", said, re.MULTILINE)
+    (draw,) = re.findall(r"To draw what is there: python -m benchmarks (.+)$", said, re.MULTILINE)
+    assert main(draw.split()) == 0
+    assert (tmp_path / "report.md").is_file()
+    capsys.readouterr()
     study.during = lambda sample: None
     assert main(again.split()) == 0
     assert "2 runs are there and not done again" in capsys.readouterr().err
@@ -307,12 +312,44 @@ def test_directories_that_will_not_do(
     assert "is a file" in capsys.readouterr().err
     (tmp_path / "samples.jsonl").write_text('{"kind": "sample", "nonsense": 1}\n')
     assert throughput(tmp_path) == 2
-    assert "no journal of these studies" in capsys.readouterr().err
+    assert "no journal of these studies (line 1: " in capsys.readouterr().err
+    assert main(["report", "--out", str(file)]) == 2
+    assert "is a file" in capsys.readouterr().err
     assert main(["report", "--out", str(tmp_path / "nowhere")]) == 2
     assert "holds no results" in capsys.readouterr().err
     assert not (tmp_path / "nowhere").exists()
     assert main(["persistence", "--out", str(tmp_path / "o"), "-l", str(tmp_path / "no.bag")]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+def test_a_line_that_is_being_written_is_left_to_its_writer(tmp_path: Path) -> None:
+    writing, path = journal_of(tmp_path), tmp_path / "samples.jsonl"
+    writing.begin({"seed": 1})
+    with path.open("ab") as file:
+        file.write(b'{"kind": "run", "seed"')
+    half = path.read_bytes()
+    going_on = journal_of(tmp_path)
+    assert going_on.headers == [{"seed": 1}]
+    assert path.read_bytes() == half
+    # Only who writes next takes away what nobody has ended.
+    going_on.begin({"seed": 2})
+    going_on.begin({"seed": 3})
+    assert [header["seed"] for header in journal_of(tmp_path).headers] == [1, 2, 3]
+    assert path.read_bytes().count(b"\n") == 3
+
+
+def test_nothing_is_left_where_nothing_was_run(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(*_: object) -> float:
+        raise SourceError("a.bag cannot be read")
+
+    monkeypatch.setattr(study, "expected_seconds", unreadable)
+    assert throughput(tmp_path / "new") == 3
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "old").mkdir()
+    assert throughput(tmp_path / "old") == 3
+    assert (tmp_path / "old").is_dir()
 
 
 def test_two_runs_do_not_write_into_one_directory(
@@ -429,7 +466,7 @@ def test_every_option_is_handed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     log = tmp_path / "a.bag"
     given = (
         f"--quick -b mcap -o {tmp_path} --sizes 5kB --rates 4 --messages 3 --topics 2 "
-        f"--seconds 0.5 -l {log} --speed 2 -n 4 --seed 9 --work {tmp_path} --restart "
+        f"--seconds 0.5 -l {log} --no-made --speed 2 -n 4 --seed 9 --work {tmp_path} --restart "
         "--no-report --json"
     )
     assert main(["all", *given.split()]) == 0
@@ -445,6 +482,7 @@ def test_every_option_is_handed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         topics=2,
         seconds=0.5,
         logs=[log],
+        made=False,
         speed=2.0,
         repetitions=4,
         seed=9,

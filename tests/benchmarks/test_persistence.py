@@ -24,7 +24,7 @@ from benchmarks.samples import Journal, Sample
 from benchmarks.studies import persistence, replays, search, speed_up
 from benchmarks.studies.replays import MADE, Replay, logs_at
 from benchmarks.studies.runs import Context
-from hybridlog_storage.errors import SourceError
+from hybridlog_storage.errors import SourceError, UsageError
 from tests.data import DATA, needs_data
 
 
@@ -143,6 +143,8 @@ def test_unknown_names(tmp_path: Path) -> None:
         persistence.plan(context, replace(FEW, backends=["oracle"]))
     with pytest.raises(ValueError, match="more than 0"):
         persistence.plan(context, replace(FEW, seconds=0))
+    with pytest.raises(UsageError, match="--logs"):
+        persistence.plan(context, replace(FEW, made=()))
     with pytest.raises(SourceError, match="no such file"):
         persistence.plan(context, replace(FEW, logs=[tmp_path / "absent.bag"]))
     with pytest.raises(ValueError, match="ascending"):
@@ -212,9 +214,11 @@ def test_chosen_logs_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     assert [path.name for path in replays.chosen_logs()] == list(replays.CHOSEN)
     named = [one.name for one in persistence.Settings(made=()).replays(1)]
     assert named == [Path(name).stem for name in replays.CHOSEN]
-    # Asked for as well, in another spelling, it is still published once.
+    # One's own log stands in their place; in two spellings, it is still published once.
+    log = DATA / "real" / replays.CHOSEN[0]
     again = DATA / "real" / ".." / "real" / replays.CHOSEN[0]
-    assert len(persistence.Settings(made=(), logs=[again]).replays(1)) == len(named)
+    own = persistence.Settings(made=(), logs=[log, again]).replays(1)
+    assert [one.name for one in own] == named[:1]
     assert persistence.Settings.usual(quick=True).replays(1)[4:] == []
     monkeypatch.setattr(replays, "REAL_LOGS", tmp_path)
     assert replays.chosen_logs() == []
