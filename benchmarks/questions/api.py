@@ -82,7 +82,7 @@ class ApiAsker(_Stored, Asker):
 
 
 class IndexedApiAsker(ApiAsker):
-    """With the paper's indexes on fields, as `hybridlog index` makes them."""
+    """With the paper's indexes, and one on the time, as `hybridlog index` makes them."""
 
     def start(self, backend: Backend) -> None:
         super().start(backend)
@@ -90,10 +90,11 @@ class IndexedApiAsker(ApiAsker):
 
 
 def add_indexes(store: Store) -> None:
-    """Make the paper's indexes, unless they are there."""
+    """Make those that `mongo_json_indexed` has on the topics that are asked about."""
     store.add_index(GRIPPER, "position")
     store.add_index(VIEWPOINT, "position.x", "_meta.inserted_at")
     store.add_index(ARM, *(f"pose.position.{axis}" for axis in "xyz"))
+    store.add_index("re:.*", "_meta.inserted_at")
 
 
 def index_bytes(store: Store) -> int:

@@ -169,7 +169,7 @@ class HybridlogAppendixAsker(MongoAsker):
 
 
 class HybridlogIndexedAsker(HybridlogAppendixAsker):
-    """Once more with the indexes of the paper, as `hybridlog index` makes them."""
+    """With the paper's indexes, and one on the time, as `hybridlog index` makes them."""
 
     def start(self, backend: Backend) -> None:
         super().start(backend)

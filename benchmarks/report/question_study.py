@@ -41,7 +41,8 @@ def section(book: Book) -> Section | None:
         "often was the gripper moved within a region. Q4: how many grasps with the camera in "
         "front, within a time window of half a second to either side, as in the paper's code.",
         "hybridlog has four rows: the paper's own MongoDB queries, unchanged, through pymongo, and "
-        "the same questions through its own API; each without and with the paper's indexes.",
+        "the same questions through its own API; each without and with the indexes that the "
+        "indexed row of MongoDB has: the paper's, and one on the time of every topic.",
         "Its API keeps fields that were asked about in memory, so that its medians are those of "
         "somebody who explores; the table of first times is of somebody who asks once. Each of "
         "its rows begins with nothing kept: what it finds are documents, segments, and the "

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,16 +19,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymongo.database import Database
 
 from benchmarks.backends.base import Backend, BackendMissingError
+from benchmarks.backends.hybridlog_store import Hybridlog
+from benchmarks.backends.mongo_json import MongoJsonIndexed
 from benchmarks.backends.registry import BACKENDS
+from benchmarks.loads.hcr_like import hcr_like
 from benchmarks.loads.truth import Truth
 from benchmarks.progress import Steps
 from benchmarks.questions import askers, sides, sql, tasks
 from benchmarks.questions.base import (
+    ARM,
     GRIPPER,
     MINUTE_NS,
     QUESTIONS,
+    ROSOUT,
     VIEWPOINT,
     Answer,
     Asker,
@@ -37,7 +44,7 @@ from benchmarks.questions.base import (
     windows_before,
 )
 from benchmarks.questions.files import _FileAsker
-from benchmarks.questions.mongo import MongoAsker
+from benchmarks.questions.mongo import HybridlogIndexedAsker, MongoAsker
 from benchmarks.questions.sqlite import SqliteUdfAsker, _time_diff, get_val
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import queries, reading
@@ -117,6 +124,30 @@ def test_all_answers_are_true(name: str, work: Path, tmp_path: Path) -> None:
         assert all(size > 1000 for size in sized)
     assert queries.expected_seconds(asked, SMALL) == 0
     assert list((work / "runs").iterdir()) == []
+
+
+def test_mongodb_and_hybridlog_are_asked_with_the_same_indexes(tmp_path: Path) -> None:
+    load = hcr_like(tmp_path / "load", sessions=1, minutes=1.0, seed=1)
+
+    def keys(database: Database[Any]) -> dict[str, set[tuple[str, ...]]]:
+        return {
+            topic: {tuple(index["key"]) for index in database[collection_of(topic)].list_indexes()}
+            for topic in (GRIPPER, VIEWPOINT, ARM, ROSOUT)
+        }
+
+    found = []
+    for kind, asker in ((MongoJsonIndexed, MongoAsker), (Hybridlog, HybridlogIndexedAsker)):
+        able(kind.name)
+        place = tmp_path / kind.name
+        place.mkdir()
+        with closing(kind(place)) as system:
+            system.open(load.channels)
+            sides.fill(system, load)
+            with closing(asker(system, load.channels)) as asked:
+                found.append(keys(asked._database))
+    assert found[0] == found[1]
+    assert ("_meta.inserted_at",) in found[0][ROSOUT]
+    assert ("position.x", "_meta.inserted_at") in found[0][VIEWPOINT]
 
 
 @pytest.mark.parametrize("name", ["mcap", "bagfile", "sqlite_json1", "hybridlog"])
