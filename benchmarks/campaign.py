@@ -131,9 +131,9 @@ def run(choices: Choices, command: Sequence[str]) -> int:
     with ExitStack() as stack:
         stack.enter_context(_locked(choices.out))
         journal = _opened(choices)
-        header = _header(choices, planned, backends, command)
-        _see_that_it_fits(journal, header, choices.out)
         work = _work(choices.work, stack)
+        header = _header(choices, planned, backends, command, work)
+        _see_that_it_fits(journal, header, choices.out)
         try:
             _run_parts(planned, choices, _context(journal, work, backends, choices), header)
         except Stopped as stopped:
@@ -320,6 +320,7 @@ def _header(
     planned: Sequence[_Planned],
     backends: Mapping[str, type[Backend]],
     command: Sequence[str],
+    work: Path,
 ) -> dict[str, Any]:
     from benchmarks.machine import describe
 
@@ -338,7 +339,7 @@ def _header(
             name: {"kind": kind.kind, "about": kind.about} for name, kind in backends.items()
         },
         "command": list(command),
-        **describe(),
+        **describe(work),
     }
 
 

@@ -140,10 +140,14 @@ class Hybridlog(Backend):
 
 
 class HybridlogRecorder(Hybridlog):
-    """The same without a thread and a queue of ten a topic: its own memory budget is the queue."""
+    """The same without a thread and a queue of ten a topic: one thread takes in everything.
+
+    Before it 512 MiB may wait, and it waits itself when the memory budget is spent, where
+    a recorder would give up payloads.
+    """
 
     name = "hybridlog_recorder"
-    about = "hybridlog with one thread that takes in everything, as its recorder does"
+    about = "hybridlog with one thread that takes in everything instead of the queues"
     intake = "single"
 
 

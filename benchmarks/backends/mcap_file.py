@@ -1,4 +1,4 @@
-"""A plain MCAP file: the floor that no index can beat."""
+"""A plain MCAP file: what is written where no index is made."""
 
 from __future__ import annotations
 

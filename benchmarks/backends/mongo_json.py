@@ -161,7 +161,10 @@ class MongoJsonIndexed(MongoJson):
     """
 
     name = "mongo_json_indexed"
-    about = "MongoDB as mongo_json, with the indexes of the paper's appendix A"
+    about = (
+        "MongoDB as mongo_json, with the indexes of the paper's appendix A and one on the time "
+        "of every topic"
+    )
 
     _is_indexed = True
 

@@ -1,8 +1,8 @@
 """What the backends that write recording files have in common.
 
 A file of a recording cannot be added to once it has come to its end. A backend that is
-opened on a directory with files from before therefore begins a new one, with the next
-number, when the first message comes.
+opened on a directory with files from before, perhaps only to read them, therefore begins
+a new one, with the next number, when the first message comes; otherwise at once.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 import threading
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -60,38 +60,36 @@ class FileBackend(Backend):
         self.check()
         self._check_channels(channels)
         self._channels = channels
+        if not self.paths:
+            with self._lock, self._failures():
+                self._begin()
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        with self._lock:
-            try:
-                if self._recorder is None:
-                    number = len(self.paths) + 1
-                    self._started = self.directory / f"recording-{number:04d}{self.suffix}"
-                    self._recorder = self._record(self._started)
-                self._recorder.write(channel, log_time, payload)
-            except Exception as error:
-                raise self._failed(error) from error
+        with self._lock, self._failures():
+            recorder = self._recorder or self._begin()
+            recorder.write(channel, log_time, payload)
+
+    def _begin(self) -> Recorder:
+        self._started = self.directory / f"recording-{len(self.paths) + 1:04d}{self.suffix}"
+        self._recorder = self._record(self._started)
+        return self._recorder
 
     def finish(self) -> None:
         with self._lock:
             recorder, self._recorder = self._recorder, None
             if recorder is None or self._started is None:
                 return
-            try:
+            with self._failures():
                 recorder.close()
                 _sync(self._started)
                 _sync(self.directory)
-            except Exception as error:
-                raise self._failed(error) from error
 
     def counts(self) -> Mapping[str, int]:
         found = dict.fromkeys((channel.topic for channel in self._channels), 0)
-        for path in self.paths:
-            try:
+        with self._failures():
+            for path in self.paths:
                 for topic, count in self._count(path).items():
                     found[topic] = found.get(topic, 0) + count
-            except Exception as error:
-                raise self._failed(error) from error
         return found
 
     def close(self) -> None:
@@ -116,9 +114,15 @@ class FileBackend(Backend):
     def _count(self, path: Path) -> Mapping[str, int]:
         """Read all messages of a file and count them by topic."""
 
-    def _failed(self, error: Exception) -> BackendFailedError:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return BackendFailedError(f"{self.name}: {type(error).__name__}: {reason}")
+    @contextmanager
+    def _failures(self) -> Iterator[None]:
+        """Whatever a package raises is a failure of the backend."""
+        try:
+            yield
+        except Exception as error:
+            of_system = isinstance(error, OSError) and error.strerror
+            reason = of_system or str(error)
+            raise BackendFailedError(f"{self.name}: {type(error).__name__}: {reason}") from error
 
 
 def _sync(path: Path) -> None:

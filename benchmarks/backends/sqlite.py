@@ -161,8 +161,8 @@ class SqliteJson1(SqliteUdf):
 
     name = "sqlite_json1"
     about = (
-        "SQLite: JSON text, one table a topic, transactions of 2 s, WAL, synchronous NORMAL, "
-        "indexes on json_extract of the fields of the paper's appendix A"
+        "SQLite: JSON text, one table a topic, transactions of 2 s or 16 MiB, WAL, synchronous "
+        "NORMAL, indexes on json_extract of the fields of the paper's appendix A"
     )
 
     _is_indexed = True

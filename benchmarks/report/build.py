@@ -12,7 +12,7 @@ from benchmarks.report import (
     reading_study,
     stream_study,
 )
-from benchmarks.report.book import Book
+from benchmarks.report.book import DISTURBED, MEANING, Book
 from benchmarks.report.model import Report, Section, Table
 from benchmarks.samples import Journal
 
@@ -44,6 +44,8 @@ def report(journal: Journal) -> Report:
         *reading_study.findings(book),
         *conditions.findings(book),
     ]
+    if any(DISTURBED in text for text in findings):
+        findings.append(MEANING)
     sections = [
         _paper(book),
         conditions.systems(journal.headers),

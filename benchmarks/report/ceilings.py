@@ -70,8 +70,10 @@ def section(book: Book) -> Section | None:
         "in the backend afterwards, known to about half of the last step. Each trial is one run, "
         "and chance has a say in the last ones, so the whole search is made anew for each "
         "repetition.",
-        "A trial is short: what a backend can put off (dirty pages, a journal, work after the last "
-        "message) helps it. “Stored” divides by the time until everything was on the disk.",
+        "A trial is short, longer only where the rate is so low that it would have few messages: "
+        "what a backend can put off (messages in memory, dirty pages, a journal, work after the "
+        "last message) helps it, hybridlog most of all. “Stored” divides by the time until "
+        "everything was on the disk.",
     )
     return Section(
         "ceilings",
@@ -140,7 +142,8 @@ def _graph(ceilings: Sequence[_Found]) -> Graph:
         lines.append(Line(name, tuple(points)))
     sizes = sorted({one.size for one in ceilings})
     floor = (
-        " Where the line of “harness alone” is reached, the harness can offer no more."
+        " Where the line of “harness alone” is reached, the harness can offer no more through its "
+        "queues."
         if any(line.backend == "nothing" for line in lines)
         else ""
     )

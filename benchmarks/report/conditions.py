@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.report import coverage
 from benchmarks.report.book import Book, by_backend, grouped
 from benchmarks.report.look import ordered, title
 from benchmarks.report.model import Cell, Section, Table
@@ -21,6 +22,8 @@ _MACHINE = (
     ("system", "system"),
     ("python", "Python"),
     ("mongod", "MongoDB"),
+    ("postgres", "PostgreSQL"),
+    ("sqlite", "SQLite"),
     ("packages", "packages"),
     ("revision", "revision"),
     ("seed", "seed"),
@@ -28,7 +31,10 @@ _MACHINE = (
     ("started", "started"),
     ("load_1min", "load at the start"),
 )
-_DIFFERENT = ("cpu", "cores", "memory_gib", "system", "python", "mongod", "packages", "revision")
+_DIFFERENT = (
+    *("cpu", "cores", "memory_gib", "disk", "system"),
+    *("python", "mongod", "postgres", "sqlite", "packages", "revision"),
+)
 """What makes figures of two runs no longer one measurement."""
 
 
@@ -73,6 +79,9 @@ def not_run(book: Book) -> Section:
                 "Their figures are not in any table above.",
             )
         )
+    lacking = coverage.table(book)
+    if lacking is not None:
+        tables.append(lacking)
     tables.append(Table("What this benchmark leaves out", ("", "why"), NOT_RUN))
     return Section(
         "not-run",
@@ -113,9 +122,9 @@ def systems(headers: Sequence[Mapping[str, Any]]) -> Section | None:
         "Backends", ("name", "in the figures", "kind", "what it is, and its settings"), rows
     )
     text = (
-        "Where they took part, a plain MCAP file and a backend that keeps nothing (“harness "
-        "alone”) stand beside the databases: no index can beat the first, the second is what the "
-        "harness itself can carry.",
+        "Where they took part, a plain MCAP file, written as the mcap package does it unless told "
+        "otherwise, and a backend that keeps nothing (“harness alone”) stand beside the databases: "
+        "the first has no index to make, the second is what the harness itself can carry.",
         "In all tables a cell is the median, with the least and the greatest repetition behind it; "
         "a spread of less than 1 % is left out. “—” was not measured.",
     )

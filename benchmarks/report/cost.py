@@ -113,8 +113,9 @@ def timing(book: Book) -> Section | None:
     )
     text = (
         "A queue holds ten messages; the depth is what a message finds ahead of it in its "
-        "topic's queue. A publisher that is late while a backend is busy is short of processor "
-        "time: logger and publisher share the machine, as they do on a robot.",
+        "topic's queue, with hybridlog (recorder) ahead of it of all topics. A publisher that is "
+        "late while a backend is busy is short of processor time: logger and publisher share the "
+        "machine, as they do on a robot.",
     )
     return Section("timing", "On time: queues and publisher", text, (), tables)
 

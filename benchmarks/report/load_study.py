@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.report.book import (
-    DISTURBED,
-    MEANING,
     Book,
     by_backend,
     by_case,
@@ -136,9 +134,7 @@ def findings(book: Book) -> list[str]:
             else f"Of {log} were kept: {shares}."
         )
     if kept_by_all:
-        found.append(f"Of {listed(kept_by_all)}, every backend kept everything.")
-    if any(DISTURBED in text for text in found):
-        found.append(MEANING)
+        found.append(f"Of {listed(kept_by_all)}, every backend that took part kept everything.")
     for (log,), group in _logs(_trials(book)).items():
         bounds = [f"{title(name)} {_bound(of)}" for name, of in by_backend(group).items()]
         if bounds:

@@ -40,13 +40,17 @@ def section(book: Book) -> Section | None:
         "was the right gripper closed. Q2: every viewpoint that was behind the robot. Q3: how "
         "often was the gripper moved within a region. Q4: how many grasps with the camera in "
         "front, within a time window of half a second to either side, as in the paper's code.",
-        "hybridlog has four rows: the paper's own MongoDB queries, unchanged, through pymongo, and "
-        "the same questions through its own API; each without and with the indexes that the "
-        "indexed row of MongoDB has: the paper's, and one on the time of every topic.",
+        "hybridlog has four rows: through pymongo, word for word what MongoDB is asked, and the "
+        "same questions through its own API; each without and with the indexes that the indexed "
+        "row of MongoDB has: the paper's, and one on the time of every topic. MongoDB is asked "
+        "with the filters of the paper's appendix; Q4 counts the rows that were found, and what "
+        "the paper only names is asked in our words.",
         "Its API keeps fields that were asked about in memory, so that its medians are those of "
-        "somebody who explores; the table of first times is of somebody who asks once. Each of "
-        "its rows begins with nothing kept: what it finds are documents, segments, and the "
-        "columns that were laid down beside those when the load was recorded.",
+        "somebody who explores. Each of its rows begins with nothing kept: what it finds are "
+        "documents, segments, and the columns that were laid down beside those when the load was "
+        "recorded. The first times are of somebody who then asks one question after the other, "
+        "in the order of the table: what one of them has brought into memory, a server's or "
+        "hybridlog's, the next ones find there. Q1, Q2 and Q3 are about a topic each.",
         "Each backend was closed, its server too, and opened again before it was asked for the "
         "first time. Rows of one backend share its files, which the first of them brings into "
         "the machine's memory. What took more than ten seconds was asked twice, both "

@@ -35,7 +35,7 @@ def section(book: Book) -> Section | None:
     ]
     tables = (
         _table(samples, "Milliseconds", tasks, MS),
-        _table(samples, "The first time, milliseconds", tasks, FIRST_MS),
+        _table(samples, "The first of each repetition, milliseconds", tasks, FIRST_MS),
     )
     graph = Graph(
         "reading",
@@ -51,7 +51,8 @@ def section(book: Book) -> Section | None:
     text = (
         "What comes after a question, decoded: a second of a laser's scans at a random time; the "
         "scan that was current at a random moment; a topic as a pandas frame. What must come out "
-        "is decoded from the load itself, and everything is compared with it.",
+        "is decoded from the load itself, and everything is compared with it. A backend is opened "
+        "once for all of it.",
     )
     return Section("reading", "Reading back", text, (graph,), tables)
 

@@ -21,7 +21,7 @@ from benchmarks.report.book import (
 )
 from benchmarks.report.look import OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table
-from benchmarks.report.numbers import listed, number, percent, size, times
+from benchmarks.report.numbers import listed, number, size, times
 from benchmarks.samples import Sample
 
 STUDY = "throughput"
@@ -42,6 +42,10 @@ def section(book: Book) -> Section | None:
         "noise, half is smooth. Throughput is the bytes that were found in the backend afterwards "
         "over the time from the first message until everything was safe on the disk. A message "
         "that finds ten ahead of it in its topic's queue is dropped.",
+        "The databases and files work in the threads of the queues. hybridlog takes a message "
+        "into memory there, a sixteenth of the machine's at most, and writes with threads of its "
+        "own; the time until all is safe includes what it then has still to write. hybridlog "
+        "(recorder) has one thread instead of the queues, before which 512 MiB may wait.",
         "While a backend keeps up, its throughput is the offered load: all lines lie on top of "
         "each other. What differs there is the CPU time (below).",
     ]
@@ -67,9 +71,9 @@ def findings(book: Book) -> list[str]:
     load = middle(streams[heaviest], offered)
     if load is not None:
         shares = [
-            f"{title(name)} {percent(share)} %"
+            f"{title(name)} {share} %"
             for name, group in by_backend(streams[heaviest]).items()
-            if (share := middle(group, persisted)) is not None
+            if (share := percents(group)) is not None
         ]
         found.append(
             f"Of the heaviest stream ({at}, {number(load)} MB/s) these shares were kept: "

@@ -127,10 +127,13 @@ def _ceiling(
     limit: Literal["backend", "harness", "plan"] = "backend"
     if lost_rate is None:
         limit = "plan"
-    elif verdicts[lost_rate] == "late" or any(
-        verdict(trial) != "kept" and float(trial.case[_RATE]) <= lost_rate for trial in harness
+    elif verdicts[lost_rate] == "late" or (
+        _has_queues(backend)
+        and any(
+            verdict(trial) != "kept" and float(trial.case[_RATE]) <= lost_rate for trial in harness
+        )
     ):
-        # The harness with a backend that keeps nothing does no better.
+        # The same queues with a backend that keeps nothing do no better.
         limit = "harness"
     if rate is None:
         return Ceiling(backend, size, repetition, None, 0.0, 0.0, lost_rate, limit)
@@ -145,6 +148,12 @@ def _ceiling(
         lost_rate,
         limit,
     )
+
+
+def _has_queues(backend: str) -> bool:
+    from benchmarks.backends.registry import BACKENDS
+
+    return backend not in BACKENDS or BACKENDS[backend].intake == "threads"
 
 
 def expected_seconds(context: Context, settings: Settings | None = None) -> float:

@@ -39,7 +39,7 @@ class Settings:
 
     Attributes:
         seconds: Of the load.
-        repetitions: Of each task; one of which the first takes more than 10 s is done once.
+        repetitions: Of each task; one of which the first takes more than 10 s is done twice.
         backends: Names of those that take part; None for all.
     """
 

@@ -456,6 +456,30 @@ def test_table_names_stay_apart() -> None:
     assert all(len(postgres.table_of(topic).encode()) <= 63 for topic in topics)
 
 
+@pytest.mark.parametrize("name", ["postgres_tuned", "sqlite_json1"])
+def test_two_seconds_are_a_transaction_to_which_messages_go_as_they_come(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = {"postgres_tuned": postgres, "sqlite_json1": sqlite}[name]
+    with opened(name, tmp_path) as backend:
+
+        def count() -> int:
+            return len(documents_of(backend)[CHANNELS[0].topic])
+
+        for message in messages(0, 0, 20):
+            backend.insert(*message)
+        assert count() == 0
+        monkeypatch.setattr(module, "BATCH_BYTES", 0)
+        began = time.monotonic()
+        backend.insert(*messages(0, 20, 21)[0])
+        assert count() == 21
+        assert time.monotonic() - began < 2
+        for message in messages(0, 21, 23):
+            backend.insert(*message)
+        backend.finish()
+        assert count() == 23
+
+
 # Failures.
 
 

@@ -17,7 +17,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.backends.registry import BACKENDS
 from benchmarks.machine import cores
+from benchmarks.questions.askers import ASKERS
 from benchmarks.report import figures, numbers
 from benchmarks.report.book import Book
 from benchmarks.report.build import report
@@ -111,6 +113,27 @@ def table(found: Report, title: str) -> Table:
 
 def all_text(found: Report) -> str:
     return markdown(found, {})
+
+
+def test_what_was_not_measured_is_told(tmp_path: Path) -> None:
+    other = replace(stream("mcap", 1.0), case={"size": 10_000, "rate": 64})
+    failed = replace(stream("bagfile", 1.0), status="failed", reason="full")
+    found = report(
+        journal(
+            tmp_path,
+            *(stream(name, 1.0) for name in BACKENDS if name not in {"nothing", "bagfile"}),
+            other,
+            failed,
+            *(question("Q1", row, 1.0) for rows in ASKERS.values() for row in rows),
+        )
+    )
+    rows = {str(row[0]): str(row[1]) for row in table(found, "What was not measured").rows}
+    absent = {"ceilings", "whole logs", "whole logs, faster", "reading back"}
+    assert rows.keys() == {"throughput", *absent}
+    assert rows["ceilings"] == rows["reading back"] == "all of it"
+    assert rows["throughput"].startswith("harness alone, ROS bag, MongoDB (1 of 2 streams were)")
+    assert "plain MCAP" not in rows["throughput"]
+    assert rows["throughput"].count("(1 of 2 streams were)") == len(BACKENDS) - 3
 
 
 # --- numbers --------------------------------------------------------------------------
@@ -652,5 +675,5 @@ def test_logs_that_all_keep_are_told_in_one_sentence(tmp_path: Path) -> None:
     samples += [whole_log("mit1", "mcap", 1.0), whole_log("mit1", "bagfile", 0.5)]
     assert [text for text in report(journal(tmp_path, *samples)).findings if "Of " in text] == [
         "Of mit1, plain MCAP kept everything; not so ROS bag 50 %.",
-        "Of hcr1 and x, every backend kept everything.",
+        "Of hcr1 and x, every backend that took part kept everything.",
     ]
