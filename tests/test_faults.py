@@ -622,18 +622,36 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
     assert "short cannot be brought into the index" in done.stderr
 
 
+def list_otherwise(path: Path, place: int, change: Callable[[int], int]) -> None:
+    """Forge eight bytes of the first chunk index of a segment, its checksum included."""
+    data = bytearray(path.read_bytes())
+    at = start = int(struct.unpack_from("<Q", data, len(data) - 28)[0])
+    while data[at] != Opcode.CHUNK_INDEX:
+        at += 9 + int(struct.unpack_from("<Q", data, at + 1)[0])
+    (was,) = struct.unpack_from("<Q", data, at + 9 + place)
+    struct.pack_into("<Q", data, at + 9 + place, change(was))
+    struct.pack_into("<I", data, len(data) - 12, crc32(data[start:-12]))
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("place", [0, 8, 38], ids=["first", "last", "message index"])
+@pytest.mark.parametrize("difference", [-5, 5])
+def test_a_chunk_that_is_listed_otherwise_than_it_is(
+    store: hl.Store, place: int, difference: int
+) -> None:
+    (_, path), *_ = store.directory.segments("short")
+    list_otherwise(path, place, lambda was: was + difference)
+    with reopened(store) as opened:
+        (found,) = (f for f in opened.verify().findings if path.name in f.place)
+    assert found.problem == "the summary lists it otherwise than it is"
+
+
 @pytest.mark.parametrize("offset", [1 << 30, 1 << 62, (1 << 64) - 1])
 def test_a_chunk_that_is_said_to_lie_behind_the_end_is_found_at_once(
     store: hl.Store, offset: int
 ) -> None:
     (_, path), *_ = store.directory.segments("short")
-    data = bytearray(path.read_bytes())
-    at = start = int(struct.unpack_from("<Q", data, len(data) - 28)[0])
-    while data[at] != Opcode.CHUNK_INDEX:
-        at += 9 + int(struct.unpack_from("<Q", data, at + 1)[0])
-    struct.pack_into("<Q", data, at + 9 + 16, offset)
-    struct.pack_into("<I", data, len(data) - 12, crc32(data[start:-12]))
-    path.write_bytes(data)
+    list_otherwise(path, 16, lambda _: offset)
     with reopened(store) as opened:
         findings = [f for f in opened.verify().findings if path.name in f.place]
     assert any(str(offset) in f.place + f.problem for f in findings)

@@ -8,6 +8,8 @@ but another MCAP reader may not, so they are to be as they were written.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from itertools import accumulate
 from typing import TYPE_CHECKING, Self
 
 from mcap.opcode import Opcode
@@ -62,7 +64,7 @@ class SegmentCheck:
             self._file.close()
             raise SegmentError(f"Segment {path} has no readable summary.")
         self._summary: Summary = summary
-        self._lengths = {c.chunk_start_offset: c.chunk_length for c in summary.chunk_indexes}
+        self._listed = {listed.chunk_start_offset: listed for listed in summary.chunk_indexes}
 
     def __enter__(self) -> Self:
         """The check itself."""
@@ -79,21 +81,36 @@ class SegmentCheck:
             chunk: As it was read from this segment.
         """
         batch = chunk.batch
-        _, _, first, last, _, _ = CHUNK_HEAD.unpack(self._read(chunk.offset, CHUNK_HEAD.size))
+        head = CHUNK_HEAD.unpack(self._read(chunk.offset, CHUNK_HEAD.size))
+        _, _, first, last, size, _ = head
         if (first, last) != (int(batch.log_time.min()), int(batch.log_time.max())):
             return "its head names other times than those of its messages"
         starts = batch.offset - MESSAGE_HEAD.itemsize
-        want = b"".join(message_indexes(batch.channel, batch.log_time, starts).values())
+        indexes = message_indexes(batch.channel, batch.log_time, starts)
+        want = b"".join(indexes.values())
         at = chunk.offset + chunk.length
         if self._read(at, len(want)) != want or self._head(at + len(want))[0] != ARRIVAL_OPCODE:
             return "its message indexes are damaged"
+        listed = self._listed.get(chunk.offset)
+        if listed is None or listed != replace(
+            listed,
+            message_start_time=first,
+            message_end_time=last,
+            message_index_offsets=dict(
+                zip(indexes, accumulate(map(len, indexes.values()), initial=at), strict=False)
+            ),
+            message_index_length=len(want),
+            compressed_size=chunk.compressed_size,
+            uncompressed_size=size,
+        ):
+            return "the summary lists it otherwise than it is"
         return None
 
     def between_chunks(self) -> Iterator[tuple[int, str]]:
         """Byte and description of all that is wrong outside of chunks and their indexes."""
         at, end = len(MAGIC), self._end_of_data()
         # A chunk that is said to lie behind the data is found by who reads it.
-        starts = [*sorted(start for start in self._lengths if start < end), end]
+        starts = [*sorted(start for start in self._listed if start < end), end]
         if self._read(0, at) != MAGIC:
             yield 0, "the file does not start as an MCAP file"
         for start in starts:
@@ -106,7 +123,8 @@ class SegmentCheck:
                 if problem is not None:
                     yield at, problem
                 at += _HEAD + length
-            at = start + self._lengths.get(start, 0)
+            listed = self._listed.get(start)
+            at = end if listed is None else start + listed.chunk_length
         if self._head(end) != (Opcode.DATA_END, 4):
             yield end, "the record that ends the data is damaged"
 
