@@ -9,7 +9,7 @@ from benchmarks.report.book import MB, Book, ends
 from benchmarks.report.look import OURS, databases, ordered, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import counted, listed, number, size, times, with_spread
-from benchmarks.studies.ceiling import STUDY, Ceiling
+from benchmarks.studies.ceiling import HARNESS, STUDY, Ceiling
 from benchmarks.studies.ceiling import ceilings as found_in
 
 _NOTE = (
@@ -144,7 +144,7 @@ def _graph(ceilings: Sequence[_Found]) -> Graph:
     floor = (
         " Where the line of “harness alone” is reached, the harness can offer no more through its "
         "queues."
-        if any(line.backend == "nothing" for line in lines)
+        if any(line.backend == HARNESS for line in lines)
         else ""
     )
     return Graph(

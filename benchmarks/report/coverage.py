@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from benchmarks.backends.registry import BACKENDS
 from benchmarks.questions.askers import ASKERS, READERS
-from benchmarks.report.book import Book
+from benchmarks.report.book import Book, by_backend, by_case
 from benchmarks.report.look import title
 from benchmarks.report.model import Table
 from benchmarks.report.numbers import listed
@@ -49,25 +49,20 @@ def table(book: Book) -> Table | None:
     rows = tuple(
         (study.title, text)
         for name, study in _STUDIES.items()
-        if (text := _lacks(study, [one for one in book.all if one.study == name]))
+        if (text := _lacks(study, book.good(name)))
     )
     return Table("What was not measured", ("study", "without"), rows) if rows else None
 
 
-def _lacks(study: _Study, samples: Sequence[Sample]) -> str:
-    good = [one for one in samples if one.status == "ok"]
+def _lacks(study: _Study, good: Sequence[Sample]) -> str:
     if not good:
         return "all of it"
-    cases = {_case(study, one) for one in good}
+    whole, of = len(by_case(good, *study.axes)), by_backend(good)
     absent, parts = [], []
     for name in study.backends:
-        done = len({_case(study, one) for one in good if one.backend == name})
+        done = len(by_case(of.get(name, ()), *study.axes))
         if not done:
             absent.append(title(name))
-        elif done < len(cases):
-            parts.append(f"{title(name)} ({done} of {len(cases)} {study.cases} were)")
+        elif done < whole:
+            parts.append(f"{title(name)} ({done} of {whole} {study.cases} were)")
     return listed([*absent, *parts])
-
-
-def _case(study: _Study, sample: Sample) -> tuple[str, ...]:
-    return tuple(str(sample.case.get(axis)) for axis in study.axes)

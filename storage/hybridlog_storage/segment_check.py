@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from itertools import accumulate
 from typing import TYPE_CHECKING, Self
 
 from mcap.opcode import Opcode
@@ -24,6 +23,7 @@ from hybridlog_storage.segment_format import (
     CHUNK_HEAD,
     PADDING_OPCODE,
     PROFILE,
+    index_offsets,
     message_indexes,
 )
 
@@ -81,8 +81,7 @@ class SegmentCheck:
             chunk: As it was read from this segment.
         """
         batch = chunk.batch
-        head = CHUNK_HEAD.unpack(self._read(chunk.offset, CHUNK_HEAD.size))
-        _, _, first, last, size, _ = head
+        _, _, first, last, size, _ = CHUNK_HEAD.unpack(self._read(chunk.offset, CHUNK_HEAD.size))
         if (first, last) != (int(batch.log_time.min()), int(batch.log_time.max())):
             return "its head names other times than those of its messages"
         starts = batch.offset - MESSAGE_HEAD.itemsize
@@ -96,8 +95,8 @@ class SegmentCheck:
             listed,
             message_start_time=first,
             message_end_time=last,
-            message_index_offsets=dict(
-                zip(indexes, accumulate(map(len, indexes.values()), initial=at), strict=False)
+            message_index_offsets=index_offsets(
+                {channel: len(index) for channel, index in indexes.items()}, at
             ),
             message_index_length=len(want),
             compressed_size=chunk.compressed_size,

@@ -13,6 +13,7 @@ import json
 import struct
 import threading
 from collections.abc import Iterator, Mapping
+from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -173,6 +174,16 @@ def message_indexes(
         head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data))
         records[int(channels[start])] = head + data
     return records
+
+
+def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
+    """Where the message index of each channel begins, by channel id.
+
+    Args:
+        sizes: Bytes of each, in their order in the file.
+        start: Byte at which the first begins.
+    """
+    return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
 
 
 def entries_of(index: bytes) -> int:

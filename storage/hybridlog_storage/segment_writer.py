@@ -55,6 +55,7 @@ from hybridlog_storage.segment_format import (
     channel_record,
     chunk_head,
     entries_of,
+    index_offsets,
     json_metadata,
     message_indexes,
     pack_arrivals,
@@ -335,11 +336,6 @@ class SegmentFile:
             compressed_size: Bytes of compressed content.
             uncompressed_size: Bytes of content.
         """
-        offsets: dict[int, int] = {}
-        at = offset + length
-        for channel, size in indexes.items():
-            offsets[channel] = at
-            at += size
         first, last = span
         self._chunk_indexes.append(
             ChunkIndex(
@@ -348,8 +344,8 @@ class SegmentFile:
                 compression=compression,
                 compressed_size=compressed_size,
                 message_end_time=last,
-                message_index_length=at - offset - length,
-                message_index_offsets=offsets,
+                message_index_length=sum(indexes.values()),
+                message_index_offsets=index_offsets(indexes, offset + length),
                 message_start_time=first,
                 uncompressed_size=uncompressed_size,
             )
