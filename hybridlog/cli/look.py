@@ -329,6 +329,7 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[
 
 
 def _source(source: Mapping[str, Any]) -> str:
-    """Where a recording came from; a robot has no size."""
+    """Where a recording came from; a robot has no size, a program that records no address."""
     size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
-    return f"{source['path']} ({source['kind']}{size})"
+    kind = f"{source['kind']}{size}"
+    return f"{source['path']} ({kind})" if source["path"] else kind

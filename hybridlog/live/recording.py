@@ -31,7 +31,7 @@ from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
@@ -46,7 +46,8 @@ if TYPE_CHECKING:
 
 _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
-_ENOUGH = 1 << 20  # bytes that are worth waking the writing thread for
+_LEAST_BUDGET = 1 << 20  # bytes
+_ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
 _TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
 _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
 _FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
@@ -85,7 +86,7 @@ class LiveOptions:
     settings: SegmentSettings = field(default_factory=SegmentSettings)
 
     def __post_init__(self) -> None:
-        if self.budget_bytes < _ENOUGH:
+        if self.budget_bytes < _LEAST_BUDGET:
             raise UsageError("the memory budget must be at least 1 MiB")
         if not 0 < self.flush_interval_s <= 3600:
             raise UsageError("the flush interval must lie between 0 and 3600 seconds")
@@ -153,6 +154,7 @@ class LiveRecording:
         self._taken: list[int] = []  # messages, by index of the channel
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
+        self._worth_waking = min(_ENOUGH, options.budget_bytes // 4)
         self._taken_bytes = 0  # taken, and not laid into a chunk yet
         self._at_work = AT_WORK * options.settings.chunk_size
         self._beyond = 0  # bytes closed beyond those, as last counted; `write` asks each time
@@ -297,7 +299,7 @@ class LiveRecording:
             if not at_once:
                 self._inbox.append(message)
                 self._inbox_bytes += size
-            enough = self._inbox_bytes >= _ENOUGH
+            enough = self._inbox_bytes >= self._worth_waking
         if at_once:
             self._lay_now(message)
         elif enough:

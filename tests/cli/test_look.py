@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from mcap.writer import Writer
 
+import hybridlog as hl
 from hybridlog.cli.look import _channel_row
 from hybridlog.cli.output import parse_size, quoted
 from hybridlog_storage.catalog import ChannelEntry
-from hybridlog_storage.messages import REDUCED
+from hybridlog_storage.messages import REDUCED, Channel, Schema
 from tests.independent import read_bag
 
 from .odd_log import HOSTILE_NAME
@@ -66,6 +68,16 @@ def test_info_without_a_name_shows_all_and_the_losses(store: Path) -> None:
         assert f"recording  {name}" in done.out
     assert "lost, source damaged: torn.bag at byte" in done.out
     assert done.err == ""
+
+
+def test_info_of_what_a_program_recorded_names_no_address(tmp_path: Path) -> None:
+    with (
+        hl.open(tmp_path / "store", create=True) as store,
+        store.start("mine") as recording,
+    ):
+        recording.write(Channel("/n", "json", Schema("", "", b"")), b"{}")
+    text = run("info", "mine", store=tmp_path / "store").out
+    assert re.search(r"^source +live *$", text, re.MULTILINE)
 
 
 def test_info_of_a_segment(logs: Path, store: Path) -> None:
