@@ -21,8 +21,8 @@ import numpy as np
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.catalog import Catalog, ChannelStats, ChannelTotals, ChunkEntry
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.index_documents import DocumentAssembler, Origin
 from hybridlog_storage.messages import Batch, Channel

@@ -31,7 +31,7 @@ from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.copying import COPIED_AT_ONCE
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata

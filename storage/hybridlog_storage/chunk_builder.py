@@ -11,7 +11,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.copying import COPIED_AT_ONCE, copy_payloads, windows
+from hybridlog_storage.copying import copy_payloads, windows
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Batch, Buffer
 
@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 _HEAD = MESSAGE_HEAD.itemsize
 _ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
+COPIED_AT_ONCE = 1 << 18
+"""Bytes below which a payload is copied without giving up the interpreter.
+
+That takes some ten microseconds. To let others have the interpreter meanwhile takes as
+long, and when one of them computes, it comes back only five milliseconds later.
+"""
 
 
 class ChunkBuilder:

@@ -13,13 +13,6 @@ from hybridlog_storage.messages import Batch, Buffer
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-COPIED_AT_ONCE = 1 << 18
-"""Bytes below which a payload is copied without giving up the interpreter.
-
-That takes some ten microseconds. To let others have the interpreter meanwhile takes as
-long, and when one of them computes, it comes back only five milliseconds later.
-"""
-
 _SLICE_FROM = 2048  # mean payload bytes from which one slice copy a message is cheapest
 
 
@@ -33,16 +26,13 @@ def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
 def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[np.int64]) -> None:
     """Copy each payload of a batch to its place in a buffer that is large enough."""
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
-        moves = zip(starts.tolist(), batch.offset.tolist(), batch.length.tolist(), strict=True)
-        source, view = np.frombuffer(batch.buffer, np.uint8), np.frombuffer(target, np.uint8)
-        if batch.payload_bytes < COPIED_AT_ONCE * len(batch):
-            content, room = source.data, view.data
-            for to, at, size in moves:
-                room[to : to + size] = content[at : at + size]
-        else:
-            # Between arrays numpy copies without the interpreter lock.
-            for to, at, size in moves:
-                view[to : to + size] = source[at : at + size]
+        # Between arrays numpy copies without the interpreter lock.
+        source = np.frombuffer(batch.buffer, np.uint8)
+        view = np.frombuffer(target, np.uint8)
+        for to, at, size in zip(
+            starts.tolist(), batch.offset.tolist(), batch.length.tolist(), strict=True
+        ):
+            view[to : to + size] = source[at : at + size]
         return
     lengths = distinct(batch.length)
     for length in lengths[lengths > 0].tolist():

@@ -27,8 +27,8 @@ from hybridlog.live import recording as live
 from hybridlog_storage import append_file
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema

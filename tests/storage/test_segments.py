@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.append_file import BLOCK, AppendFile
-from hybridlog_storage.copying import COPIED_AT_ONCE
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
