@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _SOURCES: Final = frozenset({"ros1", "ros2", "foxglove", "replay"})
 _LEAST_SEGMENT: Final = 1 << 20
-_LEAST_BUDGET: Final = 1 << 20
 _LONGEST_FLUSH_S: Final = 3600.0
 _DAY_S: Final = 86_400.0
 
@@ -115,7 +114,7 @@ def recorder_options(
         UsageError: An option that makes no sense.
         TopicError: A pattern that is malformed.
     """
-    from hybridlog.live.budget import usual_budget
+    from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
@@ -140,7 +139,7 @@ def recorder_options(
         reserve_bytes=_size("--reserve", live.reserve),
         budget_bytes=usual_budget()
         if live.budget is None
-        else _size("--budget", live.budget, _LEAST_BUDGET),
+        else _size("--budget", live.budget, LEAST_ASKED_FOR),
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(live),

@@ -1,4 +1,4 @@
-"""How much memory a live recording may use for what is not written yet, if nobody says."""
+"""How much memory a live recording may use for what is not written yet."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 
 LEAST = 64 << 20
 MOST = 2 << 30
+LEAST_ASKED_FOR = 1 << 20
+"""Bytes that whoever says a budget must give."""
 _SHARE = 16
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")

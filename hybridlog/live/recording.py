@@ -24,7 +24,7 @@ import numpy as np
 
 from hybridlog.capture import Capture
 from hybridlog.indexing import BACKLOG
-from hybridlog.live.budget import usual_budget
+from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
 from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
 from hybridlog.live.turns import Turns
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 
 _LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
-_LEAST_BUDGET = 1 << 20  # bytes
 _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
 _TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
 _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
@@ -86,7 +85,7 @@ class LiveOptions:
     settings: SegmentSettings = field(default_factory=SegmentSettings)
 
     def __post_init__(self) -> None:
-        if self.budget_bytes < _LEAST_BUDGET:
+        if self.budget_bytes < LEAST_ASKED_FOR:
             raise UsageError("the memory budget must be at least 1 MiB")
         if not 0 < self.flush_interval_s <= 3600:
             raise UsageError("the flush interval must lie between 0 and 3600 seconds")
