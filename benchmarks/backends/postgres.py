@@ -84,6 +84,7 @@ class PostgresAutocommit(DatabaseBackend):
     @classmethod
     def check(cls) -> None:
         need("psycopg", "psycopg[binary]")
+        need("orjson", "orjson")
         postgres_server.find_programs()
 
     def table_of(self, topic: str) -> str:

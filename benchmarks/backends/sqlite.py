@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 from benchmarks.backends.base import BackendFailedError, BackendMissingError
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
+from benchmarks.backends.requirements import need
 from hybridlog_storage.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -83,6 +84,10 @@ class SqliteUdf(DatabaseBackend):
         """The connection; between `open` and `close`."""
         assert self._opened is not None
         return self._opened
+
+    @classmethod
+    def check(cls) -> None:
+        need("orjson", "orjson")
 
     def open(self, channels: Sequence[Channel]) -> None:
         self.check()
@@ -174,6 +179,7 @@ class SqliteJson1(SqliteUdf):
 
     @classmethod
     def check(cls) -> None:
+        super().check()
         if sqlite3.sqlite_version_info < (3, 38):
             connection = sqlite3.connect(":memory:")
             try:

@@ -40,10 +40,15 @@ class _Connected:
     """A connection in autocommit mode."""
 
     def start(self, backend: Backend) -> None:
+        import orjson
+        from psycopg.types.json import set_json_loads
+
         from benchmarks.backends.postgres import PostgresAutocommit
 
         assert isinstance(backend, PostgresAutocommit)
         self._connection = backend.connect()
+        # As psycopg's documentation advises where much JSON is read.
+        set_json_loads(orjson.loads, self._connection)
         # As a loaded database has it after a minute, and a query's plan needs it.
         self._connection.execute("ANALYZE")
 

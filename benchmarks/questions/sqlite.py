@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -10,6 +9,7 @@ from operator import eq, ge, gt, le, lt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import orjson
 
 from benchmarks.backends.sqlite import expression, quoted, table_of
 from benchmarks.questions import sql
@@ -238,7 +238,7 @@ class SqliteJsonReading(_Connected, Reading):
 
 def get_val(message: str, path: str) -> Any:
     """A field of a message; None when there is none."""
-    value = json.loads(message)
+    value = orjson.loads(message)
     for name in path.split("."):
         value = value.get(name) if isinstance(value, dict) else None
     return value
@@ -247,7 +247,7 @@ def get_val(message: str, path: str) -> Any:
 def _scalar(message: str, path: str) -> Any:
     """A field as SQLite takes it: objects and lists as text."""
     value = get_val(message, path)
-    return json.dumps(value) if isinstance(value, dict | list) else value
+    return orjson.dumps(value).decode() if isinstance(value, dict | list) else value
 
 
 def _comparison(order: Callable[[Any, Any], bool]) -> Callable[[str, str, Any], bool]:
@@ -266,10 +266,10 @@ def _time_diff(one: str, path: str, other: str, other_path: str) -> float:
 
 
 def _ranges(rows: Sequence[tuple[Any, ...]]) -> NDArray[np.float32]:
-    return np.array([json.loads(row[0])["ranges"] for row in rows], np.float32)
+    return np.array([orjson.loads(row[0])["ranges"] for row in rows], np.float32)
 
 
 def _table(rows: Sequence[tuple[Any, ...]]) -> pd.DataFrame:
     import pandas as pd
 
-    return pd.json_normalize([json.loads(row[0]) for row in rows])
+    return pd.json_normalize([orjson.loads(row[0]) for row in rows])
