@@ -47,7 +47,7 @@ class _Connected:
 
         assert isinstance(backend, PostgresAutocommit)
         self._connection = backend.connect()
-        # As psycopg's documentation advises where much JSON is read.
+        # The standard library's takes several times as long.
         set_json_loads(orjson.loads, self._connection)
         # As a loaded database has it after a minute, and a query's plan needs it.
         self._connection.execute("ANALYZE")
