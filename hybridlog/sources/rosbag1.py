@@ -156,6 +156,7 @@ class Rosbag1Source(Source):
         self._chunk_positions: list[int] = []
         self._chunk_counts: list[int] = []
         self._index_pos = 0
+        self._index_is_short = False
         self._place: _Place | None = None
         self._pos = len(MAGIC)
         self._skipped: int | None = None
@@ -233,6 +234,8 @@ class Rosbag1Source(Source):
             else:
                 return
             pos = record.end
+        # Cut between two of its records, the index looks whole but for their number.
+        self._index_is_short = connections < conn_count or len(chunks) < chunk_count
         if connections != conn_count or len(chunks) != chunk_count:
             return
         chunks.sort()
@@ -283,6 +286,13 @@ class Rosbag1Source(Source):
                 f"the file ends before its index, which should start at byte {self._index_pos}: "
                 "it was cut short",
                 None,
+            )
+        elif self._index_is_short and not was_cut:
+            self._report(
+                self.size_bytes,
+                None,
+                "the file ends within its index, which should hold more records: it was cut short",
+                0,
             )
         self._report_undefined()
 
