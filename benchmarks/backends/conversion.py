@@ -16,8 +16,8 @@ and not the database, would be what a ceiling shows.
 | `_meta.inserted_at` | log time as a date, ms | log time as ISO 8601 text, ms |
 | `_meta.t` | log time, ns | log time, ns |
 
-JSON has no NaN. A message without a definition, or one that
-does not fit its definition, is kept whole, as bytes under `data`.
+A message without a definition, or one that does not fit its definition, is kept whole, as
+bytes under `data`.
 """
 
 from __future__ import annotations
@@ -166,10 +166,10 @@ def iso_text(log_time: int) -> str:
 
 def without_nul(text: str) -> str:
     """JSON whose strings hold U+FFFD in place of U+0000, which jsonb cannot store."""
-    import orjson
-
     if "\\u0000" not in text:
         return text
+    import orjson
+
     return _encode(_replace_nul(orjson.loads(text)))
 
 
