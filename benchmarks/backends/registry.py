@@ -6,7 +6,7 @@ from benchmarks.backends.bagfile import BagFile
 from benchmarks.backends.base import Backend
 from benchmarks.backends.hybridlog_store import Hybridlog, HybridlogRecorder
 from benchmarks.backends.mcap_file import McapFile
-from benchmarks.backends.mongo_json import MongoJson, MongoJsonIndexed
+from benchmarks.backends.mongo_json import MongoJson, MongoJsonBatched, MongoJsonIndexed
 from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.postgres import PostgresAutocommit, PostgresTuned, PostgresTunedIndexed
 from benchmarks.backends.sqlite import SqliteJson1, SqliteUdf
@@ -19,6 +19,7 @@ BACKENDS: dict[str, type[Backend]] = {
         BagFile,
         MongoJson,
         MongoJsonIndexed,
+        MongoJsonBatched,
         PostgresAutocommit,
         PostgresTuned,
         PostgresTunedIndexed,

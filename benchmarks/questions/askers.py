@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-SAME: Final = {"hybridlog_recorder": "hybridlog"}
+SAME: Final = {"hybridlog_recorder": "hybridlog", "mongo_json_batched": "mongo_json"}
 """Backends that keep just what another one keeps, which is asked in their place."""
 
 # By name of the backend: rows of the tables and the classes (`module:class`) that fill

@@ -39,6 +39,7 @@ _LOOKS = {
     "hybridlog_api_indexed": Look("hybridlog (its own API, indexed)", "#7a3300", "p", ":"),
     "mongo_json": Look("MongoDB", "#009e73", "s"),
     "mongo_json_indexed": Look("MongoDB (indexed)", "#009e73", "D", "--"),
+    "mongo_json_batched": Look("MongoDB (batched)", "#00664b", "<", "-."),
     "postgres_autocommit": Look("PostgreSQL (autocommit)", "#56b4e9", "v"),
     "postgres_tuned": Look("PostgreSQL (tuned)", "#2f7ed8", "^"),
     "postgres_tuned_indexed": Look("PostgreSQL (tuned, indexed)", "#2f7ed8", ">", "--"),

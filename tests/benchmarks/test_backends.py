@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 import pytest
 
-from benchmarks.backends import postgres, postgres_server, sqlite
+from benchmarks.backends import mongo_json, postgres, postgres_server, sqlite
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.backends.registry import BACKENDS
 from hybridlog_storage.collection_names import collection_of
@@ -383,6 +383,7 @@ def sqlite_uses_its_indexes(backend: Any) -> None:
 BESIDES: dict[str, Callable[[Any], None]] = {
     "mongo_json": leaves_out_what_no_document_can_hold,
     "mongo_json_indexed": has_the_indexes_of_the_appendix,
+    "mongo_json_batched": leaves_out_what_no_document_can_hold,
     "postgres_tuned_indexed": postgresql_uses_its_indexes,
     "sqlite_json1": sqlite_uses_its_indexes,
 }
@@ -423,6 +424,7 @@ def test_contract(name: str, tmp_path: Path) -> None:
 def test_registry() -> None:
     assert list(BACKENDS) == [
         *("nothing", "mcap", "bagfile", "mongo_json", "mongo_json_indexed"),
+        *("mongo_json_batched",),
         *("postgres_autocommit", "postgres_tuned", "postgres_tuned_indexed"),
         *("sqlite_udf", "sqlite_json1", "hybridlog", "hybridlog_recorder"),
     ]
@@ -456,11 +458,15 @@ def test_table_names_stay_apart() -> None:
     assert all(len(postgres.table_of(topic).encode()) <= 63 for topic in topics)
 
 
-@pytest.mark.parametrize("name", ["postgres_tuned", "sqlite_json1"])
-def test_two_seconds_are_a_transaction_to_which_messages_go_as_they_come(
+@pytest.mark.parametrize("name", ["mongo_json_batched", "postgres_tuned", "sqlite_json1"])
+def test_two_seconds_of_messages_go_in_together(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = {"postgres_tuned": postgres, "sqlite_json1": sqlite}[name]
+    module = {
+        "mongo_json_batched": mongo_json,
+        "postgres_tuned": postgres,
+        "sqlite_json1": sqlite,
+    }[name]
     with opened(name, tmp_path) as backend:
 
         def count() -> int:
@@ -483,11 +489,14 @@ def test_two_seconds_are_a_transaction_to_which_messages_go_as_they_come(
 # Failures.
 
 
-@pytest.mark.parametrize("name", ["mongo_json", "postgres_autocommit", "postgres_tuned"])
+@pytest.mark.parametrize(
+    "name", ["mongo_json", "mongo_json_batched", "postgres_autocommit", "postgres_tuned"]
+)
 def test_a_killed_server_is_told_and_leaves_nothing(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(postgres, "BATCH_S", 0.05)
+    for module in (mongo_json, postgres):
+        monkeypatch.setattr(module, "BATCH_S", 0.05)
 
     def go_on() -> None:
         for message in messages(0, 50, 1000):

@@ -280,7 +280,7 @@ def test_no_report_when_none_is_wanted(study: Study, tmp_path: Path) -> None:
     [
         (["-b", "nosuch"], "no backend 'nosuch'"),
         (["-b", "mongo_jsno"], "did you mean mongo_json"),
-        (["-b", "mongo"], "mongo_json, mongo_json_indexed"),
+        (["-b", "mongo"], "mongo_json, mongo_json_indexed, mongo_json_batched"),
         (["-b", ","], "names none"),
         (["--sizes", "big"], "'big' is no size"),
         (["--sizes", "0"], "not above 0"),
