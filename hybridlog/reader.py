@@ -611,8 +611,10 @@ class Query:
         from hybridlog.tables import arranged, collect
 
         frame = collect(self).to_pandas()
-        if self._fields is not None:
-            frame = frame[arranged(list(frame.columns), self._fields)]
+        names = list(frame.columns)
+        wanted = arranged(names, self._fields)
+        if wanted != names:  # choosing columns takes as long as making the frame
+            frame = frame[wanted]
         if self._reverse:
             frame = frame.iloc[::-1]
         frame.attrs["hybridlog"] = _as_dict(self.counters)

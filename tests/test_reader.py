@@ -29,6 +29,7 @@ from rosbags.typesys import Stores, get_typestore
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
 from hybridlog.latched import in_force
+from hybridlog.query import plan
 from hybridlog.reader import Query
 from hybridlog.recorder import RecordOptions
 from hybridlog_storage.catalog import SCHEMAS, Catalog
@@ -307,6 +308,28 @@ def test_tables_of_real_logs(store: hl.Store, name: str, topics: list[str]) -> N
             # A megabyte a message, compared number by number.
             query, want = query.limit(1), want[:1]
         check_tables(query, want)
+
+
+def test_small_chunks_make_the_same_table_together(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = store.topic("/base/scan").in_recording("robot")
+    chunks = [task.chunk for task in query.plan().tasks()]
+    reader = store.segment("robot", chunks[0].segment)
+    sizes = sorted(len(reader.read_chunk(chunk.place).batch.buffer) for chunk in chunks)
+    whole, half = sizes[-1], sizes[len(sizes) // 2]
+    tables, pieces = [], []
+    # Each by itself; the smaller half together, between larger ones; three; all.
+    for small, most in ((0, 0), (half, whole * 9), (whole, whole * 3), (whole, sum(sizes))):
+        monkeypatch.setattr(plan, "_SMALL", small)
+        monkeypatch.setattr(plan, "_TOGETHER", most)
+        pieces.append(len(list(plan.Sweep(query.plan(), store.segment).unordered())))
+        tables.append(query.to_arrow())
+        assert query.counters.chunks_read == len(chunks)
+    assert pieces[0] == len(chunks) > pieces[1] > 1
+    assert pieces[0] > pieces[2] > pieces[3] == 1
+    assert tables[0].num_rows == query.count()
+    assert all(table.equals(tables[0]) for table in tables)
 
 
 def test_tables_with_every_and_limit_and_reverse(store: hl.Store, robot: Truth) -> None:

@@ -18,7 +18,7 @@ from pandas.api.indexers import check_array_indexer
 from hybridlog.frames.ragged import Ragged
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from typing import Self
 
     import pyarrow as pa
@@ -232,6 +232,10 @@ class ArrayColumn(ExtensionArray):
     def __len__(self) -> int:
         """Number of rows."""
         return len(self.rows)
+
+    def __iter__(self) -> Iterator[NDArray[Any] | None]:
+        """The cells; pandas' own way looks each up by itself."""
+        return iter(self.rows)
 
     def __getitem__(self, item: Any) -> Any:
         """A cell, or the chosen rows as a column over the same elements."""

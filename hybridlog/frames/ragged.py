@@ -103,6 +103,12 @@ class Ragged:
         """Number of rows."""
         return len(self.start)
 
+    def __iter__(self) -> Iterator[NDArray[Any] | None]:
+        """Each row as a view, None for a missing one."""
+        values = self.values
+        for start, length in zip(self.start.tolist(), self.length.tolist(), strict=True):
+            yield None if length < 0 else values[start : start + length]
+
     @property
     def missing(self) -> NDArray[np.bool_]:
         """Which rows are missing, shape (n,)."""

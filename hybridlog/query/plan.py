@@ -22,7 +22,7 @@ from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.codec import codec_for
 from hybridlog.schema.column import header_stamps
-from hybridlog_storage.copying import interleave
+from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
 from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.segment_reader import SegmentReader
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 Clock = Literal["log", "publish", "header"]
 _LOOK_AHEAD = 4
 _WORTH_THREADS = 4 << 20  # bytes; starting threads takes as long as reading a megabyte
+_SMALL = 128 << 10  # bytes of a chunk that is copied in less time than it is decoded by itself
+_TOGETHER = 1 << 20  # bytes of small chunks that are decoded at once
 
 
 @dataclass(slots=True)
@@ -242,13 +244,26 @@ class Sweep:
             plan.counters.elapsed_s = time.monotonic() - started
 
     def unordered(self) -> Iterator[Piece]:
-        """All messages, chunk by chunk: what tables are built from."""
+        """All messages, a large chunk or many small ones at a time: for tables."""
         plan = self._plan
         started = time.monotonic()
+        small: list[Piece] = []
+        size = 0
         for piece, _ in self._loaded():
             count_given(plan.counters, piece.batch)
-            if len(piece.batch):
+            if not len(piece.batch):
+                continue
+            length = len(piece.batch.buffer)
+            if small and (length > _SMALL or size + length > _TOGETHER):
+                yield _together(small)
+                small, size = [], 0
+            if length > _SMALL:
                 yield piece
+                continue
+            small.append(piece)
+            size += length
+        if small:
+            yield _together(small)
         plan.counters.elapsed_s = time.monotonic() - started
 
     def _chosen(self, tasks: list[Task]) -> Iterator[tuple[Task, NDArray[np.int64] | None]]:
@@ -395,6 +410,11 @@ class _Later:
 
 def _rows(piece: Piece, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Piece:
     return Piece(piece.batch.take(rows), piece.seq[rows])
+
+
+def _together(pieces: list[Piece]) -> Piece:
+    """Several pieces as one: to decode each by itself costs more than to copy it."""
+    return Piece(joined([p.batch for p in pieces]), np.concatenate([p.seq for p in pieces]))
 
 
 def _in_order(pieces: list[Piece], plan: Plan) -> Piece:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,26 @@ def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[
         rows = slice(None) if len(lengths) == 1 else batch.length == length
         places = windows(target, length)
         places[starts[rows]] = windows(batch.buffer, length)[batch.offset[rows]]
+
+
+def joined(batches: Sequence[Batch]) -> Batch:
+    """Batches one after the other over one new buffer: their buffers, whole.
+
+    Args:
+        batches: At least one; that one is returned as it is.
+    """
+    if len(batches) == 1:
+        return batches[0]
+    starts = accumulate((len(b.buffer) for b in batches), initial=0)
+    return Batch(
+        b"".join(b.buffer for b in batches),
+        np.concatenate([b.offset + at for b, at in zip(batches, starts, strict=False)]),
+        np.concatenate([b.length for b in batches]),
+        np.concatenate([b.channel for b in batches]),
+        np.concatenate([b.log_time for b in batches]),
+        np.concatenate([b.publish_time for b in batches]),
+        np.concatenate([b.sequence for b in batches]),
+    )
 
 
 def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
