@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
-_LARGE = 1 << 15  # bytes from which a payload is laid down by itself, and at once
+_LARGE = 1 << 17  # bytes from which a payload is laid down by itself, and at once
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
 _TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
@@ -570,9 +570,11 @@ class LiveRecording:
 
 def _check_payload(payload: object) -> None:
     """Whether something that is not `bytes` can be laid down as if it were."""
-    if isinstance(payload, memoryview) and payload.c_contiguous and payload.format == "B":
-        return
-    if not isinstance(payload, bytes | bytearray):
+    if isinstance(payload, memoryview):
+        is_flat = payload.c_contiguous and payload.ndim == 1 and payload.format == "B"
+    else:
+        is_flat = isinstance(payload, bytes | bytearray)
+    if not is_flat:
         kind = type(payload).__name__
         raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
 

@@ -82,7 +82,7 @@ class Source:
         if len(base) == 1 and size >= _VIEW_BYTES:
             return np.frombuffer(self.buffer, np.uint8, size, int(base[0]) + delta)
         if size >= _LONG_BLOCK:
-            return self._join((base + delta).tolist(), [size] * len(base))
+            return self._join_equal(base + delta, size)
         return cast("NDArray[np.uint8]", self._gather(f"V{size}", size, base, delta).view("u1"))
 
     def ragged(self, start: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -91,7 +91,22 @@ class Source:
             sizes, group = np.unique(size, return_inverse=True)
             if len(sizes) <= _MAX_GROUPS and len(sizes) * _ROWS_A_GROUP <= len(start):
                 return self._by_size(start, size, sizes, group)
+        if len(size) and size[0] >= _LONG_BLOCK and bool((size == size[0]).all()):
+            return self._join_equal(start, int(size[0]))
         return self._join(start.tolist(), size.tolist())
+
+    def _join_equal(self, start: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
+        """`size` bytes from each start; in one step when these are equally far apart."""
+        rows = len(start)
+        stride = _even_stride(start, least=2)
+        if not stride:
+            return self._join(start.tolist(), [size] * rows)
+        joined = buffers.take(rows * size)[: rows * size]
+        view: NDArray[np.uint8] = np.ndarray(
+            (rows, size), np.uint8, buffer=self.buffer, offset=int(start[0]), strides=(stride, 1)
+        )
+        joined.reshape(rows, size)[:] = view
+        return joined
 
     def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
         total = sum(size)
@@ -179,9 +194,9 @@ def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
     return np.arange(rows + 1, dtype=np.int64) * width
 
 
-def _even_stride(base: NDArray[np.int64]) -> int:
-    """The distance of offsets that are all equally far apart, 0 for others."""
-    if len(base) < _EVEN_ROWS:
+def _even_stride(base: NDArray[np.int64], least: int = _EVEN_ROWS) -> int:
+    """The distance of offsets that are all equally far apart, 0 for others and for few."""
+    if len(base) < least:
         return 0
     stride = int(base[1] - base[0])
     return stride if stride > 0 and bool((base[1:] - base[:-1] == stride).all()) else 0

@@ -171,7 +171,7 @@ def test_memory_for_a_disk_that_stands_still_is_there_before(store: hl.Store, ra
 
 def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> None:
     """Small ones wait for others to be laid down together, large ones do not."""
-    sizes = [10, 40_000, 20, 30_000, 35_000, 0]
+    sizes = [10, 140_000, 20, 30_000, 135_000, 0]
     payloads = [text(bytes([i]) * sizes[i % len(sizes)]) for i in range(120)]
     own, other = channel("/talk"), channel("/other")
 
@@ -199,7 +199,7 @@ import hybridlog as hl
 from hybridlog_storage.messages import Batch, Channel, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
-sizes = [10, 40_000, 10, 100, 3000]
+sizes = [10, 140_000, 10, 100, 3000]
 payloads = [
     (size := sizes[n % 5]).to_bytes(4, "little") + bytes([n % 251]) * size for n in range(1255)
 ]
@@ -357,7 +357,7 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
     assert store.verify().findings == []
 
 
-@pytest.mark.parametrize("size", [50_000, COPIED_AT_ONCE])
+@pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
@@ -529,12 +529,13 @@ def test_misuse(store: hl.Store) -> None:
 
 
 def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store) -> None:
-    own, large = channel("/talk"), b"x" * (1 << 16)
+    own, large = channel("/talk"), b"x" * (1 << 17)
     recording: Any = store.start("talk")
     with closing(recording):
         recording.write(own, text(b"before"), log_time=1)
         wide = memoryview(bytes(8)).cast("H")
-        for wrong in ("text", None, 5, [1, 2], wide, memoryview(large)[::2]):
+        table = memoryview(bytes(8)).cast("B", (2, 4))
+        for wrong in ("text", None, 5, [1, 2], wide, table, memoryview(large)[::2]):
             with pytest.raises(UsageError, match="payload of a message"):
                 recording.write(own, wrong, log_time=2)
         for numbers in ({"log_time": 1.5e9}, {"publish_time": "1"}, {"sequence": None}):
