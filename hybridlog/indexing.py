@@ -265,6 +265,8 @@ class IndexWriter:
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(backlog)
+        self._in_memory = 0  # chunks that wait or are under way
+        self._is_asked = False  # for the next forgotten chunk
         self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
         self._senders = ThreadPoolExecutor(_SENDERS, thread_name_prefix="hybridlog-send")
         self._idle = threading.BoundedSemaphore(_SENDERS)
@@ -296,8 +298,10 @@ class IndexWriter:
         self._channels = channels
         if not self._room.acquire(blocking=self._lag is None):
             self._forget(chunk)
-            self._maker.submit(self._remember).add_done_callback(self._done)
+            self._catch_up()
             return
+        with self._lock:
+            self._in_memory += 1
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(self._made)
 
@@ -324,8 +328,7 @@ class IndexWriter:
         """Wait for all chunks; an error of our own (no database's) is raised here."""
         if self._crash is None:
             self._maker.submit(self._last_try).add_done_callback(self._done)
-            # What that has asked for stands behind it in the queue, before this.
-            self._maker.submit(_nothing).result()
+            self._maker.submit(self._remember_all).add_done_callback(self._done)
             self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
         self._end()
         self.missed += sum(chunk.messages for chunk in self._forgotten)
@@ -360,9 +363,24 @@ class IndexWriter:
         )
         self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
 
+    def _catch_up(self) -> None:
+        """Ask for a forgotten chunk once none waits in memory.
+
+        To read one back costs more than to make its documents. Taken in the order in which
+        they came, those that were let go would keep others waiting until these, too, have
+        no room.
+        """
+        with self._lock:
+            if self._is_asked or self._in_memory or not self._forgotten or self.failure is not None:
+                return
+            self._is_asked = True
+        with suppress(RuntimeError):  # nothing is taken any more
+            self._maker.submit(self._remember_next).add_done_callback(self._done)
+
     def _tend(self) -> None:
         if self.failure is not None and time.monotonic() >= self._retry_at:
             self._retry()
+        self._catch_up()
         self._dispatch(wait=False)
 
     def _last_try(self) -> None:
@@ -395,15 +413,22 @@ class IndexWriter:
                     self.indexed -= self._put_back(entry)
                     self._totals = None  # what was taken in cannot be taken out
             self.failure, self._is_away = None, False
-            waiting = len(self._forgotten)
-        for _ in range(waiting):
-            self._maker.submit(self._remember).add_done_callback(self._done)
+
+    def _remember_next(self) -> None:
+        with self._lock:
+            self._is_asked = False
+        self._remember()
+        self._catch_up()
+
+    def _remember_all(self) -> None:
+        while self._forgotten and self.failure is None:
+            self._remember()
 
     def _remember(self) -> None:
         """Make documents of the first forgotten chunk, while the next one is read."""
         assert self._lag is not None
         if self.failure is not None or not self._forgotten:
-            return  # as many as there are then are asked for when it goes on
+            return
         place = self._forgotten.popleft()
         self._lag.wait()
         chunk = self._lag.read(place)
@@ -483,7 +508,10 @@ class IndexWriter:
 
     def _made(self, future: Future[None]) -> None:
         self._room.release()
+        with self._lock:
+            self._in_memory -= 1
         self._done(future)
+        self._catch_up()
 
     def _sent(self, future: Future[None]) -> None:
         self._idle.release()
@@ -503,10 +531,6 @@ def _is_large(chunk: StoredChunk) -> bool:
     Of large messages they take little, and nearly none of it under the interpreter's lock.
     """
     return len(chunk.batch.buffer) >= COPIED_AT_ONCE * len(chunk.batch)
-
-
-def _nothing() -> None:
-    """Something to wait for."""
 
 
 def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:

@@ -173,21 +173,70 @@ def machine(headers: Sequence[Mapping[str, Any]]) -> Section:
         same = [{k: v for k, v in one.items() if k not in _MOMENT} for one in distinct]
         if {k: v for k, v in header.items() if k not in _MOMENT} not in same:
             distinct.append(header)
-    columns = ("", *(f"run {n}" for n in range(1, len(distinct) + 1)))
-    rows: list[tuple[Cell, ...]] = []
+    shared: dict[str, object] = {}
+    different: dict[str, list[object]] = {}
     for key, name in (*_MACHINE, *_settings(distinct)):
-        cells = [_of(header, key) for header in distinct]
-        if any(one is not None for one in cells):
-            rows.append((name, *(None if one is None else _text(one) for one in cells)))
-    table = Table("Machine, versions, settings", columns, tuple(rows))
+        same, others = _apart([_of(header, key) for header in distinct])
+        if same is not None:
+            shared[name] = same
+        if any(one is not None for one in others):
+            different[name] = others
+    tables = [
+        Table(
+            "Machine, versions, settings",
+            ("", "every run" if len(distinct) > 1 else "the run"),
+            tuple((name, _text(one)) for name, one in shared.items()),
+        )
+    ]
+    if len(distinct) > 1:
+        tables.append(_runs(distinct, different))
     commands = list(dict.fromkeys(_command(header) for header in headers))
-    text = [f"To run it again: `{command}`" for command in commands if command]
+    text = [f"To run it again: `{command}`" for command in commands if command][:1]
+    if len(commands) > 1:
+        text = ["To run them again: the commands in the last column, in their order."]
     text.append(
         "The same command goes on where it was stopped; `--restart` begins anew. "
         "`python -m benchmarks report` draws this report again from the journal alone. "
         "Loads are made from the seed, so another machine publishes the same bytes."
     )
-    return Section("rerun", "Machine, versions, and how to run it again", tuple(text), (), (table,))
+    return Section(
+        "rerun", "Machine, versions, and how to run it again", tuple(text), (), tuple(tables)
+    )
+
+
+def _apart(cells: list[object]) -> tuple[object, list[object]]:
+    """What is the same in all runs, None without any; and of each what is not."""
+    if not cells or all(one == cells[0] for one in cells):
+        return next(iter(cells), None), []
+    maps = [_mapping(one) for one in cells]
+    same = {k: v for k, v in maps[0].items() if all(k in one and one[k] == v for one in maps)}
+    if not same:
+        return None, cells
+    return same, [{k: v for k, v in one.items() if k not in same} or None for one in maps]
+
+
+def _runs(headers: Sequence[Mapping[str, Any]], different: Mapping[str, list[object]]) -> Table:
+    """A row a run, with what is not the same in all."""
+    parts = {name for _, name in _settings(headers)}
+    plain = [name for name in different if name not in parts]
+    rows: list[tuple[Cell, ...]] = []
+    for number, header in enumerate(headers):
+        cells = {name: found[number] for name, found in different.items()}
+        settings = [
+            f"{name}: {_text(one)}"
+            for name, one in cells.items()
+            if name in parts and one is not None
+        ]
+        command = _command(header)
+        rows.append(
+            (
+                str(number + 1),
+                *(None if cells[name] is None else _text(cells[name]) for name in plain),
+                "; ".join(settings) or None,
+                f"`{command}`" if command else None,
+            )
+        )
+    return Table("The runs", ("run", *plain, "settings", "command"), tuple(rows))
 
 
 _MOMENT = frozenset({"started", "load_1min", "command"})

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
-_LARGE = 1 << 17  # bytes from which a payload is laid down by itself, and at once
+_LARGE = 1 << 17  # bytes from which a payload is laid down at once
+_MEDIUM = 1 << 13  # and from which by itself: to join it to others first would copy it twice
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
 _TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
@@ -61,7 +62,7 @@ _AT_HAND = 128 << 20  # bytes of buffers that are there before the first message
 _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
 _LOOK_S = 0.25  # how often one looks how many that are
 _PAUSE_S = 0.005  # after each new one, since to get it takes as long
-_MOST_BACKLOG = 32  # chunks that wait for the index in memory, where the budget allows it
+_MOST_BACKLOG = 96  # chunks that wait for the index in memory, where the budget allows it
 _MOST_NS = 1 << 63
 
 
@@ -549,7 +550,8 @@ class LiveRecording:
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""
         channels = [self._channels[index] for index in {message.channel for message in group}]
-        if len(group) >= _FEW * self._capture.writer.count_chunks(channels):
+        is_small = len(group[0].payload) < _MEDIUM
+        if is_small and len(group) >= _FEW * self._capture.writer.count_chunks(channels):
             batch = _batch(group)
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
@@ -590,12 +592,11 @@ def _backlog(options: LiveOptions) -> int:
 
 
 def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:
-    """Take the first messages: one large one, or as many smaller ones as make a batch."""
+    """Take the first messages: as many small ones as make a batch, or as many others."""
     group = [inbox.popleft()]
     size = len(group[0].payload)
-    if size >= _LARGE:
-        return group
-    while inbox and size < _MOST_JOINED and len(inbox[0].payload) < _LARGE:
+    is_small = size < _MEDIUM
+    while inbox and size < _MOST_JOINED and (len(inbox[0].payload) < _MEDIUM) == is_small:
         group.append(inbox.popleft())
         size += len(group[-1].payload)
     return group

@@ -489,8 +489,22 @@ def test_runs_of_other_machines_are_noted(tmp_path: Path) -> None:
     assert len(table(found, "Machine, versions").columns) == 2
     found = report(journal(tmp_path, cpu="another"))
     assert any("processor" in text and "not alike" in text for text in found.warnings)
-    assert len(table(found, "Machine, versions").columns) == 3
+    assert "processor" not in dict(table(found, "Machine, versions").rows)
+    runs = table(found, "The runs")
+    place = runs.columns.index("processor")
+    assert [row[place] for row in runs.rows] == ["a processor", "another"]
     assert "python -m benchmarks all --out 'a b'" in all_text(found)
+
+
+def test_what_runs_share_is_said_once(tmp_path: Path) -> None:
+    journal(tmp_path, stream("hybridlog", 1.0), packages={"mcap": "1", "numpy": "2"})
+    found = report(journal(tmp_path, packages={"mcap": "1", "numpy": "3"}, python="3.99"))
+    assert dict(table(found, "Machine, versions").rows)["packages"] == "mcap 1"
+    runs = table(found, "The runs")
+    rows = [dict(zip(runs.columns, row, strict=True)) for row in runs.rows]
+    assert [row["packages"] for row in rows] == ["numpy 2", "numpy 3"]
+    assert rows[1]["Python"] == "3.99"
+    assert "seed" not in rows[0]
 
 
 # --- the files ------------------------------------------------------------------------

@@ -317,6 +317,49 @@ def test_the_index_falls_behind_and_catches_up(
     assert store.verify().findings == []
 
 
+def test_what_was_let_go_does_not_keep_others_waiting(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chunks in memory come first, or those behind them would have to be let go as well."""
+    monkeypatch.setattr(live, "_backlog", lambda _: 2)
+    made: list[int] = []
+    began, go_on = threading.Event(), threading.Event()
+    real_documents = ChunkIndexer.documents_of
+
+    def held_up(self: ChunkIndexer, chunk: StoredChunk, *args: Any) -> Any:
+        began.set()
+        go_on.wait(30)
+        made.append(int(chunk.seq[0]))
+        return real_documents(self, chunk, *args)
+
+    real_read = Lag.read
+
+    def slow(self: Lag, chunk: Any) -> StoredChunk:
+        if len(made) == 2:  # now that there is room, more comes
+            speak(6, 7)
+        return real_read(self, chunk)
+
+    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
+    monkeypatch.setattr(Lag, "read", slow)
+    own = channel("/talk")
+    payloads = [text(bytes([n]) * 200_000) for n in range(7)]
+    with store.start("talk", settings=SegmentSettings(chunk_size=100_000)) as recording:
+        totals = recording._capture.writer.totals
+
+        def speak(first: int, last: int) -> None:
+            for number in range(first, last):
+                recording.write(own, payloads[number], log_time=number)
+            wait_for(lambda: totals.chunks == last)
+
+        speak(0, 6)
+        began.wait(30)
+        go_on.set()
+        wait_for(lambda: recording.lag == 0)
+    assert made == [0, 1, 2, 6, 3, 4, 5]
+    assert [m.raw for m in store.topic("/talk")] == payloads
+    assert store.verify().findings == []
+
+
 def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -343,16 +386,18 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
     own = channel("/talk")
     payloads = [text(os.urandom(COPIED_AT_ONCE)) for _ in range(40)]
     settings = SegmentSettings(chunk_size=COPIED_AT_ONCE)
-    with store.start("talk", settings=settings, budget_bytes=64 << 20) as recording:
+    backlog = 32
+    budget = 8 * backlog * COPIED_AT_ONCE
+    with store.start("talk", settings=settings, budget_bytes=budget) as recording:
         for number, payload in enumerate(payloads):
             recording.write(own, payload, log_time=number)
         wait_for(lambda: recording._capture.writer.totals.chunks == 40)
         go_on.set()
-        wait_for(lambda: len(made) == live._MOST_BACKLOG)
+        wait_for(lambda: len(made) == backlog)
         assert not read
         busy = False
         wait_for(lambda: recording.lag == 0)
-        assert len(read) == 40 - live._MOST_BACKLOG
+        assert len(read) == 40 - backlog
     assert [m.raw for m in store.topic("/talk")] == payloads
     assert store.verify().findings == []
 
