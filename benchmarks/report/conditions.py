@@ -190,10 +190,10 @@ def machine(headers: Sequence[Mapping[str, Any]]) -> Section:
     ]
     if len(distinct) > 1:
         tables.append(_runs(distinct, different))
-    commands = list(dict.fromkeys(_command(header) for header in headers))
-    text = [f"To run it again: `{command}`" for command in commands if command][:1]
-    if len(commands) > 1:
         text = ["To run them again: the commands in the last column, in their order."]
+    else:
+        commands = list(dict.fromkeys(_command(header) for header in headers))
+        text = [f"To run it again: `{command}`" for command in commands if command]
     text.append(
         "The same command goes on where it was stopped; `--restart` begins anew. "
         "`python -m benchmarks report` draws this report again from the journal alone. "

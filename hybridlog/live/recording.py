@@ -549,15 +549,18 @@ class LiveRecording:
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""
-        channels = [self._channels[index] for index in {message.channel for message in group}]
-        is_small = len(group[0].payload) < _MEDIUM
-        if is_small and len(group) >= _FEW * self._capture.writer.count_chunks(channels):
+        if len(group[0].payload) < _MEDIUM and len(group) >= _FEW * self._count_chunks(group):
             batch = _batch(group)
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
         for message in group:
             self._place(message)()
         return sum(len(message.payload) for message in group)
+
+    def _count_chunks(self, group: Sequence[_Message]) -> int:
+        """In how many chunks some messages will lie, about."""
+        channels = [self._channels[index] for index in {message.channel for message in group}]
+        return self._capture.writer.count_chunks(channels)
 
     def _place(self, message: _Message) -> Callable[[], None]:
         """Give a message its place in a chunk; what comes back copies it there."""

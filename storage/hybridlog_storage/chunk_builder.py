@@ -40,7 +40,6 @@ class ChunkBuilder:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._buffer = np.empty(0, np.uint8)
-        self._view = self._buffer.data  # for what is laid down without numpy: it costs less
         self._used = 0
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self._rows: list[tuple[int, int, int, int, int, int, int]] = []
@@ -122,8 +121,9 @@ class ChunkBuilder:
         if not self._used:
             self.first_log_time = log_time
             self.opened = time.monotonic()
+        view = self._buffer.data  # what is laid down without numpy costs less
         _ONE_HEAD.pack_into(
-            self._view,
+            view,
             self._used,
             Opcode.MESSAGE,
             length + (_HEAD - 9),
@@ -136,7 +136,7 @@ class ChunkBuilder:
         self.messages += 1
         self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
         if length < COPIED_AT_ONCE:
-            self._view[start : start + length] = payload
+            view[start : start + length] = payload
             return _nothing
         source, target = np.frombuffer(payload, np.uint8), self._buffer[start : start + length]
         copying = Lock()
@@ -164,7 +164,6 @@ class ChunkBuilder:
         self.copying, self.messages = [], 0
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
-        self._view = self._buffer.data
         batches = [batch for batch, _ in pieces]
         content = buffer.data[:used]
         whole = Batch(
@@ -205,7 +204,7 @@ class ChunkBuilder:
         large = size * 8 > self._capacity
         larger = buffers.take(max(size, self._capacity if large else 2 * size))
         larger[: self._used] = self._buffer[: self._used]
-        self._buffer, self._view = larger, larger.data
+        self._buffer = larger
 
     def _lay_heads(self, batch: Batch, starts: NDArray[np.int64]) -> None:
         heads = np.empty(len(batch), MESSAGE_HEAD)

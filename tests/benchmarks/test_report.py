@@ -487,6 +487,8 @@ def test_runs_of_other_machines_are_noted(tmp_path: Path) -> None:
     found = report(journal(tmp_path, started="later"))
     assert found.warnings == ()
     assert len(table(found, "Machine, versions").columns) == 2
+    found = report(journal(tmp_path, command=["python", "-m", "benchmarks", "taken up"]))
+    assert "To run it again: `python -m benchmarks 'taken up'`" in all_text(found)
     found = report(journal(tmp_path, cpu="another"))
     assert any("processor" in text and "not alike" in text for text in found.warnings)
     assert "processor" not in dict(table(found, "Machine, versions").rows)
