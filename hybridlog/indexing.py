@@ -267,6 +267,7 @@ class IndexWriter:
         self._room = threading.BoundedSemaphore(backlog)
         self._in_memory = 0  # chunks that wait or are under way
         self._is_asked = False  # for the next forgotten chunk
+        self._has_ended = False  # nothing is taken any more
         self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
         self._senders = ThreadPoolExecutor(_SENDERS, thread_name_prefix="hybridlog-send")
         self._idle = threading.BoundedSemaphore(_SENDERS)
@@ -346,6 +347,8 @@ class IndexWriter:
         self._renewed.clear()
 
     def _end(self, *, cancel: bool = False) -> None:
+        with self._lock:
+            self._has_ended = True
         self._maker.shutdown(wait=True, cancel_futures=cancel)
         self._senders.shutdown(wait=True, cancel_futures=cancel)
         if self._lag is not None:
@@ -371,11 +374,12 @@ class IndexWriter:
         no room.
         """
         with self._lock:
-            if self._is_asked or self._in_memory or not self._forgotten or self.failure is not None:
+            is_idle = not (self._is_asked or self._in_memory or self._has_ended)
+            if not is_idle or not self._forgotten or self.failure is not None:
                 return
             self._is_asked = True
-        with suppress(RuntimeError):  # nothing is taken any more
-            self._maker.submit(self._remember_next).add_done_callback(self._done)
+            future = self._maker.submit(self._remember_next)
+        future.add_done_callback(self._done)
 
     def _tend(self) -> None:
         if self.failure is not None and time.monotonic() >= self._retry_at:

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -28,7 +29,9 @@ import numpy as np
 from hybridlog.counting import count_in_columns, in_all_times
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_counts import count_in_chunks
+from hybridlog.query.chunk_lists import earlier_and_earlier
 from hybridlog.query.intervals import span_of
+from hybridlog.query.latest import last_message
 from hybridlog.query.plan import (
     Chosen,
     Clock,
@@ -63,13 +66,12 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segment_writer import StoredChunk
 
 _BATCH = 10_000  # index documents that come at a time
 _FEW = 50
 """So many index documents are counted in the time in which a chunk's entry is fetched."""
 _HANDFUL = 50  # messages for which nothing is read ahead
-_BACK_NS = 1_000_000_000  # a message at a time is looked for so far back first,
-_FURTHER = 64  # and then so many times as far
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
@@ -400,53 +402,100 @@ class Query:
             TopicError: there is none.
             UsageError: the question has a time range, or another clock than the log's.
         """
-        return self._current(moment)[0]
-
-    def _current(self, moment: TimeLike) -> tuple[Query, Message]:
-        """The message that was current at a time, and the question that has it as its answer."""
-        if not self.is_unbounded or self._clock != "log":
-            raise UsageError(
-                "A message at a time is the last one by log time; `between`, `during` and "
-                "`clock` do not fit."
-            )
-        moments: list[tuple[int, int, RecordingEntry]] = []
-        for recording in self._recordings():
-            start, end = span_of(recording)
-            now = parse_time(moment, start=start, end=end)
-            if recording.span is not None and now >= start:
-                moments.append((min(now, end - 1), now, recording))
-        best: tuple[tuple[int, int, int], Query, Message] | None = None
-        # The recording that could hold the latest message is asked first: mostly it does.
-        for latest, now, recording in sorted(moments, key=lambda m: m[0], reverse=True):
-            if best is not None and latest < best[0][0]:
-                break
-            for begin in _earlier_and_earlier(latest, span_of(recording)[0]):
-                query = self._with(
-                    recording_ids=(recording.id,),
-                    _bounds=(f"{begin}ns", f"{now + 1}ns"),
-                    _clock="log",
-                    _reverse=True,
-                    _limit=1,
-                )
-                found = query.first()
-                if found is not None:
-                    break
-            if found is not None:
-                place = found.log_time_ns, recording.key, found.seq
-                if best is None or place > best[0]:
-                    best = place, query, found
-        if best is not None:
-            return best[1], best[2]
-        raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+        found = self.at(moment)
+        return self._with(
+            recording_ids=(found.recording,),
+            _bounds=(f"{found.log_time_ns}ns", f"{found.log_time_ns + 1}ns"),
+            _reverse=True,
+            _limit=1,
+        )
 
     def at(self, moment: TimeLike) -> Message:
-        """The message that `just_at` asks for.
+        """The message that `just_at` asks for. Its arrays are read-only: copy what is to change.
 
         Raises:
             TopicError: there is none.
             UsageError: the question has a time range, or another clock than the log's.
         """
-        return self._current(moment)[1]
+        if not self.is_unbounded or self._clock != "log":
+            raise UsageError(
+                "A message at a time is the last one by log time; `between`, `during` and "
+                "`clock` do not fit."
+            )
+        with self.costing():
+            found = self._current(moment)
+        if found is None:
+            raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+        return found
+
+    def _current(self, moment: TimeLike) -> Message | None:
+        """The message that was current at a time, in whichever recording it is."""
+        moments: list[tuple[int, int, RecordingEntry]] = []
+        for recording in self._recordings():
+            start, end = span_of(recording)
+            now = parse_time(moment, start=start, end=end)
+            if start < end and start <= now:
+                moments.append((min(now, end - 1), start, recording))
+        best: tuple[tuple[int, int, int], Message] | None = None
+        # The recording that could hold the latest message is asked first: mostly it does.
+        for latest, start, recording in sorted(moments, key=itemgetter(0), reverse=True):
+            if best is not None and latest < best[0][0]:
+                break
+            found = self._last_of(recording, (start, latest))
+            if found is not None:
+                place = found.log_time_ns, recording.key, found.seq
+                if best is None or place > best[0]:
+                    best = place, found
+        return best[1] if best is not None else None
+
+    def _last_of(self, recording: RecordingEntry, span: tuple[int, int]) -> Message | None:
+        """The last message of a recording in `[start, latest]`, ns."""
+        if self._predicates:
+            return self._last_that_satisfies(recording, span)
+        wanted = set(self.topics)
+        lanes = {
+            lane.channel_id: lane
+            for lane in self.store.lanes(recording)
+            if lane.channel.topic in wanted
+        }
+
+        def read(entry: ChunkEntry) -> StoredChunk:
+            return self.store.recent_chunks.get(
+                (recording.id, entry.segment, entry.offset), partial(load, entry)
+            )
+
+        def load(entry: ChunkEntry) -> StoredChunk:
+            chunk = self.store.segment(recording.id, entry.segment).read_chunk(entry.place)
+            self.counters.chunks_read += 1
+            self.counters.bytes_read += chunk.length + chunk.trailer
+            return chunk
+
+        chunks = self.store.chunks_before(recording, list(lanes), span)
+        found = last_message(chunks, lanes, span[1], read)
+        if found is None:
+            return None
+        batch = found.batch.take(slice(found.row, found.row + 1))
+        lane = lanes[int(batch.channel[0])]
+        batch.channel = np.zeros(1, np.int32)
+        count_given(self.counters, batch)
+        return next(_messages([lane], Piece(batch, np.array([found.seq]))))
+
+    def _last_that_satisfies(
+        self, recording: RecordingEntry, span: tuple[int, int]
+    ) -> Message | None:
+        start, latest = span
+        for begin in earlier_and_earlier(latest, start):
+            query = self._with(
+                recording_ids=(recording.id,),
+                _bounds=(f"{begin}ns", f"{latest + 1}ns"),
+                _reverse=True,
+                _limit=1,
+            )
+            found = next(iter(query), None)
+            self.counters.add(query.counters)
+            if found is not None:
+                return found
+        return None
 
     # Answers.
 
@@ -1122,18 +1171,6 @@ class Query:
                 taken += count
                 if self._limit is not None and given >= self._limit:
                     return
-
-
-def _earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
-    """Where to begin to look for the last message by a time, ns: close to it first.
-
-    All chunks before it are many in a long recording, and mostly the last one has it.
-    """
-    back = _BACK_NS
-    while latest - back > start:
-        yield latest - back
-        back *= _FURTHER
-    yield 0
 
 
 def _topics_of(target: Target) -> list[str]:

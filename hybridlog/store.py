@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -14,9 +14,10 @@ from hybridlog import field_indexes, maintenance
 from hybridlog.columns.kept import KeptColumns
 from hybridlog.columns.stored import FieldColumns
 from hybridlog.field_indexes import FieldIndex
-from hybridlog.query.chunk_lists import ChunkLists
+from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.plan import Lane
 from hybridlog.query.predicate import Predicate
+from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
 from hybridlog.reader import Query
 from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
@@ -85,6 +86,7 @@ def open_store(
         store.connect(wanted or directory.settings.mongo or EMBEDDED)
         # What is read of the catalog here, the first question need not ask for.
         database, recordings = store.database_for("This"), store.recordings()
+        store.learn_schemas()
         store.tended = maintenance.tend(directory, database, recordings, progress)
         if store.tended != maintenance.Tended():
             store.refresh()
@@ -112,6 +114,7 @@ class Store:
         without_database: Why it is away.
         tended: What had to be mended when it was opened.
         kept: Columns of what is asked for again and again.
+        recent_chunks: Chunks that single messages were read from.
     """
 
     def __init__(self, directory: StoreDirectory) -> None:
@@ -129,6 +132,7 @@ class Store:
         self._columns: dict[str, FieldColumns | None] = {}
         self._chunk_lists = ChunkLists()
         self.kept = KeptColumns(self)
+        self.recent_chunks = RecentChunks()
         self._lock = threading.Lock()
         self._learn()
 
@@ -195,6 +199,7 @@ class Store:
                 reader.close()
             self._segments.clear()
         self._columns.clear()
+        self.recent_chunks.clear()
         self.disconnect()
 
     def database_for(self, purpose: str) -> Database:
@@ -233,6 +238,7 @@ class Store:
             self._columns.clear()  # closed by the last thread that reads from them
         self._chunk_lists.clear()
         self.kept.clear()
+        self.recent_chunks.clear()
         self._learn()
 
     def _learn(self) -> None:
@@ -298,14 +304,23 @@ class Store:
 
     def _schemas_for(self, recording: RecordingEntry) -> dict[str, Schema]:
         """Schemas by hash: those of a recording, as far as MongoDB has them, and of others."""
-        known = self._schemas
         wanted = {c.schema for c in recording.channels if c.schema is not None}
-        if self.database is not None and not wanted <= known.keys():
-            # Recordings have most of them in common: those of all are asked for at once.
-            for other in self.recordings():
-                wanted.update(c.schema for c in other.channels if c.schema is not None)
-            known = self._schemas = Catalog(self.database).schemas(wanted)
-        return known
+        if self.database is not None and not wanted <= self._schemas.keys():
+            self.learn_schemas(recording)
+        return self._schemas
+
+    def learn_schemas(self, *others: RecordingEntry) -> None:
+        """Fetch the schemas of all recordings at once: they have most of them in common.
+
+        Args:
+            others: Recordings that may have come since the catalog was read.
+
+        Raises:
+            DatabaseError: MongoDB is away.
+        """
+        entries = (*self.recordings(), *others)
+        used = {c.schema for r in entries for c in r.channels if c.schema is not None}
+        self._schemas = Catalog(self.database_for("A schema")).schemas(used)
 
     # Asking.
 
@@ -370,17 +385,43 @@ class Store:
         clock: str,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range."""
-        if recording.status == "open":
-            return self.catalog.chunks(recording.id, channels, bounds, clock, brief=True)
-        wanted = set(channels)
-        longest = max((c.stats.longest for c in recording.channels if c.id in wanted), default=0)
-
-        def fetch(within: tuple[int, int] | None) -> list[ChunkEntry]:
-            return self.catalog.chunks(recording.id, channels, within, clock, longest, brief=True)
-
-        if bounds is None or clock != "log":
-            return fetch(bounds)
+        if bounds is None or clock != "log" or recording.status == "open":
+            return self._fetch_chunks(recording, channels, bounds, clock)
+        fetch = partial(self._fetch_chunks, recording, channels)
         return self._chunk_lists.find(recording.id, channels, bounds, fetch)
+
+    def chunks_before(
+        self, recording: RecordingEntry, channels: Sequence[int], span: tuple[int, int]
+    ) -> Iterator[tuple[ChunkEntry, int]]:
+        """Chunks that may hold the last message of some channels by a time.
+
+        Args:
+            recording: Of which.
+            channels: Channel ids.
+            span: Log time of the recording's first message, and the time, ns.
+
+        Yields:
+            See `ChunkLists.before`.
+        """
+        fetch = partial(self._fetch_chunks, recording, channels)
+        if recording.status == "open":
+            return latest_first(frozenset(channels), span, fetch)
+        return self._chunk_lists.before(recording.id, channels, span, fetch)
+
+    def _fetch_chunks(
+        self,
+        recording: RecordingEntry,
+        channels: Sequence[int],
+        bounds: tuple[int, int] | None,
+        clock: str = "log",
+    ) -> list[ChunkEntry]:
+        longest = None
+        if recording.status != "open":
+            wanted = set(channels)
+            longest = max(
+                (c.stats.longest for c in recording.channels if c.id in wanted), default=0
+            )
+        return self.catalog.chunks(recording.id, channels, bounds, clock, longest, brief=True)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a sealed segment, kept open. Thread safe."""

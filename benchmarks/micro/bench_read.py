@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,24 @@ def bench_fetch(case: str, store: Any, benchmark: Any) -> None:
         return sum(len(batch) for batch, _ in question(store).batches())
 
     assert benchmark(fetch) == count
+
+
+@pytest.mark.parametrize("case", ["elsewhere", "near"])
+def bench_moment(case: str, store: Any, benchmark: Any) -> None:
+    """The scan at a time, decoded: its chunk has to be read, or was for the one before."""
+    moments = cycle(["+1.0s", "+1.1s"])
+
+    def forget() -> None:
+        kept = getattr(store, "recent_chunks", None)  # older revisions keep none
+        if case == "elsewhere" and kept is not None:
+            kept.clear()
+
+    def look() -> Any:
+        return store.topic("/scan").at(next(moments)).decode()
+
+    look()
+    scan = benchmark.pedantic(look, setup=forget, rounds=300, warmup_rounds=3)
+    assert len(scan.ranges)
 
 
 FAST = "angular_velocity.z > 2.5"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
 
 _MOST = 20_000  # entries that are kept of one recording, about 1 kB each
+_BACK_NS = 1_000_000_000  # the last message by a time is looked for so far back first,
+_FURTHER = 64  # and then so many times as far
 
 
 class ChunkLists:
@@ -42,22 +44,88 @@ class ChunkLists:
             fetch: Asks the database for the chunks of these channels in a time range,
                 or in all times.
         """
-        key = recording, frozenset(channels)
-        if key in self._lists:
-            kept = self._lists[key]
-        elif key not in self._asked:
-            self._asked.add(key)
-            kept = None
-        else:
-            everything = fetch(None)
-            kept = _ChunkList(everything, key[1]) if len(everything) <= _MOST else None
-            self._lists[key] = kept
+        kept = self._kept(recording, frozenset(channels), fetch)
         return fetch(bounds) if kept is None else kept.between(*bounds)
+
+    def before(
+        self,
+        recording: str,
+        channels: Sequence[int],
+        span: tuple[int, int],
+        fetch: Callable[[tuple[int, int] | None], list[ChunkEntry]],
+    ) -> Iterator[tuple[ChunkEntry, int]]:
+        """Chunks that may hold the last message of some channels by a time, for `latest`.
+
+        Args:
+            recording: Its id.
+            channels: Channel ids.
+            span: Log time of the first message there is, and the time, ns.
+            fetch: As for `find`.
+
+        Yields:
+            A chunk, and the log time of the last message, ns, that it or any chunk still to
+            come may hold.
+        """
+        held = frozenset(channels)
+        kept = self._kept(recording, held, fetch)
+        if kept is None:
+            yield from latest_first(held, span, fetch)
+        else:
+            yield from kept.before(span[1])
+
+    def _kept(
+        self,
+        recording: str,
+        channels: frozenset[int],
+        fetch: Callable[[tuple[int, int] | None], list[ChunkEntry]],
+    ) -> _ChunkList | None:
+        """The chunks of some channels; None at the first question, and when they are too many."""
+        key = recording, channels
+        if key in self._lists:
+            return self._lists[key]
+        if key not in self._asked:
+            self._asked.add(key)
+            return None
+        everything = fetch(None)
+        kept = _ChunkList(everything, channels) if len(everything) <= _MOST else None
+        self._lists[key] = kept
+        return kept
 
     def clear(self) -> None:
         """Forget everything."""
         self._lists.clear()
         self._asked.clear()
+
+
+def latest_first(
+    channels: frozenset[int],
+    span: tuple[int, int],
+    fetch: Callable[[tuple[int, int]], list[ChunkEntry]],
+) -> Iterator[tuple[ChunkEntry, int]]:
+    """What `ChunkLists.before` gives, asked of the database piece by piece.
+
+    All chunks before a time are many in a long recording, and mostly the last one has what
+    is looked for.
+    """
+    start, latest = span
+    seen: set[tuple[int, int]] = set()
+    for begin in earlier_and_earlier(latest, start):
+        part = _ChunkList(fetch((begin, latest + 1)), channels)
+        for chunk, last in part.before(latest):
+            place = chunk.segment, chunk.offset
+            if place not in seen:
+                seen.add(place)
+                # Those that were not fetched yet end before this piece begins.
+                yield chunk, max(last, begin - 1)
+
+
+def earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
+    """Where to begin to look for the last message by a time, ns: close to it first."""
+    back = _BACK_NS
+    while latest - back > start:
+        yield latest - back
+        back *= _FURTHER
+    yield start
 
 
 class _ChunkList:
@@ -70,9 +138,16 @@ class _ChunkList:
         spans = np.array([span for _, span in held], np.int64).reshape(-1, 2)
         self._first, self._last = np.ascontiguousarray(spans.T)
         self._longest = int((self._last - self._first).max()) if held else 0
+        self._last_by = np.maximum.accumulate(self._last)
 
     def between(self, begin: int, end: int) -> list[ChunkEntry]:
         low = int(np.searchsorted(self._first, begin - self._longest))
         high = int(np.searchsorted(self._first, end))
         rows = np.flatnonzero(self._last[low:high] >= begin) + low
         return [self._chunks[row] for row in rows.tolist()]
+
+    def before(self, latest: int) -> Iterator[tuple[ChunkEntry, int]]:
+        place = int(np.searchsorted(self._first, latest, "right"))
+        while place > 0:
+            place -= 1
+            yield self._chunks[place], int(self._last_by[place])

@@ -70,6 +70,15 @@ class Counters:
         self.documents_read = self.reduced = 0
         self.elapsed_s = 0.0
 
+    def add(self, other: Counters) -> None:
+        """Take in what a part of the answer has cost; the time is that of the whole."""
+        self.messages += other.messages
+        self.payload_bytes += other.payload_bytes
+        self.bytes_read += other.bytes_read
+        self.chunks_read += other.chunks_read
+        self.documents_read += other.documents_read
+        self.reduced += other.reduced
+
 
 def count_given(counters: Counters, batch: Batch) -> None:
     """Messages were given out."""

@@ -1,0 +1,71 @@
+"""The last message at or before a time, out of as few chunks as may hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import ChunkEntry
+    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segment_writer import StoredChunk
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A message in a chunk.
+
+    Attributes:
+        log_time: ns.
+        seq: Arrival number in its recording.
+        batch: The messages of its chunk; `channel` holds channel ids.
+        row: Which of them it is.
+    """
+
+    log_time: int
+    seq: int
+    batch: Batch
+    row: int
+
+
+def last_message(
+    chunks: Iterable[tuple[ChunkEntry, int]],
+    channels: Collection[int],
+    latest: int,
+    read: Callable[[ChunkEntry], StoredChunk],
+) -> Found | None:
+    """The message with the greatest log time, of several the one that arrived last.
+
+    Args:
+        chunks: Those of one recording that may hold it, see `ChunkLists.before`.
+        channels: Ids of the channels that are asked about.
+        latest: The time, ns.
+        read: Gives the content of a chunk.
+
+    Raises:
+        SegmentError: a chunk is not there, or damaged.
+    """
+    best: Found | None = None
+    for entry, last in chunks:
+        if best is not None and last < best.log_time:
+            break
+        chunk = read(entry)
+        row = _last_row(chunk.batch, channels, latest)
+        if row is not None:
+            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
+            if best is None or place > (best.log_time, best.seq):
+                best = Found(*place, chunk.batch, row)
+    return best
+
+
+def _last_row(batch: Batch, channels: Collection[int], latest: int) -> int | None:
+    is_wanted = np.zeros(max(int(batch.channel.max()), *channels) + 1, np.bool_)
+    is_wanted[list(channels)] = True
+    (rows,) = (is_wanted[batch.channel] & (batch.log_time <= latest)).nonzero()
+    if not len(rows):
+        return None
+    # Rows are in the order of arrival: of equal times the last one counts.
+    return int(rows[-1 - int(batch.log_time[rows][::-1].argmax())])

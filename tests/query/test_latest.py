@@ -1,0 +1,259 @@
+"""The message at a time, against a loop, and what looking around in a log reads."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog.query.recent_chunks import RecentChunks
+from hybridlog.reader import Query
+from hybridlog.recorder import RecordOptions
+from hybridlog_storage.errors import SegmentError, TopicError
+from hybridlog_storage.messages import Batch
+from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_writer import SegmentSettings, StoredChunk
+from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
+
+AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
+PADDING = "a" * 60  # about ten messages fill a chunk
+
+rows = st.lists(
+    st.tuples(
+        st.integers(0, 200), st.sampled_from(["/state", "/state", "/other"]), st.integers(0, 3)
+    ),
+    min_size=1,
+    max_size=60,
+)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    place = tmp_path_factory.mktemp("latest") / "store"
+    with hl.open(place, create=True, require_database=True) as opened:
+        yield opened
+
+
+def looked_for(
+    model: Model, keys: dict[str, int], topics: set[str], now: int, states: set[int]
+) -> tuple[str, object] | None:
+    """Recording and number of the current message: by time, recording, then arrival."""
+    found = [
+        (m.time, keys[name], name, place, m.value["n"])
+        for name, log in model.logs.items()
+        for place, m in enumerate(log)
+        if m.topic in topics and m.time <= now and m.value["s"] in states
+    ]
+    return (max(found)[2], max(found)[4]) if found else None
+
+
+@several
+@given(
+    logs=st.fixed_dictionaries({"a": rows, "b": rows}),
+    moments=st.lists(st.integers(-2, 210), min_size=1, max_size=8),
+    is_away=st.booleans(),
+)
+def test_the_message_at_a_time_is_what_a_loop_finds(
+    store: hl.Store,
+    logs: dict[str, list[tuple[int, str, int]]],
+    moments: list[int],
+    is_away: bool,
+) -> None:
+    model = recorded(
+        store,
+        {
+            name: [
+                (t, topic, {"s": s, "n": n, "pad": PADDING}) for n, (t, topic, s) in enumerate(log)
+            ]
+            for name, log in logs.items()
+        },
+    )
+    with hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked:
+        keys = {entry.id: entry.key for entry in asked.recordings()}
+        for topics in ({"/state"}, {"/other"}, {"/state", "/other"}):
+            if not topics <= set(asked.topics()):
+                continue
+            questions: dict[tuple[int, ...], Query] = {(0, 1, 2, 3): asked.topic(*topics)}
+            if not is_away:
+                questions[0, 2] = asked.topic(*topics).where("s == 0 or s == 2")
+            for states, query in questions.items():
+                for moment in moments:
+                    now = BASE + moment * SECOND + 1
+                    want = looked_for(model, keys, topics, now, set(states))
+                    if want is None:
+                        with pytest.raises(TopicError, match="at or before"):
+                            query.at(f"{now}ns")
+                        continue
+                    found = query.at(f"{now}ns")
+                    assert (found.recording, found.fields["n"]) == want
+                    (same,) = query.just_at(f"{now}ns")
+                    assert (same.recording, same.fields["n"]) == want
+
+
+@pytest.fixture
+def many(store: hl.Store) -> hl.Store:
+    """200 messages, a second apart, in about twenty chunks."""
+    recorded(store, {"a": [(n, "/state", {"n": n, "pad": PADDING}) for n in range(200)]})
+    return store
+
+
+def test_a_chunk_is_read_once_for_who_looks_around_in_it(many: hl.Store) -> None:
+    query = many.topic("/state")
+    read = []
+    for moment in range(200):
+        assert query.at(f"+{moment}s").fields["n"] == moment
+        assert query.counters.messages == 1
+        assert query.counters.documents_read == 0
+        read.append((query.counters.chunks_read, query.counters.bytes_read > 0))
+    assert set(read) == {(0, False), (1, True)}
+    assert sum(count for count, _ in read) == many.recordings()[0].chunks
+
+
+def test_a_message_chosen_by_the_index_costs_something_too(many: hl.Store) -> None:
+    query = many.topic("/state").where("n < 5")
+    assert query.at("end").fields["n"] == 4
+    cost = query.counters
+    assert (cost.messages, cost.documents_read, cost.chunks_read) == (1, 5, 1)
+    assert cost.payload_bytes > 0
+    assert cost.bytes_read > 0
+    assert cost.elapsed_s > 0
+
+
+def test_what_was_read_is_forgotten_with_its_recording(many: hl.Store) -> None:
+    assert many.topic("/state").at("end").fields["n"] == 199
+    recorded(many, {"a": [(n, "/state", {"n": -n, "pad": PADDING}) for n in range(200)]})
+    assert many.topic("/state").at("end").fields["n"] == -199
+
+
+def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
+    entry = many.recordings()[0]
+    path = many.directory.recording(entry.id) / "000000.mcap"
+    whole = path.read_bytes()
+    last = many.chunks(entry, [entry.channels[0].id], None, "log")[-1]
+    place = last.offset + last.length - 1
+    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    try:
+        with pytest.raises(SegmentError, match=f"{last.offset} of .*{path.name}"):
+            many.topic("/state").at("end")
+        assert many.topic("/state").at("+3s").fields["n"] == 3
+    finally:
+        path.write_bytes(whole)
+    assert many.topic("/state").at("end").fields["n"] == 199
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_who_changes_a_message_does_not_change_what_is_kept(
+    tmp_path: Path, compression: str
+) -> None:
+    from hybridlog.demo.write import write_bag
+
+    write_bag(tmp_path / "robot.bag", duration_s=1.0)
+    settings = SegmentSettings(compression=compression)  # type: ignore[arg-type]
+    with hl.open(tmp_path / "store", create=True) as opened:
+        opened.record(tmp_path / "robot.bag", RecordOptions(settings=settings))
+        scan = opened.topic("/base/scan").at("end")
+        before = scan.raw
+        with pytest.raises(TypeError, match="read-only"):
+            scan.payload[0] = 1
+        with pytest.raises(ValueError, match="read-only"):
+            scan.decode().ranges[0] = 1.0
+        assert opened.topic("/base/scan").at("end").raw == before
+
+
+# What is kept.
+
+
+def chunk(number: int, size: int) -> StoredChunk:
+    one = np.zeros(1, np.int64)
+    batch = Batch(
+        bytearray(size), one, one + size, np.zeros(1, np.int32), one, one, one.astype(np.uint32)
+    )
+    return StoredChunk(0, number, size, 0, batch, one, size)
+
+
+class Reading:
+    """Counts what is read."""
+
+    def __init__(self, chunks: RecentChunks) -> None:
+        self._chunks = chunks
+        self.read: list[int] = []
+
+    def get(self, number: int, size: int = 1000) -> StoredChunk:
+        def read() -> StoredChunk:
+            self.read.append(number)
+            return chunk(number, size)
+
+        return self._chunks.get(("a", 0, number), read)
+
+
+def test_those_that_were_not_asked_for_longest_go_first() -> None:
+    reading = Reading(RecentChunks(3500))
+    for number in (1, 2, 3, 1, 4, 1, 2):
+        assert reading.get(number).offset == number
+    assert reading.read == [1, 2, 3, 4, 2]  # 2 had to go for 4
+
+
+def test_a_chunk_without_room_is_given_and_not_kept() -> None:
+    reading = Reading(RecentChunks(3500))
+    reading.get(1)
+    assert len(reading.get(2, size=4000).batch.buffer) == 4000
+    assert reading.get(2, size=4000).offset == 2
+    assert reading.get(1).offset == 1
+    assert reading.read == [1, 2, 2]
+
+
+def test_nothing_is_kept_of_what_could_not_be_read() -> None:
+    chunks = RecentChunks()
+
+    def damaged() -> StoredChunk:
+        raise SegmentError("damaged")
+
+    for _ in range(2):
+        with pytest.raises(SegmentError):
+            chunks.get(("a", 0, 1), damaged)
+    assert Reading(chunks).get(1).offset == 1
+
+
+def test_several_threads_ask_for_the_same_chunks() -> None:
+    chunks = RecentChunks(5500)
+    wrong: list[int] = []
+
+    def ask(seed: int) -> None:
+        reading = Reading(chunks)
+        numbers = np.random.default_rng(seed).integers(0, 10, 2000).tolist()
+        wrong.extend(number for number in numbers if reading.get(number).offset != number)
+
+    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    kept = Reading(chunks)
+    for number in range(10):
+        kept.get(number)
+    assert len(kept.read) >= 5  # no more than five had room
+
+
+def test_a_segment_is_read_where_its_chunk_lies(
+    many: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The chunks before a time are not read one after the other."""
+    read = []
+    whole = SegmentReader.read_chunk
+
+    def counted(self: SegmentReader, place: object) -> StoredChunk:
+        read.append(place)
+        return whole(self, place)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(SegmentReader, "read_chunk", counted)
+    for moment in (150, 20, 90):  # the first question, the second, and one that knows all
+        assert many.topic("/state").at(f"+{moment}s").fields["n"] == moment
+    assert len(read) == 3
