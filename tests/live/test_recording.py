@@ -209,6 +209,7 @@ writing = False
 def interrupt(*_):
     if writing:
         raise KeyboardInterrupt
+    signal.setitimer(signal.ITIMER_REAL, 0.0005)  # it came too early, and none would follow
 
 signal.signal(signal.SIGALRM, interrupt)
 with hl.open(sys.argv[1], create=True) as store:
