@@ -403,12 +403,7 @@ class Query:
             UsageError: the question has a time range, or another clock than the log's.
         """
         found = self.at(moment)
-        return self._with(
-            recording_ids=(found.recording,),
-            _bounds=(f"{found.log_time_ns}ns", f"{found.log_time_ns + 1}ns"),
-            _reverse=True,
-            _limit=1,
-        )
+        return self._last_within(found.recording, found.log_time_ns, found.log_time_ns)
 
     def at(self, moment: TimeLike) -> Message:
         """The message that `just_at` asks for. Its arrays are read-only: copy what is to change.
@@ -459,16 +454,15 @@ class Query:
             if lane.channel.topic in wanted
         }
 
-        def read(entry: ChunkEntry) -> StoredChunk:
-            return self.store.recent_chunks.get(
-                (recording.id, entry.segment, entry.offset), partial(load, entry)
-            )
-
         def load(entry: ChunkEntry) -> StoredChunk:
             chunk = self.store.segment(recording.id, entry.segment).read_chunk(entry.place)
             self.counters.chunks_read += 1
             self.counters.bytes_read += chunk.length + chunk.trailer
             return chunk
+
+        def read(entry: ChunkEntry) -> StoredChunk:
+            key = recording.id, entry.segment, entry.offset
+            return self.store.recent_chunks.get(key, partial(load, entry))
 
         chunks = self.store.chunks_before(recording, list(lanes), span)
         found = last_message(chunks, lanes, span[1], read)
@@ -485,17 +479,21 @@ class Query:
     ) -> Message | None:
         start, latest = span
         for begin in earlier_and_earlier(latest, start):
-            query = self._with(
-                recording_ids=(recording.id,),
-                _bounds=(f"{begin}ns", f"{latest + 1}ns"),
-                _reverse=True,
-                _limit=1,
-            )
+            query = self._last_within(recording.id, begin, latest)
             found = next(iter(query), None)
             self.counters.add(query.counters)
             if found is not None:
                 return found
         return None
+
+    def _last_within(self, recording: str, begin: int, latest: int) -> Query:
+        """The question about the last message of a recording in `[begin, latest]`, ns."""
+        return self._with(
+            recording_ids=(recording,),
+            _bounds=(f"{begin}ns", f"{latest + 1}ns"),
+            _reverse=True,
+            _limit=1,
+        )
 
     # Answers.
 

@@ -320,7 +320,8 @@ class Store:
         """
         entries = (*self.recordings(), *others)
         used = {c.schema for r in entries for c in r.channels if c.schema is not None}
-        self._schemas = Catalog(self.database_for("A schema")).schemas(used)
+        if used:  # of a new store there is nothing to ask for
+            self._schemas = Catalog(self.database_for("A schema")).schemas(used)
 
     # Asking.
 

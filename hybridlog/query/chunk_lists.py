@@ -10,6 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
 
+    Fetch = Callable[[tuple[int, int] | None], list[ChunkEntry]]
+    """Asks the database for the chunks of some channels in a time range, or in all times."""
+
 _MOST = 20_000  # entries that are kept of one recording, about 1 kB each
 _BACK_NS = 1_000_000_000  # the last message by a time is looked for so far back first,
 _FURTHER = 64  # and then so many times as far
@@ -33,7 +36,7 @@ class ChunkLists:
         recording: str,
         channels: Sequence[int],
         bounds: tuple[int, int],
-        fetch: Callable[[tuple[int, int] | None], list[ChunkEntry]],
+        fetch: Fetch,
     ) -> list[ChunkEntry]:
         """Chunks that may hold messages of some channels in a time range.
 
@@ -52,7 +55,7 @@ class ChunkLists:
         recording: str,
         channels: Sequence[int],
         span: tuple[int, int],
-        fetch: Callable[[tuple[int, int] | None], list[ChunkEntry]],
+        fetch: Fetch,
     ) -> Iterator[tuple[ChunkEntry, int]]:
         """Chunks that may hold the last message of some channels by a time, for `latest`.
 
@@ -77,7 +80,7 @@ class ChunkLists:
         self,
         recording: str,
         channels: frozenset[int],
-        fetch: Callable[[tuple[int, int] | None], list[ChunkEntry]],
+        fetch: Fetch,
     ) -> _ChunkList | None:
         """The chunks of some channels; None at the first question, and when they are too many."""
         key = recording, channels
