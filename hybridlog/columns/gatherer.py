@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import logging
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,6 +46,9 @@ _PART = 1000  # bytes that a part of a topic takes besides its columns
 _RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
 _log = logging.getLogger(__name__)
 
+_Place = tuple[int, int]
+"""Of a chunk: its segment, and the byte in that."""
+
 
 class _Held(NamedTuple):
     """Messages that were collected: places of payloads, channels, log times, arrival numbers."""
@@ -64,6 +69,31 @@ class _Held(NamedTuple):
         )
 
 
+@dataclass(slots=True)
+class _Stretch:
+    """Chunks that lie one after the other: the place of the first, and where the last ends."""
+
+    begin: _Place
+    end: _Place
+
+
+class _Part(NamedTuple):
+    """Messages of a topic out of a stretch."""
+
+    stretch: _Stretch
+    order: Order
+    fields: dict[str, Single]
+
+
+class _Run(NamedTuple):
+    """Rows of a topic that were laid down together: log times and arrival of first and last."""
+
+    place: _Place
+    first: tuple[int, int]
+    last: tuple[int, int]
+    is_ordered: bool
+
+
 class _Topic:
     """What is known of a topic; without `types` there is nothing but the order of its messages."""
 
@@ -72,9 +102,8 @@ class _Topic:
         self.types = types_of(self.codec) if channel.message_encoding in SINGLE_READ else {}
         self.is_wanted = True
         self.rows = 0
-        self.is_ordered = True
-        self.pending: list[tuple[Order, dict[str, Single]]] = []
-        self._last = -1, -1
+        self.pending: list[_Part] = []
+        self._runs: list[_Run] = []
 
     def give_up(self) -> None:
         """Have no columns of it."""
@@ -93,32 +122,45 @@ class _Topic:
         if codec_for(channel) is not self.codec:
             self.give_up()
 
-    def add(self, order: Order, fields: dict[str, Single]) -> None:
-        """More of its messages."""
-        self.pending.append((order, fields))
-        self.rows += len(order.seq)
-        first = int(order.log_time[0]), int(order.seq[0])
-        self.is_ordered = self.is_ordered and self._last < first and order.is_kept
-        self._last = int(order.log_time[-1]), int(order.seq[-1])
+    @property
+    def is_ordered(self) -> bool:
+        """Whether its rows, by their places, are by log time and arrival."""
+        runs = sorted(self._runs)
+        return all(run.is_ordered for run in runs) and all(
+            run.last < following.first for run, following in pairwise(runs)
+        )
 
-    def take(self) -> dict[str, Values]:
-        """The columns that were not laid down yet."""
-        orders, fields = zip(*self.pending, strict=True)
-        self.pending.clear()
-        columns: dict[str, Values] = {
-            LOG_TIME: np.concatenate([order.log_time for order in orders]),
-            SEQ: np.concatenate([order.seq for order in orders]),
-        }
-        for path in self.types:
-            columns[path] = values_of(concatenate([part[path] for part in fields]))
-        return columns
+    def add(self, part: _Part) -> None:
+        """More of its messages."""
+        self.pending.append(part)
+        self.rows += len(part.order.seq)
+
+    def take(self, run_of: Mapping[_Place, _Place]) -> Iterator[tuple[_Place, dict[str, Values]]]:
+        """The columns that were not laid down yet, each run's, and the place of the run.
+
+        Args:
+            run_of: Place of the run to which a stretch belongs, by where that begins.
+        """
+        parts, self.pending = self.pending, []
+        parts.sort(key=lambda part: part.stretch.begin)
+        for place, run in groupby(parts, lambda part: run_of[part.stretch.begin]):
+            _, orders, fields = zip(*run, strict=True)
+            order = Order(*(np.concatenate(column) for column in zip(*orders, strict=True)))
+            first, last = ((int(order.log_time[n]), int(order.seq[n])) for n in (0, -1))
+            self._runs.append(_Run(place, first, last, order.is_kept))
+            columns: dict[str, Values] = {LOG_TIME: order.log_time, SEQ: order.seq}
+            for path in self.types:
+                columns[path] = values_of(concatenate([part[path] for part in fields]))
+            yield place, columns
 
 
 class FieldGatherer:
     """Collects the order of a recording's messages, and fields of small ones, while it is indexed.
 
-    Payloads are put together until there are enough of them to be decoded by columns. Where
-    anything does not fit there are no columns of a topic; where anything fails, or the disk
+    Payloads are put together until there are enough of them to be decoded by columns. Chunks
+    may come in any order, as those do that were let go and read back: what is laid down ends
+    where one is missing, so that its columns can have their place in between. Where anything
+    does not fit there are no columns of a topic; where anything fails, or the disk
     is nearly full, there are none at all. Neither is a loss: the index has the same.
 
     Args:
@@ -134,6 +176,8 @@ class FieldGatherer:
         self._filled = 0
         self._rows = 0
         self._held: list[_Held] = []
+        self._stretch: _Stretch | None = None  # that of the last chunk
+        self._stretches: list[_Stretch] = []  # of which something was not laid down yet
         self._channels: dict[int, Channel] = {}
         self._topics: dict[str, _Topic] = {}
 
@@ -150,7 +194,6 @@ class FieldGatherer:
             entry: The whole recording.
         """
         with self._harmless():
-            self._decode()
             self._flush()
             whole = {
                 name: {ORDERED: topic.is_ordered, RECORDING: entry.key}
@@ -188,12 +231,31 @@ class FieldGatherer:
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch = chunk.batch
         self._channels.update(channels)
+        self._place(chunk)
         if not is_small(batch.payload_bytes, len(batch)):
             whole = _Held(batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq)
             for topic, held in self._by_topic(whole):
                 topic.give_up_fields()
                 self._add_order(topic, held)
+        else:
+            self._collect(chunk)
+        if self._pending >= _PENDING:
+            self._flush()
+
+    def _place(self, chunk: StoredChunk) -> None:
+        """Find out whether a chunk follows the last one; else what is put together ends here."""
+        begin, size = (chunk.segment, chunk.offset), chunk.length + chunk.trailer
+        end = chunk.segment, chunk.offset + size
+        if self._stretch is not None and self._stretch.end == begin:
+            self._stretch.end = end
             return
+        self._decode()
+        self._stretch = _Stretch(begin, end)
+        self._stretches.append(self._stretch)
+
+    def _collect(self, chunk: StoredChunk) -> None:
+        """Put the payloads of a chunk to those that wait to be decoded."""
+        batch = chunk.batch
         begin = int(batch.offset.min())
         size = int((batch.offset + batch.length).max()) - begin
         if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:
@@ -270,14 +332,17 @@ class FieldGatherer:
             self._lay(topic, held, {})
 
     def _lay(self, topic: _Topic, held: _Held, fields: dict[str, Single]) -> None:
-        topic.add(Order(held.log_time, held.seq), fields)
+        assert self._stretch is not None
+        topic.add(_Part(self._stretch, Order(held.log_time, held.seq), fields))
         self._pending += held.seq.nbytes * 2 + sum(map(nbytes, fields.values())) + _PART
-        if self._pending >= _PENDING:
-            self._flush()
 
     def _flush(self) -> None:
-        """Lay down what was decoded."""
+        """Lay down all that was collected."""
+        self._decode()
         self._pending = 0
+        run_of = _runs(self._stretches)
+        self._stretch = None
+        self._stretches.clear()
         waiting = [(name, topic) for name, topic in self._topics.items() if topic.pending]
         if not waiting:
             return
@@ -286,7 +351,21 @@ class FieldGatherer:
         if self._writer is None:
             self._writer = ColumnFileWriter(self._path)
         for name, topic in waiting:
-            self._writer.append(name, topic.take())
+            for place, columns in topic.take(run_of):
+                self._writer.append(name, columns, place)
+
+
+def _runs(stretches: Iterable[_Stretch]) -> dict[_Place, _Place]:
+    """Where the run begins to which each stretch belongs: no chunk is missing between its own."""
+    found: dict[_Place, _Place] = {}
+    last: _Stretch | None = None
+    for stretch in sorted(stretches, key=lambda one: one.begin):
+        if last is not None and last.end == stretch.begin:
+            found[stretch.begin] = found[last.begin]
+        else:
+            found[stretch.begin] = stretch.begin
+        last = stretch
+    return found
 
 
 def _apart(column: Single, data: NDArray[np.uint8]) -> Single:

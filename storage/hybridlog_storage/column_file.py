@@ -90,19 +90,24 @@ class ColumnFileWriter:
         self._tables: dict[str, dict[str, str]] = {}
         self._numbers: dict[str, int] = {}
         self._blocks = bytearray()
+        self._places: list[tuple[int, int]] = []  # of each block's rows
         try:
             self._write([MAGIC])
         except OSError:
             self.discard()
             raise
 
-    def append(self, table: str, columns: Mapping[str, Values]) -> None:
+    def append(
+        self, table: str, columns: Mapping[str, Values], place: tuple[int, int] = (0, 0)
+    ) -> None:
         """Add rows to a table.
 
         Args:
             table: Its name.
             columns: By name, all of the same number of rows; the same names and types each
                 time.
+            place: Where they belong: after rows of a lower place and, of the same one, after
+                those that were added before.
 
         Raises:
             OSError: They cannot be written.
@@ -115,7 +120,7 @@ class ColumnFileWriter:
         offset = self._end
         everything: list[Any] = []
         blocks: list[tuple[int, ...]] = []
-        for place, values in enumerate(columns.values()):
+        for column, values in enumerate(columns.values()):
             rows = _rows(values)
             same = rows > 1 and _is_same(values)
             parts = _packed(values, 1 if same else rows)
@@ -123,10 +128,11 @@ class ColumnFileWriter:
             crc = 0
             for part in parts:
                 crc = crc32(part, crc)
-            blocks.append((number, place, rows, same, offset, size, crc, 0))
+            blocks.append((number, column, rows, same, offset, size, crc, 0))
             everything += parts
             offset += size
         self._blocks += np.array(blocks, _ENTRY).tobytes()
+        self._places += [place] * len(blocks)
         self._write(everything)
 
     def close(self, tables: Mapping[str, Mapping[str, object]]) -> None:
@@ -140,7 +146,8 @@ class ColumnFileWriter:
         """
         kept = [name for name in self._tables if name in tables]
         numbers = {self._numbers[name]: place for place, name in enumerate(kept)}
-        blocks = np.frombuffer(self._blocks, _ENTRY)
+        in_order = sorted(range(len(self._places)), key=self._places.__getitem__)
+        blocks = np.frombuffer(self._blocks, _ENTRY)[in_order]
         renumbered = np.full(len(self._numbers), -1, np.int64)
         renumbered[list(numbers)] = list(numbers.values())
         blocks = blocks[renumbered[blocks["table"]] >= 0]

@@ -448,6 +448,42 @@ def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Pa
     assert not list(place.iterdir())
 
 
+@pytest.mark.parametrize("pending", [1, 3000, 16 << 20])
+@pytest.mark.parametrize("seed", range(6))
+def test_chunks_may_come_in_any_order(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pending: int, seed: int
+) -> None:
+    """Chunks that were let go come last; their rows have their place all the same."""
+    name = live(store, 200, settings=SegmentSettings(chunk_size=1024, segment_size=8192))
+    (entry,) = store.recordings()
+    channels = {lane.channel_id: lane.channel for lane in store.lanes(entry)}
+    chunks = list(store.catalog.chunks(name))
+    assert len({chunk.segment for chunk in chunks}) > 2
+    shuffled = chunks[seed // 2 :: 2] + chunks[: seed // 2] + chunks[seed // 2 + 1 :: 2]
+    if seed % 2:
+        np.random.default_rng(seed).shuffle(shuffled)
+    assert shuffled != chunks
+    assert len(shuffled) == len(chunks)
+    monkeypatch.setattr(gathering, "_PENDING", pending)
+    (tmp_path / "again").mkdir()
+    gatherer = FieldGatherer(tmp_path / "again")
+    for chunk in shuffled:
+        gatherer.add(store.segment(name, chunk.segment).read_chunk(chunk.place), channels)
+    gatherer.close(entry)
+    found, file = FieldColumns(tmp_path / "again"), column_file.ColumnFile(file_of(store, name))
+    for topic in ("/state", "/other"):
+        assert found._file.notes(topic) == file.notes(topic)
+        assert file.notes(topic)["ordered"] is True
+        for column in file.types(topic):
+            have, want = found._file.read(topic, column), file.read(topic, column)
+            if isinstance(want, column_file.Text):
+                assert isinstance(have, column_file.Text)
+                assert [part.tolist() for part in have] == [part.tolist() for part in want]
+            else:
+                assert have.tolist() == want.tolist()
+    found.check(entry)
+
+
 IMAGE = Channel("/image", "ros1", Schema("test/Image", "ros1msg", b"uint32 width\nuint8[] data"))
 
 

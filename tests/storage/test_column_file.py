@@ -137,6 +137,29 @@ def test_what_was_written_is_read(
                 )
 
 
+@given(part=tables(), places=st.lists(st.tuples(*[st.integers(0, 2)] * 2), min_size=3, max_size=3))
+def test_rows_have_their_place(
+    tmp_path_factory: pytest.TempPathFactory, part: list[Any], places: list[tuple[int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("columns") / "some"
+    writer = ColumnFileWriter(path)
+    placed = list(zip(part, places, strict=False))
+    for columns, place in placed:
+        writer.append("other", columns, place)
+        writer.append("one", columns, place)
+    writer.close({"one": {}})
+    in_order = [columns for columns, _ in sorted(placed, key=lambda one: one[1])]
+    file, wanted = ColumnFile(path), path.with_name("wanted")
+    writer = ColumnFileWriter(wanted)
+    for columns in in_order:
+        writer.append("one", columns)
+    writer.close({"one": {}})
+    for name in part[0]:
+        have, want = file.read("one", name), ColumnFile(wanted).read("one", name)
+        assert bits(have) == bits(want)
+    assert repr(plain(path)) == repr(plain(wanted))
+
+
 def some(path: Path) -> dict[str, Values]:
     columns: dict[str, Values] = {
         "x": np.linspace(0, 1, 50),
