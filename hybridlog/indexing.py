@@ -364,6 +364,8 @@ class IndexWriter:
             int(chunk.batch.log_time.max()),
             (),
         )
+        if self._gatherer is not None:
+            self._gatherer.expect(chunk.segment, chunk.offset)
         self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch)))
 
     def _catch_up(self) -> None:

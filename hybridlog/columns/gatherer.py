@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import logging
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+import threading
+from bisect import bisect, bisect_left, insort
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
 _ARENA = 2 << 20  # bytes of payloads that are put together to be decoded; caches hold no more
 _ENOUGH = 1 << 20  # a chunk of so many is decoded where it is
 _ROWS = 1 << 18  # messages that are put together
-_PENDING = 16 << 20  # bytes of columns that are laid down together: many small blocks cost memory
+_PENDING = 16 << 20  # bytes of columns that wait to be laid down: many small blocks cost time
+_LEFT = _PENDING // 4  # of the smallest topics, which go on waiting until there is more of them
 _PART = 1000  # bytes that a part of a topic takes besides its columns
 _RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
 _log = logging.getLogger(__name__)
@@ -51,8 +53,12 @@ _Place = tuple[int, int]
 
 
 class _Held(NamedTuple):
-    """Messages that were collected: places of payloads, channels, log times, arrival numbers."""
+    """Messages that were collected: offsets of payloads, channels, log times, arrival numbers.
 
+    No chunk is missing between those that they are from; `place` is the first one's.
+    """
+
+    place: _Place
     offset: NDArray[np.int64]
     length: NDArray[np.int64]
     channel: NDArray[np.int32]
@@ -61,6 +67,7 @@ class _Held(NamedTuple):
 
     def take(self, rows: NDArray[np.intp]) -> _Held:
         return _Held(
+            self.place,
             self.offset[rows],
             self.length[rows],
             self.channel[rows],
@@ -69,18 +76,10 @@ class _Held(NamedTuple):
         )
 
 
-@dataclass(slots=True)
-class _Stretch:
-    """Chunks that lie one after the other: the place of the first, and where the last ends."""
-
-    begin: _Place
-    end: _Place
-
-
 class _Part(NamedTuple):
-    """Messages of a topic out of a stretch."""
+    """Messages of a topic out of chunks between which none is missing; the first one's place."""
 
-    stretch: _Stretch
+    place: _Place
     order: Order
     fields: dict[str, Single]
 
@@ -102,14 +101,17 @@ class _Topic:
         self.types = types_of(self.codec) if channel.message_encoding in SINGLE_READ else {}
         self.is_wanted = True
         self.rows = 0
-        self.pending: list[_Part] = []
-        self._runs: list[_Run] = []
+        self.pending = 0
+        """Bytes of its columns that were not laid down yet."""
+        self._parts: list[_Part] = []
+        self._runs: list[_Run] = []  # by their places
 
     def give_up(self) -> None:
         """Have no columns of it."""
         self.is_wanted = False
         self.types = {}
-        self.pending.clear()
+        self.pending = 0
+        self._parts.clear()
 
     def give_up_fields(self) -> None:
         """Have only the order of its messages: of all of them, or of none."""
@@ -125,29 +127,36 @@ class _Topic:
     @property
     def is_ordered(self) -> bool:
         """Whether its rows, by their places, are by log time and arrival."""
-        runs = sorted(self._runs)
-        return all(run.is_ordered for run in runs) and all(
-            run.last < following.first for run, following in pairwise(runs)
+        return all(run.is_ordered for run in self._runs) and all(
+            run.last < following.first for run, following in pairwise(self._runs)
         )
 
-    def add(self, part: _Part) -> None:
-        """More of its messages."""
-        self.pending.append(part)
+    def add(self, part: _Part) -> int:
+        """More of its messages; returns the bytes of their columns."""
+        self._parts.append(part)
         self.rows += len(part.order.seq)
+        size = part.order.seq.nbytes * 2 + sum(map(nbytes, part.fields.values())) + _PART
+        self.pending += size
+        return size
 
-    def take(self, run_of: Mapping[_Place, _Place]) -> Iterator[tuple[_Place, dict[str, Values]]]:
-        """The columns that were not laid down yet, each run's, and the place of the run.
+    def take(self, missing: list[_Place]) -> Iterator[tuple[_Place, dict[str, Values]]]:
+        """The columns that were not laid down yet: those of each run, and its place.
 
         Args:
-            run_of: Place of the run to which a stretch belongs, by where that begins.
+            missing: Places of chunks that are still to come, in order.
         """
-        parts, self.pending = self.pending, []
-        parts.sort(key=lambda part: part.stretch.begin)
-        for place, run in groupby(parts, lambda part: run_of[part.stretch.begin]):
-            _, orders, fields = zip(*run, strict=True)
+        parts, self._parts, self.pending = self._parts, [], 0
+        parts.sort(key=lambda part: part.place)
+        laid = [run.place for run in self._runs]
+
+        def run_of(part: _Part) -> tuple[int, int]:
+            return bisect(missing, part.place), bisect(laid, part.place)
+
+        for _, run in groupby(parts, run_of):
+            (place, *_), orders, fields = zip(*run, strict=True)
             order = Order(*(np.concatenate(column) for column in zip(*orders, strict=True)))
             first, last = ((int(order.log_time[n]), int(order.seq[n])) for n in (0, -1))
-            self._runs.append(_Run(place, first, last, order.is_kept))
+            insort(self._runs, _Run(place, first, last, order.is_kept))
             columns: dict[str, Values] = {LOG_TIME: order.log_time, SEQ: order.seq}
             for path in self.types:
                 columns[path] = values_of(concatenate([part[path] for part in fields]))
@@ -171,15 +180,22 @@ class FieldGatherer:
         self._path = recording / NAME
         self._writer: ColumnFileWriter | None = None
         self._ended = False
-        self._pending = 0
+        self._pending = 0  # bytes of columns that were not laid down yet
         self._arena: NDArray[np.uint8] | None = None
         self._filled = 0
         self._rows = 0
         self._held: list[_Held] = []
-        self._stretch: _Stretch | None = None  # that of the last chunk
-        self._stretches: list[_Stretch] = []  # of which something was not laid down yet
+        self._last: _Place = 0, 0  # of all chunks that were taken
+        self._begins: list[_Place] = []  # of those that did not follow the one before, in order
+        self._missing: list[_Place] = []  # in order
+        self._lock = threading.Lock()  # of what is missing
         self._channels: dict[int, Channel] = {}
         self._topics: dict[str, _Topic] = {}
+
+    def expect(self, segment: int, offset: int) -> None:
+        """A chunk comes later than those behind it. Thread safe."""
+        with self._lock:
+            insort(self._missing, (segment, offset))
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Take what is in a chunk; its buffer is not needed any more afterwards."""
@@ -194,7 +210,7 @@ class FieldGatherer:
             entry: The whole recording.
         """
         with self._harmless():
-            self._flush()
+            self._flush(left=0)
             whole = {
                 name: {ORDERED: topic.is_ordered, RECORDING: entry.key}
                 for name, topic in self._topics.items()
@@ -231,27 +247,29 @@ class FieldGatherer:
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch = chunk.batch
         self._channels.update(channels)
-        self._place(chunk)
+        if not self._follows(_place(chunk)):
+            self._decode()
         if not is_small(batch.payload_bytes, len(batch)):
-            whole = _Held(batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq)
-            for topic, held in self._by_topic(whole):
+            for topic, held in self._by_topic(_Held(_place(chunk), *_columns(chunk))):
                 topic.give_up_fields()
                 self._add_order(topic, held)
         else:
             self._collect(chunk)
         if self._pending >= _PENDING:
-            self._flush()
+            self._flush(left=_LEFT)
 
-    def _place(self, chunk: StoredChunk) -> None:
-        """Find out whether a chunk follows the last one; else what is put together ends here."""
-        begin, size = (chunk.segment, chunk.offset), chunk.length + chunk.trailer
-        end = chunk.segment, chunk.offset + size
-        if self._stretch is not None and self._stretch.end == begin:
-            self._stretch.end = end
-            return
-        self._decode()
-        self._stretch = _Stretch(begin, end)
-        self._stretches.append(self._stretch)
+    def _follows(self, place: _Place) -> bool:
+        """Whether a chunk comes after the last one: none is missing, or was before, in between."""
+        last, self._last = self._last, place
+        with self._lock:
+            before = bisect_left(self._missing, place)
+            if place in self._missing[before : before + 1]:
+                del self._missing[before]
+            follows = last < place and bisect(self._missing, last) == before
+        if follows and bisect(self._begins, last) == bisect(self._begins, place):
+            return True
+        insort(self._begins, place)
+        return False
 
     def _collect(self, chunk: StoredChunk) -> None:
         """Put the payloads of a chunk to those that wait to be decoded."""
@@ -261,16 +279,10 @@ class FieldGatherer:
         if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:
             self._decode()
         data = np.frombuffer(batch.buffer, np.uint8, size, begin)
-        self._held.append(
-            # Copies: what is held must not keep the buffers of chunks from being used again.
-            _Held(
-                batch.offset + (self._filled - begin),
-                batch.length.copy(),
-                batch.channel.copy(),
-                batch.log_time.copy(),
-                chunk.seq.copy(),
-            )
-        )
+        offset, *others = _columns(chunk)
+        # Copies: what is held must not keep the buffers of chunks from being used again.
+        copies = [column.copy() for column in others]
+        self._held.append(_Held(_place(chunk), offset + (self._filled - begin), *copies))
         if size >= _ENOUGH:
             self._decode(data)
             return
@@ -287,7 +299,8 @@ class FieldGatherer:
         if data is None:
             assert self._arena is not None
             data = self._arena[: self._filled]
-        held = _Held(*(np.concatenate(parts) for parts in zip(*self._held, strict=True)))
+        (place, *_), *columns = zip(*self._held, strict=True)
+        held = _Held(place, *map(np.concatenate, columns))
         self._held.clear()
         self._filled = self._rows = 0
         for topic, part in self._by_topic(held):
@@ -332,40 +345,34 @@ class FieldGatherer:
             self._lay(topic, held, {})
 
     def _lay(self, topic: _Topic, held: _Held, fields: dict[str, Single]) -> None:
-        assert self._stretch is not None
-        topic.add(_Part(self._stretch, Order(held.log_time, held.seq), fields))
-        self._pending += held.seq.nbytes * 2 + sum(map(nbytes, fields.values())) + _PART
+        self._pending += topic.add(_Part(held.place, Order(held.log_time, held.seq), fields))
 
-    def _flush(self) -> None:
-        """Lay down all that was collected."""
+    def _flush(self, *, left: int) -> None:
+        """Lay down what was collected, the largest topics first, but for so many bytes."""
         self._decode()
-        self._pending = 0
-        run_of = _runs(self._stretches)
-        self._stretch = None
-        self._stretches.clear()
-        waiting = [(name, topic) for name, topic in self._topics.items() if topic.pending]
-        if not waiting:
-            return
-        if shutil.disk_usage(self._path.parent).free < _RESERVE:
-            raise OSError(errno.ENOSPC, "the disk is nearly full")
-        if self._writer is None:
-            self._writer = ColumnFileWriter(self._path)
-        for name, topic in waiting:
-            for place, columns in topic.take(run_of):
+        with self._lock:
+            missing = self._missing.copy()
+        self._pending = sum(topic.pending for topic in self._topics.values())
+        for name, topic in sorted(self._topics.items(), key=lambda item: -item[1].pending):
+            if self._pending <= left:
+                return
+            if shutil.disk_usage(self._path.parent).free < _RESERVE:
+                raise OSError(errno.ENOSPC, "the disk is nearly full")
+            if self._writer is None:
+                self._writer = ColumnFileWriter(self._path)
+            self._pending -= topic.pending
+            for place, columns in topic.take(missing):
                 self._writer.append(name, columns, place)
 
 
-def _runs(stretches: Iterable[_Stretch]) -> dict[_Place, _Place]:
-    """Where the run begins to which each stretch belongs: no chunk is missing between its own."""
-    found: dict[_Place, _Place] = {}
-    last: _Stretch | None = None
-    for stretch in sorted(stretches, key=lambda one: one.begin):
-        if last is not None and last.end == stretch.begin:
-            found[stretch.begin] = found[last.begin]
-        else:
-            found[stretch.begin] = stretch.begin
-        last = stretch
-    return found
+def _place(chunk: StoredChunk) -> _Place:
+    return chunk.segment, chunk.offset
+
+
+def _columns(chunk: StoredChunk) -> tuple[NDArray[Any], ...]:
+    """What a chunk's messages are held by."""
+    batch = chunk.batch
+    return batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq
 
 
 def _apart(column: Single, data: NDArray[np.uint8]) -> Single:

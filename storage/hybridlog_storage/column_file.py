@@ -14,9 +14,11 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from itertools import accumulate
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -36,14 +38,12 @@ TEXT: Final = "text"
 _TAIL = struct.Struct("<QQI")  # bytes of the directory, number of blocks, checksum of both
 _ENTRY = np.dtype(
     [
-        ("table", "<u4"),
-        ("column", "<u4"),
         ("rows", "<u4"),
         ("same", "<u4"),
         ("offset", "<u8"),
         ("size", "<u8"),
         ("crc", "<u4"),
-        ("", "<u4"),
+        ("unused", "<u4"),
     ]
 )
 _TYPES = frozenset({"|b1", "|i1", "|u1", *(f"<{k}{n}" for k in "iu" for n in (2, 4, 8))})
@@ -88,9 +88,7 @@ class ColumnFileWriter:
         self._fd = os.open(self._part, flags, 0o644)
         self._end = 0
         self._tables: dict[str, dict[str, str]] = {}
-        self._numbers: dict[str, int] = {}
-        self._blocks = bytearray()
-        self._places: list[tuple[int, int]] = []  # of each block's rows
+        self._blocks: dict[str, list[_Rows]] = {}
         try:
             self._write([MAGIC])
         except OSError:
@@ -116,11 +114,10 @@ class ColumnFileWriter:
         types = {name: _type_of(values) for name, values in columns.items()}
         if self._tables.setdefault(table, types) != types:
             raise ValueError(f"other columns than before: {table}")
-        number = self._numbers.setdefault(table, len(self._numbers))
         offset = self._end
         everything: list[Any] = []
-        blocks: list[tuple[int, ...]] = []
-        for column, values in enumerate(columns.values()):
+        blocks: list[_Block] = []
+        for values in columns.values():
             rows = _rows(values)
             same = rows > 1 and _is_same(values)
             parts = _packed(values, 1 if same else rows)
@@ -128,11 +125,10 @@ class ColumnFileWriter:
             crc = 0
             for part in parts:
                 crc = crc32(part, crc)
-            blocks.append((number, column, rows, same, offset, size, crc, 0))
+            blocks.append(_Block(rows, same, offset, size, crc))
             everything += parts
             offset += size
-        self._blocks += np.array(blocks, _ENTRY).tobytes()
-        self._places += [place] * len(blocks)
+        self._blocks.setdefault(table, []).append(_Rows(place, np.array(blocks, _ENTRY)))
         self._write(everything)
 
     def close(self, tables: Mapping[str, Mapping[str, object]]) -> None:
@@ -145,29 +141,35 @@ class ColumnFileWriter:
             OSError: It cannot be written.
         """
         kept = [name for name in self._tables if name in tables]
-        numbers = {self._numbers[name]: place for place, name in enumerate(kept)}
-        in_order = sorted(range(len(self._places)), key=self._places.__getitem__)
-        blocks = np.frombuffer(self._blocks, _ENTRY)[in_order]
-        renumbered = np.full(len(self._numbers), -1, np.int64)
-        renumbered[list(numbers)] = list(numbers.values())
-        blocks = blocks[renumbered[blocks["table"]] >= 0]
-        blocks["table"] = renumbered[blocks["table"]]
+        parts = {
+            name: [rows.blocks for rows in sorted(self._blocks[name], key=lambda rows: rows.place)]
+            for name in kept
+        }
         directory = json.dumps(
             {
                 "tables": [
-                    {"name": name, "columns": [*self._tables[name].items()], "notes": tables[name]}
+                    {
+                        "name": name,
+                        "columns": [
+                            [column, kind, len(parts[name])]
+                            for column, kind in self._tables[name].items()
+                        ],
+                        "notes": tables[name],
+                    }
                     for name in kept
                 ]
             },
             separators=(",", ":"),
         ).encode()
-        crc = crc32(blocks.tobytes(), crc32(directory))
-        if len(directory) + blocks.nbytes > _MOST_DIRECTORY:
+        # Those of a column lie together.
+        blocks = b"".join(np.array(parts[name]).T.tobytes() for name in kept)
+        crc = crc32(blocks, crc32(directory))
+        if len(directory) + len(blocks) > _MOST_DIRECTORY:
             kept = []
         try:
             if kept:
-                tail = _TAIL.pack(len(directory), len(blocks), crc)
-                self._write([directory, blocks.tobytes(), tail, MAGIC])
+                tail = _TAIL.pack(len(directory), len(blocks) // _ENTRY.itemsize, crc)
+                self._write([directory, blocks, tail, MAGIC])
                 self._part.replace(self._path)
             else:
                 self._path.unlink(missing_ok=True)
@@ -222,7 +224,8 @@ class ColumnFile:
     def rows(self, table: str) -> int:
         """Rows of a table; 0 when there is none of that name."""
         found = self._tables.get(table)
-        return 0 if found is None else found.rows
+        # As many as its first column has.
+        return 0 if found is None else int(self._blocks_of(found, 0)["rows"].sum())
 
     def memory(self, table: str, column: str) -> int:
         """Bytes that a column takes when it has been read, without where its strings begin."""
@@ -253,18 +256,17 @@ class ColumnFile:
         Raises:
             StoreError: It is damaged.
         """
-        found, blocks = self._tables[table], self._of(table, column)
-        kind = found.types[column]
-        if int(blocks["rows"].sum()) != found.rows:
+        kind, entries = self._tables[table].types[column], self._of(table, column)
+        rows = self.rows(table)
+        if int(entries["rows"].sum()) != rows:
             raise self._damaged(f"rows of {column!r} of {table!r} are missing")
         if kind == TEXT:
-            return self._text(blocks)
-        values = np.empty(found.rows, kind)
+            return self._text(_blocks(entries))
+        values = np.empty(rows, kind)
         at = 0
-        for entry in blocks:
-            rows = int(entry["rows"])
-            self._fill(entry, values[at : at + rows])
-            at += rows
+        for block in _blocks(entries):
+            self._fill(block, values[at : at + block.rows])
+            at += block.rows
         return values
 
     def check(self) -> None:
@@ -275,8 +277,8 @@ class ColumnFile:
         """
         for table in self._tables:
             for column in self._tables[table].types:
-                for entry in self._of(table, column):
-                    self._raw(entry)
+                for block in _blocks(self._of(table, column)):
+                    self._raw(block)
 
     def _directory(self, size: int) -> tuple[dict[str, _Table], NDArray[np.void]]:
         least = len(MAGIC) * 2 + _TAIL.size
@@ -292,95 +294,79 @@ class ColumnFile:
         if crc32(data) != crc:
             raise self._damaged("the checksum of its directory differs")
         blocks = np.frombuffer(data[length:], _ENTRY)
+        tables: dict[str, _Table] = {}
+        end = 0
         try:
-            named = [
-                (
-                    str(table["name"]),
-                    [(str(name), str(kind)) for name, kind in table["columns"]],
-                    dict(table["notes"]),
-                )
-                for table in json.loads(data[:length])["tables"]
-            ]
+            for table in json.loads(data[:length])["tables"]:
+                name, columns = str(table["name"]), table["columns"]
+                names, kinds, counts = zip(*columns, strict=True)
+                types = dict(zip(names, kinds, strict=True))
+                if len(types) != len(columns) or name in tables or min(counts) < 0:
+                    raise self._damaged("its directory has a name twice, or fewer blocks than none")
+                if not _KNOWN.issuperset(kinds):
+                    raise self._damaged("its directory has types that are not known")
+                begins = list(accumulate(map(index, counts), initial=end))
+                end = begins[-1]
+                tables[name] = _Table(types, begins, dict(table["notes"]))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise self._damaged("its directory cannot be read") from error
+        blocks = np.frombuffer(data, _ENTRY, offset=length)
         ends = blocks["offset"] + blocks["size"]
         beyond = (ends < blocks["offset"]) | (ends > start) | (blocks["rows"] >= _MOST_ROWS)
-        if bool(beyond.any()):
+        if end != len(blocks) or bool(beyond.any()):
             raise self._damaged("its directory names places outside of it")
-        key = blocks["table"].astype(np.int64) << 32 | blocks["column"]
-        order = np.argsort(key, kind="stable")
-        self._keys, blocks = key[order], blocks[order]
-        # A table has as many rows as its first column.
-        first = np.arange(len(named), dtype=np.int64) << 32
-        begin, end = np.searchsorted(self._keys, [first, first + 1])
-        before = np.concatenate([np.zeros(1, np.int64), np.cumsum(blocks["rows"], dtype=np.int64)])
-        rows_of = (before[end] - before[begin]).tolist()
-        tables: dict[str, _Table] = {}
-        for number, (name, columns, notes) in enumerate(named):
-            types = dict(columns)
-            if not types or len(types) != len(columns) or name in tables:
-                raise self._damaged("its directory has a name twice, or none")
-            if not _KNOWN.issuperset(types.values()):
-                raise self._damaged("its directory has types that are not known")
-            tables[name] = _Table(number, types, rows_of[number], notes)
         return tables, blocks
-
-    def _range(self, table: int, column: int) -> slice:
-        """Where the blocks of a column are among all."""
-        key = table << 32 | column
-        return slice(*np.searchsorted(self._keys, [key, key + 1]).tolist())
 
     def _of(self, table: str, column: str) -> NDArray[np.void]:
         """The blocks of a column, in order."""
         found = self._tables[table]
-        blocks: NDArray[np.void] = self._blocks[
-            self._range(found.number, list(found.types).index(column))
-        ]
-        return blocks
+        return self._blocks_of(found, list(found.types).index(column))
 
-    def _fill(self, entry: np.void, values: NDArray[Any]) -> None:
+    def _blocks_of(self, table: _Table, column: int) -> NDArray[np.void]:
+        begin, end = table.begins[column : column + 2]
+        return self._blocks[begin:end]
+
+    def _fill(self, block: _Block, values: NDArray[Any]) -> None:
         """Rows of a block of numbers, read to where they belong."""
-        wanted = values.itemsize if entry["same"] else values.nbytes
-        if int(entry["size"]) != wanted:
-            raise self._damaged(f"the block at byte {entry['offset']} has the wrong length")
-        if entry["same"]:
-            values[:] = np.frombuffer(self._raw(entry), values.dtype)[0]
+        wanted = values.itemsize if block.same else values.nbytes
+        if block.size != wanted:
+            raise self._damaged(f"the block at byte {block.offset} has the wrong length")
+        if block.same:
+            values[:] = np.frombuffer(self._raw(block), values.dtype)[0]
             return
-        self._read_into(entry, values.view(np.uint8).data)
+        self._read_into(block, values.view(np.uint8).data)
 
-    def _text(self, blocks: NDArray[np.void]) -> Text:
+    def _text(self, blocks: Iterable[_Block]) -> Text:
         parts: list[NDArray[np.uint8]] = []
         lengths: list[NDArray[np.int64]] = []
-        for entry in blocks:
-            raw = np.frombuffer(self._raw(entry), np.uint8)
-            rows = int(entry["rows"])
-            if entry["same"]:
-                parts.append(np.tile(raw, rows))
-                lengths.append(np.full(rows, len(raw), np.int64))
+        for block in blocks:
+            raw = np.frombuffer(self._raw(block), np.uint8)
+            if block.same:
+                parts.append(np.tile(raw, block.rows))
+                lengths.append(np.full(block.rows, len(raw), np.int64))
                 continue
-            head = rows * 4
+            head = block.rows * 4
             each = raw[:head].view("<u4").astype(np.int64) if len(raw) >= head else None
             if each is None or int(each.sum()) != len(raw) - head:
-                raise self._damaged(f"the block at byte {entry['offset']} has the wrong length")
+                raise self._damaged(f"the block at byte {block.offset} has the wrong length")
             lengths.append(each)
             parts.append(raw[head:])
         offset = np.zeros(sum(map(len, lengths)) + 1, np.int64)
         np.cumsum(np.concatenate([np.empty(0, np.int64), *lengths]), out=offset[1:])
         return Text(np.concatenate([np.empty(0, np.uint8), *parts]), offset)
 
-    def _raw(self, entry: np.void) -> memoryview:
-        data = np.empty(int(entry["size"]), np.uint8).data
-        self._read_into(entry, data)
+    def _raw(self, block: _Block) -> memoryview:
+        data = np.empty(block.size, np.uint8).data
+        self._read_into(block, data)
         return data
 
-    def _read_into(self, entry: np.void, data: memoryview) -> None:
-        offset = int(entry["offset"])
+    def _read_into(self, block: _Block, data: memoryview) -> None:
         try:
-            count = os.preadv(self._fd, [data], offset)
+            count = os.preadv(self._fd, [data], block.offset)
         except OSError as error:
             raise self._damaged(f"it cannot be read: {error.strerror}") from error
-        if count != len(data) or crc32(data) != int(entry["crc"]):
-            raise self._damaged(f"the checksum of the block at byte {offset} differs")
+        if count != len(data) or crc32(data) != block.crc:
+            raise self._damaged(f"the checksum of the block at byte {block.offset} differs")
 
     def _read(self, offset: int, size: int) -> bytes:
         return os.pread(self._fd, size, offset)
@@ -390,10 +376,31 @@ class ColumnFile:
 
 
 class _Table(NamedTuple):
-    number: int
     types: dict[str, str]
-    rows: int
+    begins: list[int]  # where the blocks of each column begin among all, and where the last end
     notes: dict[str, object]
+
+
+class _Block(NamedTuple):
+    """An entry of the table of blocks."""
+
+    rows: int
+    same: int
+    offset: int
+    size: int
+    crc: int
+    unused: int = 0
+
+
+class _Rows(NamedTuple):
+    """Rows of a table that were added together: where they belong, a block a column."""
+
+    place: tuple[int, int]
+    blocks: NDArray[np.void]
+
+
+def _blocks(entries: NDArray[np.void]) -> Iterable[_Block]:
+    return map(_Block._make, entries.tolist())
 
 
 def _type_of(values: Values) -> str:

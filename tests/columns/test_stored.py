@@ -448,10 +448,17 @@ def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Pa
     assert not list(place.iterdir())
 
 
-@pytest.mark.parametrize("pending", [1, 3000, 16 << 20])
+@pytest.mark.parametrize(
+    ("pending", "left"), [(1, 0), (6000, 0), (12_000, 6000), (16 << 20, 4 << 20)]
+)
 @pytest.mark.parametrize("seed", range(6))
 def test_chunks_may_come_in_any_order(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pending: int, seed: int
+    store: hl.Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    pending: int,
+    left: int,
+    seed: int,
 ) -> None:
     """Chunks that were let go come last; their rows have their place all the same."""
     name = live(store, 200, settings=SegmentSettings(chunk_size=1024, segment_size=8192))
@@ -465,12 +472,23 @@ def test_chunks_may_come_in_any_order(
     assert shuffled != chunks
     assert len(shuffled) == len(chunks)
     monkeypatch.setattr(gathering, "_PENDING", pending)
+    monkeypatch.setattr(gathering, "_LEFT", left)
     (tmp_path / "again").mkdir()
     gatherer = FieldGatherer(tmp_path / "again")
-    for chunk in shuffled:
+    told = set()
+    for n, chunk in enumerate(shuffled):
+        for later in shuffled[n + 1 :]:
+            place = later.segment, later.offset
+            if place < (chunk.segment, chunk.offset) and place not in told:
+                gatherer.expect(*place)
+                told.add(place)
         gatherer.add(store.segment(name, chunk.segment).read_chunk(chunk.place), channels)
     gatherer.close(entry)
+    assert told
     found, file = FieldColumns(tmp_path / "again"), column_file.ColumnFile(file_of(store, name))
+    if pending > 1 << 20:
+        # When all had come, nothing was missing any more.
+        assert len(found._file._blocks) == len(file._blocks) == 2 + 10 + 2 + 1
     for topic in ("/state", "/other"):
         assert found._file.notes(topic) == file.notes(topic)
         assert file.notes(topic)["ordered"] is True

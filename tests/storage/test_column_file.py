@@ -45,18 +45,19 @@ def plain(path: Path) -> dict[str, dict[str, list[Any]]]:
     assert content.endswith(magic)
     at = len(content) - 8 - 20
     length, count, crc = struct.unpack_from("<QQI", content, at)
-    start = at - 40 * count - length
+    start = at - 32 * count - length
     assert zlib.crc32(content[start:at]) == crc
     tables = json.loads(content[start : start + length])["tables"]
     found: dict[str, dict[str, list[Any]]] = {
-        t["name"]: {name: [] for name, _ in t["columns"]} for t in tables
+        t["name"]: {name: [] for name, *_ in t["columns"]} for t in tables
     }
-    for number in range(count):
-        entry = struct.unpack_from("<IIIIQQII", content, start + length + 40 * number)
-        table, column, rows, same, offset, size, check, _ = entry
+    owners = [(t["name"], *c) for t in tables for c in t["columns"] for _ in range(c[2])]
+    assert len(owners) == count
+    for number, (table, name, kind, _) in enumerate(owners):
+        entry = struct.unpack_from("<IIQQII", content, start + length + 32 * number)
+        rows, same, offset, size, check, _ = entry
         block = content[offset : offset + size]
         assert zlib.crc32(block) == check
-        name, kind = tables[table]["columns"][column]
         stored = 1 if same else rows
         cells: list[Any]
         if kind == "text" and same:
@@ -70,7 +71,7 @@ def plain(path: Path) -> dict[str, dict[str, list[Any]]]:
             code = code or {1: "b", 2: "h", 4: "i", 8: "q"}[int(kind[2:])]
             code = code.upper() if kind[1] == "u" else code
             cells = list(struct.unpack(f"<{stored}{code}", block))
-        found[tables[table]["name"]][name] += cells * (rows if same else 1)
+        found[table][name] += cells * (rows if same else 1)
     return found
 
 
@@ -207,14 +208,18 @@ def test_every_changed_byte_and_every_cut_is_noticed(tmp_path: Path) -> None:
         b"{}",
         b"[" * 100_000,
         b'{"tables":3}',
-        b'{"tables":[{"name":"a","columns":[["x"]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8"]],"notes":3}]}',
-        b'{"tables":[{"name":"a","columns":[["x","O"]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x",["<f8"]]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8"]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",0]],"notes":3}]}',
+        b'{"tables":[{"name":"a","columns":[["x","O",0]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x",["<f8"],0]],"notes":{}}]}',
         b'{"tables":[{"name":"a","columns":[],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8"],["x","<f8"]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8"]],"notes":{}},'
-        b'{"name":"a","columns":[["x","<f8"]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",0],["x","<f8",0]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",0]],"notes":{}},'
+        b'{"name":"a","columns":[["x","<f8",0]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",1]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",1],["y","<f8",-1]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",1e400]],"notes":{}}]}',
+        b'{"tables":[{"name":"a","columns":[["x","<f8",null]],"notes":{}}]}',
         b"\xff",
     ],
 )
@@ -230,24 +235,29 @@ def test_a_hostile_directory_is_refused(tmp_path: Path, directory: bytes) -> Non
 @pytest.mark.parametrize(
     "entry",
     [
-        (0, 0, 1, 0, 0, 1 << 40, 0, 0),
-        (0, 0, 1, 0, (1 << 64) - 4, 8, 0, 0),
-        (0, 0, (1 << 32) - 1, 0, 8, 8, 0, 0),
-        (0, 0, 3, 0, 8, 8, zlib.crc32(bytes(8)), 0),
-        (0, 0, 3, 1, 8, 7, zlib.crc32(bytes(7)), 0),
-        (0, 1, 3, 0, 8, 8, zlib.crc32(bytes(8)), 0),
-        (0, 1, 1, 0, 8, 8, zlib.crc32(bytes(8)), 0),
+        ("x", 1, 0, 0, 1 << 40, 0, 0),
+        ("x", 1, 0, (1 << 64) - 4, 8, 0, 0),
+        ("x", (1 << 32) - 1, 0, 8, 8, 0, 0),
+        ("x", 3, 0, 8, 8, zlib.crc32(bytes(8)), 0),
+        ("x", 3, 1, 8, 7, zlib.crc32(bytes(7)), 0),
+        ("s", 3, 0, 8, 8, zlib.crc32(bytes(8)), 0),
+        ("s", 1, 0, 8, 8, zlib.crc32(bytes(8)), 0),
     ],
 )
-def test_hostile_blocks_are_refused(tmp_path: Path, entry: tuple[int, ...]) -> None:
+def test_hostile_blocks_are_refused(tmp_path: Path, entry: tuple[Any, ...]) -> None:
     path = tmp_path / "some"
     magic = b"\x89HLC1\r\n\n"
-    directory = b'{"tables":[{"name":"a","columns":[["x","<f8"],["s","text"]],"notes":{}}]}'
-    blocks = struct.pack("<IIIIQQII", *entry)
+    column, *block = entry
+    counts = {"x": 0, "s": 0, column: 1}
+    directory = (
+        b'{"tables":[{"name":"a","columns":[["x","<f8",%d],["s","text",%d]],"notes":{}}]}'
+        % (counts["x"], counts["s"])
+    )
+    blocks = struct.pack("<IIQQII", *block)
     tail = struct.pack("<QQI", len(directory), 1, zlib.crc32(directory + blocks))
     path.write_bytes(magic + bytes(8) + directory + blocks + tail + magic)
     with pytest.raises(StoreError, match="damaged"):
-        ColumnFile(path).read("a", "x" if entry[1] == 0 else "s")
+        ColumnFile(path).read("a", column)
 
 
 @pytest.mark.parametrize(("length", "count"), [((1 << 40) - 8, 0), (0, 1 << 27)])
