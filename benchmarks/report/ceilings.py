@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from benchmarks.report.book import MB, Book, ends
+from benchmarks.report.book import MB, Book
 from benchmarks.report.look import OURS, databases, ordered, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import counted, listed, number, size, times, with_spread
@@ -90,10 +90,10 @@ def section(book: Book) -> Section | None:
 
 
 def findings(book: Book) -> list[str]:
-    """Our ceiling against the best database's, at the least and the greatest size."""
+    """Our ceiling against the best database's, at every size."""
     ceilings = _ceilings(book)
     found = []
-    for bytes_ in ends(sorted({one.size for one in ceilings})):
+    for bytes_ in sorted({one.size for one in ceilings}):
         of_size = [one for one in ceilings if one.size == bytes_]
         pair = _pair(of_size)
         if pair is None:
