@@ -168,9 +168,10 @@ class FieldGatherer:
 
     Payloads are put together until there are enough of them to be decoded by columns. Chunks
     may come in any order, as those do that were let go and read back: what is laid down ends
-    where one is missing, so that its columns can have their place in between. Where anything
-    does not fit there are no columns of a topic; where anything fails, or the disk
-    is nearly full, there are none at all. Neither is a loss: the index has the same.
+    where one is missing, so that its columns can have their place in between.
+
+    Where anything does not fit there are no columns of a topic; where anything fails, or the
+    disk is nearly full, there are none at all. Neither is a loss: the index has the same.
 
     Args:
         recording: The recording's directory.

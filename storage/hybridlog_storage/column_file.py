@@ -293,7 +293,6 @@ class ColumnFile:
         data = self._read(start, whole)
         if crc32(data) != crc:
             raise self._damaged("the checksum of its directory differs")
-        blocks = np.frombuffer(data[length:], _ENTRY)
         tables: dict[str, _Table] = {}
         end = 0
         try:
@@ -310,7 +309,7 @@ class ColumnFile:
                 tables[name] = _Table(types, begins, dict(table["notes"]))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise self._damaged("its directory cannot be read") from error
-        blocks = np.frombuffer(data, _ENTRY, offset=length)
+        blocks = np.frombuffer(data[length:], _ENTRY)
         ends = blocks["offset"] + blocks["size"]
         beyond = (ends < blocks["offset"]) | (ends > start) | (blocks["rows"] >= _MOST_ROWS)
         if end != len(blocks) or bool(beyond.any()):
