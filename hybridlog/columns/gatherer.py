@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.column_filter import Single
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Buffer, Channel
     from hybridlog_storage.segment_writer import StoredChunk
 
 _ARENA = 2 << 20  # bytes of payloads that are put together to be decoded; caches hold no more
@@ -64,6 +64,24 @@ class _Held(NamedTuple):
     channel: NDArray[np.int32]
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, chunk: StoredChunk) -> _Held:
+        """All of a chunk's."""
+        batch = chunk.batch
+        place = chunk.segment, chunk.offset
+        return cls(place, batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq)
+
+    def moved(self, by: int) -> _Held:
+        """A copy, with payloads that lie so many bytes further on."""
+        return _Held(
+            self.place,
+            self.offset + by,
+            self.length.copy(),
+            self.channel.copy(),
+            self.log_time.copy(),
+            self.seq.copy(),
+        )
 
     def take(self, rows: NDArray[np.intp]) -> _Held:
         return _Held(
@@ -246,16 +264,16 @@ class FieldGatherer:
             self.discard()
 
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        batch = chunk.batch
+        batch, held = chunk.batch, _Held.of(chunk)
         self._channels.update(channels)
-        if not self._follows(_place(chunk)):
+        if not self._follows(held.place):
             self._decode()
         if not is_small(batch.payload_bytes, len(batch)):
-            for topic, held in self._by_topic(_Held(_place(chunk), *_columns(chunk))):
+            for topic, part in self._by_topic(held):
                 topic.give_up_fields()
-                self._add_order(topic, held)
+                self._add_order(topic, part)
         else:
-            self._collect(chunk)
+            self._collect(held, batch.buffer)
         if self._pending >= _PENDING:
             self._flush(left=_LEFT)
 
@@ -272,18 +290,15 @@ class FieldGatherer:
         insort(self._begins, place)
         return False
 
-    def _collect(self, chunk: StoredChunk) -> None:
+    def _collect(self, held: _Held, buffer: Buffer) -> None:
         """Put the payloads of a chunk to those that wait to be decoded."""
-        batch = chunk.batch
-        begin = int(batch.offset.min())
-        size = int((batch.offset + batch.length).max()) - begin
-        if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + len(batch) > _ROWS:
+        rows, begin = len(held.seq), int(held.offset.min())
+        size = int((held.offset + held.length).max()) - begin
+        if size >= _ENOUGH or self._filled + size > _ARENA or self._rows + rows > _ROWS:
             self._decode()
-        data = np.frombuffer(batch.buffer, np.uint8, size, begin)
-        offset, *others = _columns(chunk)
+        data = np.frombuffer(buffer, np.uint8, size, begin)
         # Copies: what is held must not keep the buffers of chunks from being used again.
-        copies = [column.copy() for column in others]
-        self._held.append(_Held(_place(chunk), offset + (self._filled - begin), *copies))
+        self._held.append(held.moved(self._filled - begin))
         if size >= _ENOUGH:
             self._decode(data)
             return
@@ -291,7 +306,7 @@ class FieldGatherer:
             self._arena = buffers.take(_ARENA)
         self._arena[self._filled : self._filled + size] = data
         self._filled += size
-        self._rows += len(batch)
+        self._rows += rows
 
     def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
         """Make columns of what was collected."""
@@ -364,16 +379,6 @@ class FieldGatherer:
             self._pending -= topic.pending
             for place, columns in topic.take(missing):
                 self._writer.append(name, columns, place)
-
-
-def _place(chunk: StoredChunk) -> _Place:
-    return chunk.segment, chunk.offset
-
-
-def _columns(chunk: StoredChunk) -> tuple[NDArray[Any], ...]:
-    """What a chunk's messages are held by."""
-    batch = chunk.batch
-    return batch.offset, batch.length, batch.channel, batch.log_time, chunk.seq
 
 
 def _apart(column: Single, data: NDArray[np.uint8]) -> Single:

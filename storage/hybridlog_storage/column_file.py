@@ -36,16 +36,20 @@ TEXT: Final = "text"
 """Type of a column of strings; all others have a numpy type."""
 
 _TAIL = struct.Struct("<QQI")  # bytes of the directory, number of blocks, checksum of both
-_ENTRY = np.dtype(
-    [
-        ("rows", "<u4"),
-        ("same", "<u4"),
-        ("offset", "<u8"),
-        ("size", "<u8"),
-        ("crc", "<u4"),
-        ("unused", "<u4"),
-    ]
-)
+
+
+class _Block(NamedTuple):
+    """An entry of the table of blocks."""
+
+    rows: int
+    same: int
+    offset: int
+    size: int
+    crc: int
+    unused: int = 0
+
+
+_ENTRY = np.dtype([*zip(_Block._fields, ("<u4", "<u4", "<u8", "<u8", "<u4", "<u4"), strict=True)])
 _TYPES = frozenset({"|b1", "|i1", "|u1", *(f"<{k}{n}" for k in "iu" for n in (2, 4, 8))})
 _KNOWN = _TYPES | {"<f4", "<f8", TEXT}
 _MOST_ROWS = 1 << 31  # of a block
@@ -378,17 +382,6 @@ class _Table(NamedTuple):
     types: dict[str, str]
     begins: list[int]  # where the blocks of each column begin among all, and where the last end
     notes: dict[str, object]
-
-
-class _Block(NamedTuple):
-    """An entry of the table of blocks."""
-
-    rows: int
-    same: int
-    offset: int
-    size: int
-    crc: int
-    unused: int = 0
 
 
 class _Rows(NamedTuple):
