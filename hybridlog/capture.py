@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.entries import build_entry, new_key, recording_metadata
-from hybridlog.indexing import BACKLOG, ChunkIndexer, IndexWriter, Lag
+from hybridlog.index_writer import BACKLOG, IndexWriter, Lag
+from hybridlog.indexing import ChunkIndexer
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, StoreError

@@ -16,7 +16,8 @@ from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.columns.stored import FieldColumns
 from hybridlog.columns.topic import is_small
 from hybridlog.entries import build_entry, channels_of, entry_of, read_summaries
-from hybridlog.indexing import ChunkIndexer, Documents, IndexWriter
+from hybridlog.index_writer import IndexWriter
+from hybridlog.indexing import ChunkIndexer, Documents
 from hybridlog_storage.catalog import (
     CHUNKS,
     RECORDINGS,
@@ -191,8 +192,7 @@ def _indexed(catalog: Catalog, recording_id: str) -> dict[tuple[int, int], bool]
 
 
 def _is_small(chunk: ChunkEntry) -> bool:
-    stats = chunk.stats.values()
-    return is_small(sum(s.payload_bytes for s in stats), sum(s.messages for s in stats))
+    return is_small(sum(s.payload_bytes for s in chunk.stats.values()), chunk.messages)
 
 
 def _drop_dangling(
@@ -407,7 +407,7 @@ class _Check:
         assert self.indexer is not None
         self._result.chunks += 1
         where = f"{name} byte {chunk.offset}"
-        documents, entry = self.indexer.documents_of(chunk, channels)
+        documents, (entry,) = self.indexer.documents_of([chunk], channels)
         for collection, want in _by_collection(documents).items():
             self._expected[collection] = self._expected.get(collection, 0) + len(want)
             problem = _compare(self._database, key, chunk, collection, want)

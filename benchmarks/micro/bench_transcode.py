@@ -26,21 +26,37 @@ def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
     name, topic, count = CASES[case]
     stream = read(bags / name, topic, count)
     codec_for = need("hybridlog.schema.codec", "codec_for").codec_for
-    found = need("hybridlog_storage.index_documents", "DocumentAssembler", "Origin")
+    found = need("hybridlog_storage.index_documents", "DocumentAssembler", "Origin", "Placed")
     batch: Any = stream.batches(count)[0]
-    chunk = _chunk(batch)
+    placed = found.Placed.of([_chunk(batch)])
     codec = codec_for(stream.channel())
     assembler = found.DocumentAssembler(found.Origin("recording", 1, topic, False))
 
     def transcode() -> int:
         documents = 0
         for group in codec.bodies(batch.buffer, batch.offset, batch.length):
-            table = assembler.assemble(chunk, group.rows, group.body, group.error)
+            table = assembler.assemble(placed, group.rows, group.body, group.error)
             assert group.error is None
             documents += len(table)
         return documents
 
     assert benchmark(transcode) == count
+
+
+def bench_few(bags: Path, benchmark: Any) -> None:
+    """Documents of chunks of four messages each, of twenty topics, all at once."""
+    stream = read(bags / IMU, "/imu/data", 320)
+    need("hybridlog.index_writer", "IndexWriter")  # before, each chunk was by itself
+    indexer = need("hybridlog.indexing", "ChunkIndexer").ChunkIndexer("recording", 1)
+    channels = {number: stream.channel() for number in range(20)}
+    chunks = []
+    for number, batch in enumerate(stream.batches(4)):
+        own: Any = batch
+        own.channel[:] = number % len(channels)
+        chunks.append(_chunk(own))
+
+    _, entries = benchmark(indexer.documents_of, chunks, channels)
+    assert [entry.messages for entry in entries] == [4] * 80
 
 
 def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Capture
-from hybridlog.indexing import BACKLOG
+from hybridlog.index_writer import BACKLOG
 from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
 from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
@@ -51,6 +51,8 @@ _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each ba
 _TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
 _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
 _FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
+_PATIENCE = 4  # flush intervals for which chunks of few messages wait to be indexed together,
+_PATIENCE_S = 4.0  # and seconds at most
 _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
 _COPYING = 2  # threads that copy large messages at the same time
@@ -466,7 +468,7 @@ class LiveRecording:
                         flushed = now
                     if now - told >= interval / 4:
                         self._write_losses()
-                        self._capture.index.nudge()
+                        self._capture.index.nudge(_patience(interval))
                         told = now
                 if now - looked >= _LOOK_S:
                     stored = self._capture.writer.totals.payload_bytes
@@ -582,6 +584,11 @@ def _check_payload(payload: object) -> None:
     if not is_flat:
         kind = type(payload).__name__
         raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
+
+
+def _patience(flush_interval_s: float) -> float:
+    """Seconds for which chunks of few messages may wait to be indexed together."""
+    return min(_PATIENCE * flush_interval_s, _PATIENCE_S)
 
 
 def _backlog(options: LiveOptions) -> int:

@@ -167,6 +167,11 @@ class ChunkEntry:
             self.offset, self.length, self.trailer, self.first, self.last, tuple(self.stats)
         )
 
+    @property
+    def messages(self) -> int:
+        """Number of its messages."""
+        return sum(stats.messages for stats in self.stats.values())
+
     def span(self, channels: Container[int]) -> tuple[int, int] | None:
         """First and last log time of some channels in it, None when it has none of them."""
         stats = [s for c, s in self.stats.items() if c in channels]

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog_storage.segment_writer import StoredChunk
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    from hybridlog_storage.segment_writer import StoredChunk
 
 KEY_BYTES: Final = 20
 _HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
@@ -51,6 +55,50 @@ class Origin:
     has_publish_time: bool
 
 
+class Placed(NamedTuple):
+    """The messages of some chunks, and where they lie.
+
+    Attributes:
+        batch: n messages, those of each chunk together; its offsets are into its buffer.
+        seq: int64[n], arrival numbers.
+        number: intp[n], which of the chunks each is from.
+        segment: int32[n], of that chunk.
+        chunk: int64[n], the chunk's place in the segment.
+        offset: int64[n], the payload's place in the chunk's content.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+    number: NDArray[np.intp]
+    segment: NDArray[np.int32]
+    chunk: NDArray[np.int64]
+    offset: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, chunks: Sequence[StoredChunk]) -> Self:
+        """All messages of one chunk or more; of several the contents are copied together."""
+        batches = [chunk.batch for chunk in chunks]
+        counts = [len(batch) for batch in batches]
+        segment = np.array([chunk.segment for chunk in chunks], np.int32).repeat(counts)
+        place = np.array([chunk.offset for chunk in chunks], np.int64).repeat(counts)
+        number = np.arange(len(chunks)).repeat(counts)
+        if len(chunks) == 1:
+            return cls(batches[0], chunks[0].seq, number, segment, place, batches[0].offset)
+        offset = np.concatenate([batch.offset for batch in batches])
+        sizes = np.array([len(batch.buffer) for batch in batches])
+        whole = Batch(
+            b"".join([batch.buffer for batch in batches]),
+            offset + (np.cumsum(sizes) - sizes).repeat(counts),
+            np.concatenate([batch.length for batch in batches]),
+            np.concatenate([batch.channel for batch in batches]),
+            np.concatenate([batch.log_time for batch in batches]),
+            np.concatenate([batch.publish_time for batch in batches]),
+            np.concatenate([batch.sequence for batch in batches]),
+        )
+        seq = np.concatenate([chunk.seq for chunk in chunks])
+        return cls(whole, seq, number, segment, place, offset)
+
+
 class DocumentAssembler:
     """Puts together the index documents of one channel."""
 
@@ -60,16 +108,16 @@ class DocumentAssembler:
 
     def assemble(
         self,
-        chunk: StoredChunk,
+        placed: Placed,
         rows: NDArray[np.intp],
         body: NDArray[np.uint8],
         error: str | None = None,
     ) -> NDArray[np.uint8]:
-        """Documents of some messages of a chunk.
+        """Documents of some messages.
 
         Args:
-            chunk: Where the messages lie.
-            rows: intp[k], which of the chunk's messages.
+            placed: The messages, and others.
+            rows: intp[k], which of them.
             body: uint8[k, w], BSON elements of each message's fields.
             error: Why there are no fields, for `_meta.error`.
 
@@ -86,9 +134,9 @@ class DocumentAssembler:
         out = np.empty((count, width), np.uint8)
         head = struct.pack("<i", width) + b"\x05_id\x00" + struct.pack("<iB", KEY_BYTES, 0)
         out[:, :_KEY_AT] = np.frombuffer(head, np.uint8)
-        batch = chunk.batch
+        batch = placed.batch
         log_time = batch.log_time[rows]
-        seq = chunk.seq[rows]
+        seq = placed.seq[rows]
         _column(out, _KEY_AT, ">i8")[:] = log_time
         _column(out, _KEY_AT + 8, ">u4")[:] = self._origin.key
         _column(out, _KEY_AT + 12, ">i8")[:] = seq
@@ -101,9 +149,9 @@ class DocumentAssembler:
         if "pub" in at:
             _column(out, start + at["pub"], "<i8")[:] = batch.publish_time[rows]
         _column(out, start + at["seq"], "<i8")[:] = seq
-        _column(out, start + at["seg"], "<i4")[:] = chunk.segment
-        _column(out, start + at["chunk"], "<i8")[:] = chunk.offset
-        _column(out, start + at["off"], "<i8")[:] = batch.offset[rows]
+        _column(out, start + at["seg"], "<i4")[:] = placed.segment[rows]
+        _column(out, start + at["chunk"], "<i8")[:] = placed.chunk[rows]
+        _column(out, start + at["off"], "<i8")[:] = placed.offset[rows]
         _column(out, start + at["len"], "<i8")[:] = batch.length[rows]
         return out
 

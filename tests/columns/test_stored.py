@@ -290,7 +290,10 @@ def test_a_chunk_that_is_indexed_twice_is_no_two_chunks(
                 recording.write(words, payload, log_time=BASE + n)
             time.sleep(2.5)
     assert store.topic("/words").where('data == "small"').count() == 10
-    assert store.columns(recording.id) is None
+    columns = store.columns(recording.id)
+    assert columns is not None
+    assert compare_with_documents(store) == 0
+    assert store.verify().findings == []
 
 
 def test_a_link_in_the_place_of_the_file_leads_nowhere(recorded: hl.Store, tmp_path: Path) -> None:

@@ -20,8 +20,10 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from hybridlog import index_writer
 from hybridlog.demo.write import write_bag
-from hybridlog.indexing import ChunkIndexer, Lag
+from hybridlog.index_writer import Lag
+from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file
@@ -327,11 +329,11 @@ def test_what_was_let_go_does_not_keep_others_waiting(
     began, go_on = threading.Event(), threading.Event()
     real_documents = ChunkIndexer.documents_of
 
-    def held_up(self: ChunkIndexer, chunk: StoredChunk, *args: Any) -> Any:
+    def held_up(self: ChunkIndexer, chunks: list[StoredChunk], *args: Any) -> Any:
         began.set()
         go_on.wait(30)
-        made.append(int(chunk.seq[0]))
-        return real_documents(self, chunk, *args)
+        made.extend(int(chunk.seq[0]) for chunk in chunks)
+        return real_documents(self, chunks, *args)
 
     real_read = Lag.read
 
@@ -620,7 +622,7 @@ def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
 def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.Store) -> None:
     """Not at the end only: a recording may go on for hours."""
     speech = channel("/speech")
-    with store.start("talk") as recording:
+    with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"before"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         kill_mongod(store.directory.path)
@@ -640,7 +642,7 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     store: hl.Store,
 ) -> None:
     speech = channel("/speech")
-    with store.start("talk") as recording:
+    with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         database = store.database_for("This")
@@ -677,6 +679,74 @@ def test_the_end_of_a_recording_asks_for_none_of_its_chunks(
     assert not store.verify().findings
 
 
+def test_chunks_of_few_messages_are_indexed_together(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each topic has a chunk a flush, and one insert every few of them."""
+    inserted: Counter[str] = Counter()
+    real = Database.insert_raw
+
+    def counted(self: Database, collection: str, *args: Any, **given: Any) -> int:
+        inserted[collection] += 1
+        return real(self, collection, *args, **given)
+
+    monkeypatch.setattr(Database, "insert_raw", counted)
+    monkeypatch.setattr(live, "_patience", lambda _: 1e9)
+    topics = [channel(f"/topic{number}") for number in range(3)]
+    with store.start("talk", flush_interval_s=0.05) as recording:
+        totals = recording._capture.writer.totals
+        for number in range(5):
+            for own in topics:
+                recording.write(own, text(bytes([number]) * 2000), log_time=number)
+            wait_for(lambda n=number: totals.chunks == 3 * (n + 1))
+        assert recording.lag == 15
+        assert not inserted
+        monkeypatch.setattr(live, "_patience", lambda _: 0.0)
+        # Nobody need close it, or say more.
+        wait_for(lambda: recording.lag == 0)
+        assert inserted == {collection_of(own.topic): 1 for own in topics}
+        assert totals.chunks == 15
+    assert [m.raw[4] for m in store.topic("/topic1")] == list(range(5))
+    assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("most", ["_FEW_CHUNKS", "_FEW_WAITING"])
+def test_no_more_than_so_many_chunks_wait_for_others(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, most: str
+) -> None:
+    monkeypatch.setattr(index_writer, most, 4 if most == "_FEW_CHUNKS" else 8000)
+    monkeypatch.setattr(live, "_patience", lambda _: 1e9)
+    together: list[int] = []
+    real = ChunkIndexer.documents_of
+
+    def seen(self: ChunkIndexer, chunks: list[StoredChunk], *args: Any) -> Any:
+        together.append(len(chunks))
+        return real(self, chunks, *args)
+
+    monkeypatch.setattr(ChunkIndexer, "documents_of", seen)
+    own = channel("/talk")
+    with store.start("talk", flush_interval_s=0.05) as recording:
+        totals = recording._capture.writer.totals
+        for number in range(10):
+            recording.write(own, text(bytes([number]) * 2000), log_time=number)
+            wait_for(lambda n=number: totals.chunks == n + 1)
+        wait_for(lambda: together == [4, 4])
+    assert together == [4, 4, 2]
+    assert recording.close().indexed == 10
+    assert store.verify().findings == []
+
+
+def test_a_chunk_of_many_messages_waits_for_none(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "_patience", lambda _: 1e9)
+    own = channel("/talk")
+    with store.start("talk", flush_interval_s=0.5) as recording:
+        for number in range(1000):
+            recording.write(own, text(b"%d" % number), log_time=number)
+        wait_for(lambda: recording.stored[0] - recording.lag > 900)
+
+
 def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
     pid = int(json.loads((store.directory.mongod / "mongod.json").read_text())["mongod"])
@@ -701,7 +771,7 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
 def test_a_recording_of_more_chunks_than_are_kept_is_counted_whole(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hybridlog.indexing._MOST_LATEST", 2)
+    monkeypatch.setattr("hybridlog.index_writer._MOST_LATEST", 2)
     settings = SegmentSettings(chunk_size=1 << 12)
     recording = store.start("many", settings=settings)
     own = channel("/talk")

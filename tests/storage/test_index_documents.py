@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hybridlog_storage.index_documents import (
     DocumentAssembler,
     Origin,
+    Placed,
     key_bound,
     recording_key,
 )
@@ -27,13 +28,18 @@ ORIGIN = Origin("run-1", 0xFEDCBA98, "/a topic/ä", has_publish_time=True)
 
 
 def chunk_of(
-    times: list[int], seq: list[int] | None = None, lengths: list[int] | None = None
+    times: list[int],
+    seq: list[int] | None = None,
+    lengths: list[int] | None = None,
+    *,
+    at: tuple[int, int] = (7, 2**40),
+    content: bytes = b"",
 ) -> StoredChunk:
     count = len(times)
     length = np.array(lengths if lengths is not None else [3] * count, np.int64)
     offset = 31 + np.concatenate([[0], np.cumsum(length + 31)[:-1]]).astype(np.int64)
     batch = Batch(
-        b"",
+        content,
         offset,
         length,
         np.zeros(count, np.int32),
@@ -42,7 +48,7 @@ def chunk_of(
         np.zeros(count, np.uint32),
     )
     arrivals = np.array(seq if seq is not None else range(count), np.int64)
-    return StoredChunk(7, 2**40, 100, 50, batch, arrivals, 90)
+    return StoredChunk(*at, 100, 50, batch, arrivals, 90)
 
 
 def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:
@@ -69,7 +75,7 @@ def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], pub
     origin = Origin("run-1", 0xFEDCBA98, "/a topic/ä", has_publish_time=publish)
     chosen = np.arange(0, len(rows), 2)
     body = body_of([{"number": i, "text": "abc"} for i in range(len(chosen))])
-    made = documents(DocumentAssembler(origin).assemble(chunk, chosen, body))
+    made = documents(DocumentAssembler(origin).assemble(Placed.of([chunk]), chosen, body))
     assert len(made) == len(chosen)
     for number, (row, document) in enumerate(zip(chosen.tolist(), made, strict=True)):
         time, seq, length = rows[row]
@@ -91,11 +97,50 @@ def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], pub
         assert document["_id"] == struct.pack(">QIQ", time, 0xFEDCBA98, seq)
 
 
+@given(
+    st.lists(
+        st.tuples(
+            st.tuples(st.integers(0, 2**31 - 1), st.integers(0, 2**62)),
+            st.lists(st.tuples(TIMES, st.integers(0, 9)), min_size=1, max_size=5),
+        ),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_documents_of_several_chunks_are_those_of_each(
+    parts: list[tuple[tuple[int, int], list[tuple[int, int]]]],
+) -> None:
+    chunks = []
+    for number, (at, rows) in enumerate(parts):
+        lengths = [length for _, length in rows]
+        content = bytes(100 + number for _ in range(sum(lengths) + 31 * len(rows)))
+        chunk = chunk_of([time for time, _ in rows], None, lengths, at=at, content=content)
+        chunks.append(chunk)
+    placed = Placed.of(chunks)
+    assembler = DocumentAssembler(ORIGIN)
+    every = np.arange(len(placed.batch))
+    made = assembler.assemble(placed, every, np.empty((len(every), 0), np.uint8))
+    alone = [
+        assembler.assemble(
+            Placed.of([chunk]), np.arange(len(rows)), np.empty((len(rows), 0), np.uint8)
+        )
+        for chunk, (_, rows) in zip(chunks, parts, strict=True)
+    ]
+    assert made.tobytes() == np.concatenate(alone).tobytes()
+    assert placed.number.tolist() == [n for n, (_, rows) in enumerate(parts) for _ in rows]
+    payloads = [bytes(placed.batch.payload(row)) for row in every]
+    assert payloads == [
+        bytes(chunk.batch.payload(row)) for chunk in chunks for row in range(len(chunk.batch))
+    ]
+
+
 @given(st.lists(st.tuples(TIMES, st.integers(0, 2**62)), min_size=2))
 def test_the_order_of_keys_is_the_order_of_messages(rows: list[tuple[int, int]]) -> None:
     chunk = chunk_of([r[0] for r in rows], [r[1] for r in rows])
     empty = np.empty((len(rows), 0), np.uint8)
-    made = documents(DocumentAssembler(ORIGIN).assemble(chunk, np.arange(len(rows)), empty))
+    made = documents(
+        DocumentAssembler(ORIGIN).assemble(Placed.of([chunk]), np.arange(len(rows)), empty)
+    )
     keys = [d["_id"] for d in made]
     assert sorted(range(len(rows)), key=lambda i: keys[i]) == sorted(
         range(len(rows)), key=lambda i: rows[i]
@@ -106,7 +151,9 @@ def test_the_order_of_keys_is_the_order_of_messages(rows: list[tuple[int, int]])
 def test_a_bound_parts_the_keys_at_its_time(time: int, bound: int) -> None:
     chunk = chunk_of([time])
     (made,) = documents(
-        DocumentAssembler(ORIGIN).assemble(chunk, np.arange(1), np.empty((1, 0), np.uint8))
+        DocumentAssembler(ORIGIN).assemble(
+            Placed.of([chunk]), np.arange(1), np.empty((1, 0), np.uint8)
+        )
     )
     assert (made["_id"] >= key_bound(bound)) == (time >= bound)
 
@@ -115,7 +162,9 @@ def test_a_bound_parts_the_keys_at_its_time(time: int, bound: int) -> None:
 def test_bounds_outside_of_all_times(time: int) -> None:
     chunk = chunk_of([0, 2**63 - 1])
     made = documents(
-        DocumentAssembler(ORIGIN).assemble(chunk, np.arange(2), np.empty((2, 0), np.uint8))
+        DocumentAssembler(ORIGIN).assemble(
+            Placed.of([chunk]), np.arange(2), np.empty((2, 0), np.uint8)
+        )
     )
     assert all((d["_id"] >= key_bound(time)) == (time < 0) for d in made)
 
@@ -125,19 +174,28 @@ def test_errors_replace_the_fields() -> None:
     chunk = chunk_of([1, 2, 3])
     none = np.empty((3, 0), np.uint8)
     for error in ("short", "ü" * 3000, "\udc80 half", "short"):
-        for document in documents(assembler.assemble(chunk, np.arange(3), none, error)):
+        for document in documents(
+            assembler.assemble(Placed.of([chunk]), np.arange(3), none, error)
+        ):
             assert list(document) == ["_id", "_meta"]
             said = document["_meta"]["error"]
             assert said[:5] == error.encode("utf-8", "replace").decode()[:5]
             assert len(said) <= 1000
     # Many different errors do not mix, nor does one stay in documents without.
     for number in range(600):
-        (made, *_) = documents(assembler.assemble(chunk, np.arange(3), none, f"e{number}"))
+        (made, *_) = documents(
+            assembler.assemble(Placed.of([chunk]), np.arange(3), none, f"e{number}")
+        )
         assert made["_meta"]["error"] == f"e{number}"
-    assert "error" not in documents(assembler.assemble(chunk, np.arange(3), none))[0]["_meta"]
+    assert (
+        "error"
+        not in documents(assembler.assemble(Placed.of([chunk]), np.arange(3), none))[0]["_meta"]
+    )
 
 
 def test_the_recording_is_read_from_a_key() -> None:
     chunk = chunk_of([5])
-    data = DocumentAssembler(ORIGIN).assemble(chunk, np.arange(1), np.empty((1, 0), np.uint8))
+    data = DocumentAssembler(ORIGIN).assemble(
+        Placed.of([chunk]), np.arange(1), np.empty((1, 0), np.uint8)
+    )
     assert recording_key(data[0].tobytes()) == ORIGIN.key

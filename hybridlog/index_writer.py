@@ -1,0 +1,528 @@
+"""The way of chunks into the index: what becomes of them in the background.
+
+`IndexWriter` makes documents of them and sends these to the database; with a `Lag` it may
+fall behind the recording that it belongs to, and reads back what it has let go.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hybridlog_storage.catalog import Catalog, ChannelTotals, ChunkEntry
+from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import DatabaseError, SegmentError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segment_writer import OPEN_SUFFIX, SEALED_SUFFIX, StoredChunk
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.columns.gatherer import FieldGatherer
+    from hybridlog.indexing import ChunkIndexer, Documents
+    from hybridlog_storage.database import Database
+
+_SENDERS = 2
+_LAG_PAUSE_S = 0.002
+_RETRY_S = 2.0  # after the database has failed
+_PARCEL_BYTES = 4 << 20
+_PARCEL_CHUNKS = 32
+BACKLOG = 8
+"""Chunks that may wait for the index in memory, if nobody says."""
+_FEW = 32  # messages, and
+_FEW_BYTES = 128 << 10  # bytes of a chunk up to which it is not worth documents of its own
+_FEW_CHUNKS = 512  # that wait for others, at most
+_FEW_WAITING = 4 << 20  # and bytes of them
+_MOST_LATEST = 4096  # chunks: far more than a server that is killed has not in its journal
+
+
+@dataclass(slots=True)
+class _Parcel:
+    """What goes to the database in one go: documents of some chunks, and those chunks."""
+
+    documents: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
+    entries: list[ChunkEntry] = field(default_factory=list)
+    messages: int = 0
+    size: int = 0
+
+    def add(self, documents: list[Documents], entries: list[ChunkEntry]) -> None:
+        for part in documents:
+            self.documents.setdefault(part.collection, []).extend(part.tables)
+            self.size += part.size
+        self.entries += entries
+        self.messages += sum(entry.messages for entry in entries)
+
+
+class _Few:
+    """Chunks of few messages, which wait until there are more of them.
+
+    A topic that says four things a second has a chunk of four messages each second, so that
+    no more can be lost. To make documents of such a chunk, and to insert them, costs as much
+    as of one of a hundred.
+    """
+
+    def __init__(self) -> None:
+        self._chunks: list[StoredChunk] = []
+        self._channels: dict[int, Channel] = {}
+        self._size = 0
+        self._since = 0.0
+
+    @staticmethod
+    def takes(chunk: StoredChunk) -> bool:
+        """Whether a chunk is one of these."""
+        return len(chunk.batch) <= _FEW and len(chunk.batch.buffer) <= _FEW_BYTES
+
+    def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
+        """Have a chunk wait; of a recording that is recovered each segment has its channels."""
+        self._channels.update(channels)
+        if not self._chunks:
+            self._since = time.monotonic()
+        # A copy: its buffer may have room for a hundred times as much.
+        content = bytes(chunk.batch.buffer)
+        self._chunks.append(replace(chunk, batch=replace(chunk.batch, buffer=content)))
+        self._size += len(content)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no more should wait."""
+        return self._size >= _FEW_WAITING or len(self._chunks) >= _FEW_CHUNKS
+
+    @property
+    def waited(self) -> float:
+        """Seconds for which the first one has waited; 0 without any."""
+        return time.monotonic() - self._since if self._chunks else 0.0
+
+    def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
+        """All that wait, which do so no longer, and their channels."""
+        chunks, self._chunks, self._size = self._chunks, [], 0
+        return chunks, self._channels
+
+
+class Lag:
+    """Lets the index fall behind the recording that it belongs to.
+
+    Args:
+        recording: The recording's directory.
+        behind: Says whether the recorder has more than it can write.
+        renew: Another connection to the index, after one has failed; starts the embedded
+            MongoDB again if that has ended. Raises `DatabaseError`.
+    """
+
+    def __init__(
+        self, recording: Path, behind: Callable[[], bool], renew: Callable[[], Database]
+    ) -> None:
+        self.renew = renew
+        self._recording = recording
+        self._behind = behind
+        self._reader: SegmentReader | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-reread")
+        self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
+
+    def wait(self) -> None:
+        """Return once the recorder can spare the processor and the disk."""
+        while self._behind():
+            time.sleep(_LAG_PAUSE_S)
+
+    def read(self, chunk: _Forgotten) -> StoredChunk:
+        """Read a chunk back from its segment, which may still be growing."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is None or ahead[0] is not chunk:
+            return self._thread.submit(self._read, chunk).result()
+        return ahead[1].result()
+
+    def read_ahead(self, chunk: _Forgotten) -> None:
+        """Start to read the chunk that is asked for next."""
+        self._ahead = chunk, self._thread.submit(self._read, chunk)
+
+    def _read(self, chunk: _Forgotten) -> StoredChunk:
+        if self._reader is None or self._reader.number != chunk.segment:
+            self._release()
+            self._reader = self._open(chunk.segment)
+        self._reader.grow()
+        return self._reader.read_chunk(chunk.place)
+
+    def close(self) -> None:
+        """Give everything back."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+        self._release()
+
+    def _release(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _open(self, segment: int) -> SegmentReader:
+        path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
+        if path.exists():
+            # It may be sealed, and renamed, at this moment.
+            with suppress(SegmentError):
+                return SegmentReader(path, segment, direct=True)
+        sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
+        return SegmentReader(sealed, segment, direct=True)
+
+
+class _Forgotten(NamedTuple):
+    """A chunk that is in its segment, and no longer in memory.
+
+    Attributes:
+        segment: Number of the segment.
+        place: Where it lies there.
+        messages: Number of its messages.
+        is_gathered: Whether its columns have been made.
+    """
+
+    segment: int
+    place: ChunkPlace
+    messages: int
+    is_gathered: bool
+
+
+class IndexWriter:
+    """Sends chunks to the index in the background, so that recording need not wait.
+
+    One thread makes documents, others send them; what is made while they are busy goes
+    in one parcel, so that a chunk of one image costs no round trip of its own. A database
+    that fails stops the index, never the recording: what was not indexed is made up for
+    from the segments, with a lag as soon as the database answers again, else when the
+    store is opened next.
+
+    Args:
+        indexer: Makes the documents.
+        database: Where they go.
+        backlog: Most chunks in memory, waiting or under way, before `submit` waits.
+        lag: With it `submit` never waits: chunks beyond the backlog are read back.
+        gatherer: Gets each chunk of which documents are made, once.
+    """
+
+    def __init__(
+        self,
+        indexer: ChunkIndexer,
+        database: Database,
+        *,
+        backlog: int = BACKLOG,
+        lag: Lag | None = None,
+        gatherer: FieldGatherer | None = None,
+    ) -> None:
+        self.failure: DatabaseError | None = None
+        self.indexed = 0
+        """Messages whose index documents are in the database."""
+        self.missed = 0
+        """Messages that were skipped because the database had failed."""
+        self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
+        self._totals: ChannelTotals | None = ChannelTotals()
+        self._indexer = indexer
+        self._lag = lag
+        self._gatherer = gatherer
+        self._forgotten: deque[_Forgotten] = deque()
+        self._database = database
+        self._catalog = Catalog(database)
+        self._collections: set[str] = set()
+        self._lock = threading.Lock()
+        self._room = threading.BoundedSemaphore(backlog)
+        self._in_memory = 0  # chunks that wait or are under way
+        self._is_asked = False  # for the next forgotten chunk
+        self._has_ended = False  # nothing is taken any more
+        self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
+        self._senders = ThreadPoolExecutor(_SENDERS, thread_name_prefix="hybridlog-send")
+        self._idle = threading.BoundedSemaphore(_SENDERS)
+        self._few = _Few()
+        self._parcel = _Parcel()
+        self._crash: BaseException | None = None
+        self._channels: Mapping[int, Channel] = {}
+        self._retry_at = 0.0
+        self._is_away = False
+        self._renewed: list[Database] = []
+
+    @property
+    def database(self) -> Database:
+        """Where documents go now."""
+        return self._database
+
+    def totals(self) -> ChannelTotals:
+        """Statistics of the channels, of all chunks that are in the index."""
+        if self._totals is None and self.failure is None:
+            try:
+                self._totals = ChannelTotals.of(self._catalog.every_chunk(self._indexer.recording))
+            except DatabaseError as error:
+                self.failure = error
+        return self._totals or ChannelTotals()
+
+    def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
+        """Index a chunk that is in its segment; waits while the backlog is full."""
+        if self._crash is not None:
+            raise self._crash
+        self._channels = channels
+        if not self._room.acquire(blocking=self._lag is None):
+            self._forget(chunk)
+            self._catch_up()
+            return
+        with self._lock:
+            self._in_memory += 1
+        future = self._maker.submit(self._make, chunk, channels)
+        future.add_done_callback(self._made)
+
+    def prepare(self, channel: Channel) -> None:
+        """Do now what a channel's first message would have to wait for."""
+        self._indexer.prepare(channel)
+        self._maker.submit(self._prepare, channel).add_done_callback(self._done)
+
+    def _prepare(self, channel: Channel) -> None:
+        if self._is_away:
+            return
+        try:
+            self._ensure(collection_of(channel.topic))
+        except DatabaseError:
+            # It fails again with the first documents, and is told then. To find out that
+            # nobody answers takes seconds, and others stand behind this.
+            self._is_away = True
+
+    def nudge(self, patience_s: float) -> None:
+        """Send what has been made so far, however little, once a sender is free.
+
+        Args:
+            patience_s: Seconds for which chunks of few messages may wait for others.
+        """
+        self._maker.submit(self._tend, patience_s).add_done_callback(self._done)
+
+    def close(self) -> None:
+        """Wait for all chunks; an error of our own (no database's) is raised here."""
+        if self._crash is None:
+            self._maker.submit(self._last_try).add_done_callback(self._done)
+            self._maker.submit(self._remember_all).add_done_callback(self._done)
+            self._maker.submit(self._make_few).add_done_callback(self._done)
+            self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
+        self._end()
+        self.missed += sum(chunk.messages for chunk in self._forgotten)
+        if self._crash is not None:
+            raise self._crash
+
+    def abandon(self) -> None:
+        """Stop without indexing what still waits."""
+        self._end(cancel=True)
+
+    def release(self) -> None:
+        """Close the connections that it has made itself; `database` may be one of them."""
+        for database in self._renewed:
+            database.close()
+        self._renewed.clear()
+
+    def _end(self, *, cancel: bool = False) -> None:
+        with self._lock:
+            self._has_ended = True
+        self._maker.shutdown(wait=True, cancel_futures=cancel)
+        self._senders.shutdown(wait=True, cancel_futures=cancel)
+        if self._lag is not None:
+            self._lag.close()
+
+    def _forget(self, chunk: StoredChunk, *, is_gathered: bool = False) -> None:
+        """Keep only where a chunk lies."""
+        place = ChunkPlace(
+            chunk.offset,
+            chunk.length,
+            chunk.trailer,
+            int(chunk.batch.log_time.min()),
+            int(chunk.batch.log_time.max()),
+            (),
+        )
+        if self._gatherer is not None and not is_gathered:
+            self._gatherer.expect(chunk.segment, chunk.offset)
+        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), is_gathered))
+
+    def _catch_up(self) -> None:
+        """Ask for a forgotten chunk once none waits in memory.
+
+        To read one back costs more than to make its documents. Taken in the order in which
+        they came, those that were let go would keep others waiting until these, too, have
+        no room.
+        """
+        with self._lock:
+            is_idle = not (self._is_asked or self._in_memory or self._has_ended)
+            if not is_idle or not self._forgotten or self.failure is not None:
+                return
+            self._is_asked = True
+            future = self._maker.submit(self._remember_next)
+        future.add_done_callback(self._done)
+
+    def _tend(self, patience_s: float) -> None:
+        if self.failure is not None and time.monotonic() >= self._retry_at:
+            self._retry()
+        self._catch_up()
+        if self._few.waited >= patience_s:
+            self._make_few()
+        self._dispatch(wait=False)
+
+    def _last_try(self) -> None:
+        if self.failure is not None:
+            self._retry()
+
+    def _retry(self) -> None:
+        """Go on after the database has failed, if it can be had again."""
+        if self._lag is None:
+            return
+        try:
+            database = self._lag.renew()
+            self._renewed.append(database)
+            catalog = Catalog(database)
+            chunks = catalog.every_chunk(self._indexer.recording)
+            there = {(chunk.segment, chunk.offset) for chunk in chunks}
+        except DatabaseError as error:
+            self.failure = error
+            self._retry_at = time.monotonic() + _RETRY_S
+            return
+        with self._lock:
+            self._database, self._catalog = database, catalog
+            self._collections.clear()
+            # A server that was killed has lost what it had not yet in its journal.
+            latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
+            for entry in latest:
+                if (entry.segment, entry.offset) in there:
+                    self._latest.append(entry)
+                else:
+                    self.indexed -= self._put_back(entry)
+                    self._totals = None  # what was taken in cannot be taken out
+            self.failure, self._is_away = None, False
+
+    def _remember_next(self) -> None:
+        with self._lock:
+            self._is_asked = False
+        self._remember()
+        self._catch_up()
+
+    def _remember_all(self) -> None:
+        while self._forgotten and self.failure is None:
+            self._remember()
+
+    def _remember(self) -> None:
+        """Make documents of the first forgotten chunk, while the next one is read."""
+        assert self._lag is not None
+        if self.failure is not None or not self._forgotten:
+            return
+        place = self._forgotten.popleft()
+        self._lag.wait()
+        chunk = self._lag.read(place)
+        if self._forgotten:
+            self._lag.read_ahead(self._forgotten[0])
+        self._make(chunk, self._channels, is_gathered=place.is_gathered)
+
+    def _make(
+        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_gathered: bool = False
+    ) -> None:
+        if self.failure is not None:
+            if self._lag is not None:
+                self._forget(chunk, is_gathered=is_gathered)
+            else:
+                with self._lock:
+                    self.missed += len(chunk.batch)
+            return
+        if self._lag is not None and not _is_large(chunk):
+            self._lag.wait()
+        if self._gatherer is not None and not is_gathered:
+            self._gatherer.add(chunk, channels)
+        if not self._few.takes(chunk):
+            self._index([chunk], channels)
+            return
+        self._few.add(chunk, channels)
+        if self._few.is_full:
+            self._make_few()
+
+    def _make_few(self) -> None:
+        """Make documents of the chunks that wait for others."""
+        chunks, channels = self._few.take()
+        if chunks:
+            if self._lag is not None:
+                self._lag.wait()
+            self._index(chunks, channels)
+
+    def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
+        self._parcel.add(*self._indexer.documents_of(chunks, channels))
+        parcel = self._parcel
+        if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:
+            self._dispatch(wait=parcel.size >= _PARCEL_BYTES)
+
+    def _dispatch(self, *, wait: bool) -> None:
+        """Hand over what has been made, if a sender is free or has to be waited for."""
+        if self._parcel.entries and self._idle.acquire(blocking=wait):
+            parcel, self._parcel = self._parcel, _Parcel()
+            future = self._senders.submit(self._send, parcel)
+            future.add_done_callback(self._sent)
+
+    def _send(self, parcel: _Parcel) -> None:
+        failure = self.failure
+        try:
+            if failure is None:
+                for collection, tables in parcel.documents.items():
+                    self._ensure(collection)
+                    lengths = np.concatenate(
+                        [np.full(len(table), table.shape[1], np.int64) for table in tables]
+                    )
+                    data = b"".join(table.data for table in tables)
+                    self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
+                self._catalog.put_chunks(parcel.entries)
+        except DatabaseError as error:
+            failure = error
+        with self._lock:
+            if failure is None:
+                self.indexed += parcel.messages
+                self._latest.extend(parcel.entries)
+                if self._totals is not None:
+                    for entry in parcel.entries:
+                        self._totals.add(entry)
+                return
+            self.failure = failure
+            self._retry_at = time.monotonic() + _RETRY_S
+            if self._lag is None:
+                self.missed += parcel.messages
+                return
+            # To insert a document twice is to insert it once, so all of it comes again.
+            for entry in parcel.entries:
+                self._put_back(entry)
+
+    def _put_back(self, entry: ChunkEntry) -> int:
+        """A chunk is to be indexed again; returns its messages."""
+        self._forgotten.append(_Forgotten(entry.segment, entry.place, entry.messages, True))
+        return entry.messages
+
+    def _ensure(self, collection: str) -> None:
+        with self._lock:
+            if collection in self._collections:
+                return
+        self._database.ensure_collection(collection)
+        with self._lock:
+            self._collections.add(collection)
+
+    def _made(self, future: Future[None]) -> None:
+        self._room.release()
+        with self._lock:
+            self._in_memory -= 1
+        self._done(future)
+        self._catch_up()
+
+    def _sent(self, future: Future[None]) -> None:
+        self._idle.release()
+        self._done(future)
+
+    def _done(self, future: Future[None]) -> None:
+        if future.cancelled():
+            return
+        error = future.exception()
+        if error is not None and self._crash is None:
+            self._crash = error
+
+
+def _is_large(chunk: StoredChunk) -> bool:
+    """Whether documents of a chunk cost less than to let it go and read it again.
+
+    Of large messages they take little, and nearly none of it under the interpreter's lock.
+    """
+    return len(chunk.batch.buffer) >= COPIED_AT_ONCE * len(chunk.batch)
