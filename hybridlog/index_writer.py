@@ -293,7 +293,9 @@ class IndexWriter:
         Args:
             patience_s: Seconds for which chunks of few messages may wait for others.
         """
-        self._maker.submit(self._tend, patience_s).add_done_callback(self._done)
+        # To wake the thread that makes documents for nothing costs what ten of them do.
+        if self._parcel.entries or self._forgotten or self.failure or self._is_late(patience_s):
+            self._maker.submit(self._tend, patience_s).add_done_callback(self._done)
 
     def close(self) -> None:
         """Wait for all chunks; an error of our own (no database's) is raised here."""
@@ -358,9 +360,13 @@ class IndexWriter:
         if self.failure is not None and time.monotonic() >= self._retry_at:
             self._retry()
         self._catch_up()
-        if self._few.waited >= patience_s:
+        if self._is_late(patience_s):
             self._make_few()
         self._dispatch(wait=False)
+
+    def _is_late(self, patience_s: float) -> bool:
+        """Whether chunks have waited for others for so long."""
+        return self._few.waited > patience_s
 
     def _last_try(self) -> None:
         if self.failure is not None:

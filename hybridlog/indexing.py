@@ -18,6 +18,7 @@ from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.runs import run_lengths, run_starts
 from hybridlog_storage.segment_writer import StoredChunk
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
         return
     order = np.argsort(channel, kind="stable")
     ids = channel[order]
-    starts = np.flatnonzero(np.diff(ids, prepend=-1)).tolist()
+    starts = run_starts(ids).tolist()
     for start, end in zip(starts, [*starts[1:], len(ids)], strict=True):
         yield int(ids[start]), order[start:end]
 
@@ -174,9 +175,9 @@ class _Told:
 
     def by_chunk(self) -> Iterator[tuple[int, ChannelStats]]:
         """The chunks that have messages, in order, and what is told of these."""
-        batch, begins = self._batch, _begins(self._number)
+        batch, begins = self._batch, run_starts(self._number)
         numbers = self._number[begins].tolist()
-        messages = np.diff(begins, append=len(batch)).tolist()
+        messages = run_lengths(begins, len(batch)).tolist()
         payload_bytes = np.add.reduceat(batch.length, begins).tolist()
         spans = _spans(batch.log_time, begins)
         found = {
@@ -204,9 +205,9 @@ class _Told:
         order = np.argsort(rows)
         rows, stamps = rows[order], stamps[order]
         skew = self._batch.log_time[rows] - stamps
-        begins = _begins(self._number[rows])
+        begins = run_starts(self._number[rows])
         numbers = self._number[rows[begins]].tolist()
-        counts = np.diff(begins, append=len(rows)).tolist()
+        counts = run_lengths(begins, len(rows)).tolist()
         # As integers they could run over.
         sums = np.add.reduceat(skew, begins, dtype=np.float64).tolist()
         for number, count, total, (first, last), (least, most) in zip(
@@ -227,13 +228,6 @@ def _read_stamps(codec: Codec, batch: Batch, told: _Told) -> None:
         stamps = header_stamps(decoded.records)
         if stamps is not None:
             told.stamped(rows[decoded.rows], stamps)
-
-
-def _begins(number: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Where each run of equal numbers begins."""
-    if number[0] == number[-1]:
-        return np.zeros(1, np.intp)
-    return np.flatnonzero(np.diff(number, prepend=-1))
 
 
 def _spans(values: NDArray[np.int64], begins: NDArray[np.intp]) -> Iterator[tuple[int, int]]:

@@ -327,6 +327,10 @@ class FieldGatherer:
 
     def _by_topic(self, held: _Held) -> Iterator[tuple[_Topic, _Held]]:
         """Messages, those of each topic by themselves."""
+        first = int(held.channel[0])
+        if bool((held.channel == first).all()):
+            yield self._topic_of(first), held.moved(0)
+            return
         by_channel = self._topics_of(held.channel)
         topics = list(dict.fromkeys(by_channel.values()))
         table = np.zeros(int(held.channel.max()) + 1, np.int32)
@@ -336,14 +340,17 @@ class FieldGatherer:
 
     def _topics_of(self, channel: NDArray[np.int32]) -> dict[int, _Topic]:
         """The topics of messages, by the ids of their channels."""
-        found: dict[int, _Topic] = {}
-        for number in np.flatnonzero(np.bincount(channel)).tolist():
-            of = self._channels[number]
-            if of.topic not in self._topics:
-                self._topics[of.topic] = _Topic(of)
-            found[number] = self._topics[of.topic]
-            found[number].meet(of)
-        return found
+        numbers = np.flatnonzero(np.bincount(channel)).tolist()
+        return {number: self._topic_of(number) for number in numbers}
+
+    def _topic_of(self, number: int) -> _Topic:
+        """The topic of a channel, which has messages."""
+        channel = self._channels[number]
+        topic = self._topics.get(channel.topic)
+        if topic is None:
+            topic = self._topics[channel.topic] = _Topic(channel)
+        topic.meet(channel)
+        return topic
 
     def _read(self, topic: _Topic, held: _Held, data: NDArray[np.uint8]) -> None:
         decoded = topic.codec.columns(data.data, held.offset, held.length, topic.types.keys())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Final, Self, cast
 
 from hybridlog_storage.database import Database
@@ -52,6 +52,10 @@ class ChannelStats:
     longest: int = 0
     """Most log time that one chunk's messages of the channel span."""
 
+    def to_document(self) -> dict[str, int | float | None]:
+        """As the catalog keeps it, without the copies that `asdict` makes of each value."""
+        return {name: getattr(self, name) for name in _STATS}
+
     def add(self, other: ChannelStats) -> None:
         """Take in the messages of another part of the channel."""
         for name in ("messages", "payload_bytes", "unreadable", "stamped", "skew_sum"):
@@ -60,6 +64,9 @@ class ChannelStats:
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
         for name in ("last", "last_publish", "last_stamp", "skew_max", "longest"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
+
+
+_STATS = tuple(of.name for of in fields(ChannelStats))
 
 
 @dataclass(slots=True)
@@ -259,7 +266,9 @@ class Catalog:
                     "trailer": chunk.trailer,
                     "first": chunk.first,
                     "last": chunk.last,
-                    "ch": [{"c": c, **asdict(stats)} for c, stats in sorted(chunk.stats.items())],
+                    "ch": [
+                        {"c": c, **stats.to_document()} for c, stats in sorted(chunk.stats.items())
+                    ],
                 }
                 for chunk in chunks
             ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from threading import Lock
@@ -49,8 +50,8 @@ class ChunkBuilder:
         """Messages laid down so far."""
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
-        self.opened = 0.0
-        """When that was, seconds of `time.monotonic`."""
+        self.opened = math.inf
+        """When that was, seconds of `time.monotonic`; never, while there is none."""
 
     def __len__(self) -> int:
         """Bytes laid down so far."""
@@ -161,7 +162,7 @@ class ChunkBuilder:
             the content's size in bytes (the batch's buffer may be longer).
         """
         self._settle()
-        self.copying, self.messages = [], 0
+        self.copying, self.messages, self.opened = [], 0, math.inf
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
         batches = [batch for batch, _ in pieces]

@@ -29,6 +29,7 @@ from hybridlog_storage.copying import windows
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
+from hybridlog_storage.runs import run_starts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -167,7 +168,7 @@ def message_indexes(
     entries = np.empty(len(order), _INDEX_ENTRY)
     entries["log_time"] = log_time[order]
     entries["offset"] = record_offset[order]
-    starts = np.flatnonzero(np.diff(channels, prepend=-1)).tolist()
+    starts = run_starts(channels).tolist()
     records: dict[int, bytes] = {}
     for start, end in zip(starts, [*starts[1:], len(channels)], strict=True):
         data = entries[start:end].tobytes()
@@ -197,7 +198,9 @@ def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
     if compressor is None:
         compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)
         _per_thread.compressor = compressor
-    packed: bytes = compressor.compress(np.diff(seq, prepend=0).astype("<i8").tobytes())
+    steps = seq.astype("<i8")
+    steps[1:] -= seq[:-1]
+    packed: bytes = compressor.compress(steps.tobytes())
     return packed
 
 

@@ -667,7 +667,7 @@ class RecordingWriter:
         """Close the chunks that were opened so long ago, and write what is packed."""
         limit = time.monotonic() - seconds
         for key, builder in self._clusters.items():
-            if len(builder) and builder.opened <= limit:
+            if builder.opened <= limit:
                 self._close_chunk(key)
         self._keep_pace(limit=4)
 
