@@ -52,10 +52,6 @@ class ChannelStats:
     longest: int = 0
     """Most log time that one chunk's messages of the channel span."""
 
-    def to_document(self) -> dict[str, int | float | None]:
-        """As the catalog keeps it, without the copies that `asdict` makes of each value."""
-        return {name: getattr(self, name) for name in _STATS}
-
     def add(self, other: ChannelStats) -> None:
         """Take in the messages of another part of the channel."""
         for name in ("messages", "payload_bytes", "unreadable", "stamped", "skew_sum"):
@@ -67,6 +63,11 @@ class ChannelStats:
 
 
 _STATS = tuple(of.name for of in fields(ChannelStats))
+
+
+def _as_dict(stats: ChannelStats) -> dict[str, int | float | None]:
+    """By name, without the copies that `asdict` makes of each value."""
+    return {name: getattr(stats, name) for name in _STATS}
 
 
 @dataclass(slots=True)
@@ -266,9 +267,7 @@ class Catalog:
                     "trailer": chunk.trailer,
                     "first": chunk.first,
                     "last": chunk.last,
-                    "ch": [
-                        {"c": c, **stats.to_document()} for c, stats in sorted(chunk.stats.items())
-                    ],
+                    "ch": [{"c": c, **_as_dict(stats)} for c, stats in sorted(chunk.stats.items())],
                 }
                 for chunk in chunks
             ],
