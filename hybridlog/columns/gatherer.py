@@ -329,6 +329,7 @@ class FieldGatherer:
         """Messages, those of each topic by themselves."""
         first = int(held.channel[0])
         if bool((held.channel == first).all()):
+            # A copy, as below: columns of a chunk may lie in a buffer that is used again.
             yield self._topic_of(first), held.moved(0)
             return
         by_channel = self._topics_of(held.channel)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.sources.base import join
+from hybridlog_storage.copying import joined
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -116,5 +116,5 @@ def _join(parts: Sequence[Rows]) -> Rows:
     return Rows(
         [buffer for part in parts for buffer in part.buffers],
         np.concatenate([part.which + start for part, start in zip(parts, starts, strict=True)]),
-        join([part.table for part in parts]),
+        joined([part.table for part in parts]),
     )

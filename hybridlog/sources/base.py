@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from hybridlog_storage.copying import joined
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Attachment, Metadata
 
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Batch, Channel
 
 BATCH_BYTES = 2 << 20
 """Payload bytes at which a source closes a batch; one larger payload may exceed it."""
@@ -172,11 +172,11 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
         if not len(batch):
             continue
         if held and (size + len(batch.buffer) > BATCH_BYTES or rows + len(batch) > BATCH_MESSAGES):
-            yield join(held)
+            yield joined(held)
             held, size, rows = [], 0, 0
         if len(batch.buffer) * 8 > BATCH_BYTES or len(batch) * 2 > BATCH_MESSAGES:
             if held:
-                yield join(held)
+                yield joined(held)
                 held, size, rows = [], 0, 0
             yield from _split(batch)
         else:
@@ -184,24 +184,7 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
             size += len(batch.buffer)
             rows += len(batch)
     if held:
-        yield join(held)
-
-
-def join(batches: Sequence[Batch]) -> Batch:
-    """One batch of several, over one buffer."""
-    if len(batches) == 1:
-        return batches[0]
-    starts = np.cumsum([0, *(len(batch.buffer) for batch in batches[:-1])])
-    offsets = [batch.offset + start for batch, start in zip(batches, starts, strict=True)]
-    return Batch(
-        b"".join(batch.buffer for batch in batches),
-        np.concatenate(offsets),
-        np.concatenate([batch.length for batch in batches]),
-        np.concatenate([batch.channel for batch in batches]),
-        np.concatenate([batch.log_time for batch in batches]),
-        np.concatenate([batch.publish_time for batch in batches]),
-        np.concatenate([batch.sequence for batch in batches]),
-    )
+        yield joined(held)
 
 
 def _split(batch: Batch) -> Iterator[Batch]:

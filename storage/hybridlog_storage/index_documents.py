@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.copying import joined
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from hybridlog_storage.messages import Batch
     from hybridlog_storage.segment_writer import StoredChunk
 
 KEY_BYTES: Final = 20
@@ -78,25 +79,15 @@ class Placed(NamedTuple):
     def of(cls, chunks: Sequence[StoredChunk]) -> Self:
         """All messages of one chunk or more; of several the contents are copied together."""
         batches = [chunk.batch for chunk in chunks]
-        counts = [len(batch) for batch in batches]
-        segment = np.array([chunk.segment for chunk in chunks], np.int32).repeat(counts)
-        place = np.array([chunk.offset for chunk in chunks], np.int64).repeat(counts)
-        number = np.arange(len(chunks)).repeat(counts)
-        if len(chunks) == 1:
-            return cls(batches[0], chunks[0].seq, number, segment, place, batches[0].offset)
-        offset = np.concatenate([batch.offset for batch in batches])
-        sizes = np.array([len(batch.buffer) for batch in batches])
-        whole = Batch(
-            b"".join([batch.buffer for batch in batches]),
-            offset + (np.cumsum(sizes) - sizes).repeat(counts),
-            np.concatenate([batch.length for batch in batches]),
-            np.concatenate([batch.channel for batch in batches]),
-            np.concatenate([batch.log_time for batch in batches]),
-            np.concatenate([batch.publish_time for batch in batches]),
-            np.concatenate([batch.sequence for batch in batches]),
+        number = np.arange(len(chunks)).repeat([len(batch) for batch in batches])
+        return cls(
+            joined(batches),
+            np.concatenate([chunk.seq for chunk in chunks]),
+            number,
+            np.array([chunk.segment for chunk in chunks], np.int32)[number],
+            np.array([chunk.offset for chunk in chunks], np.int64)[number],
+            np.concatenate([batch.offset for batch in batches]),
         )
-        seq = np.concatenate([chunk.seq for chunk in chunks])
-        return cls(whole, seq, number, segment, place, offset)
 
 
 class DocumentAssembler:
