@@ -171,6 +171,10 @@ class FakePublisher:
     def uri(self) -> str:
         return self.server.uri
 
+    def withdraw(self) -> None:
+        """Takes no more subscribers, as a node does that has unadvertised the topic."""
+        self.topic = ""
+
     def _request_topic(self, caller: str, topic: str, protocols: list[Any]) -> list[Any]:
         assert caller.startswith("/hybridlog_")
         assert protocols == [["TCPROS"]]

@@ -160,8 +160,10 @@ def test_a_topic_goes_and_comes_back() -> None:
         connection.sendall(framed(b"x"))
         closing.wait(10)
 
-    with _system(FakePublisher(until_told)) as (master, sink):
+    publisher = FakePublisher(until_told)
+    with _system(publisher) as (master, sink):
         sink.wait_for(b"x")
+        publisher.withdraw()
         master.remove("/topic", "/node")
         closing.set()
         sink.wait(lambda: ("/topic",) in sink.topics)
