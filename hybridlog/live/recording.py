@@ -48,7 +48,7 @@ _LARGE = 1 << 17  # bytes from which a payload is laid down at once
 _MEDIUM = 1 << 13  # and from which by itself: to join it to others first would copy it twice
 _MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
 _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
-_TICK_S = 0.05  # the writing thread looks so often when little comes, or it has no batches
+_TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
 _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
 _FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
 _PATIENCE = 4  # flush intervals for which chunks of few messages wait to be indexed together,
@@ -448,7 +448,7 @@ class LiveRecording:
         flushed = told = looked = time.monotonic()
         seen = 0
         interval = self._options.flush_interval_s
-        tick = min(_TICK_S, interval / 16)
+        tick = min(_TICK_S, interval / 10)
         with suppress(BaseException), self._failing():
             while True:
                 with suppress(Empty):
