@@ -192,9 +192,14 @@ class Message:
 
 
 class _Documents:
-    """The index documents of a piece, made for all its messages when one is asked for."""
+    """The index documents of a piece, made for all its messages when one is asked for.
 
-    def __init__(self, lanes: Sequence[Lane], batch: Batch) -> None:
+    Args:
+        lanes: By what `batch.channel` holds.
+        batch: The messages.
+    """
+
+    def __init__(self, lanes: Sequence[Lane] | Mapping[int, Lane], batch: Batch) -> None:
         self._lanes = lanes
         self._batch = batch
         self._bodies: dict[int, bytes] = {}
@@ -469,10 +474,19 @@ class Query:
         if found is None:
             return None
         batch = found.batch.take(slice(found.row, found.row + 1))
-        lane = lanes[int(batch.channel[0])]
-        batch.channel = np.zeros(1, np.int32)
-        count_given(self.counters, batch)
-        return next(_messages([lane], Piece(batch, np.array([found.seq]))))
+        view = batch.payload(0)
+        self.counters.messages += 1
+        self.counters.payload_bytes += len(view)
+        return Message(
+            lanes[batch.channel.item()],
+            log_time=found.log_time,
+            publish_time=batch.publish_time.item(),
+            sequence=batch.sequence.item(),
+            seq=found.seq,
+            view=view,
+            documents=_Documents(lanes, batch),
+            row=0,
+        )
 
     def _last_that_satisfies(
         self, recording: RecordingEntry, span: tuple[int, int]

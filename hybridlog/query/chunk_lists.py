@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -139,18 +140,20 @@ class _ChunkList:
         held.sort(key=lambda item: item[1][0])
         self._chunks = [chunk for chunk, _ in held]
         spans = np.array([span for _, span in held], np.int64).reshape(-1, 2)
-        self._first, self._last = np.ascontiguousarray(spans.T)
-        self._longest = int((self._last - self._first).max()) if held else 0
-        self._last_by = np.maximum.accumulate(self._last)
+        first, self._last = np.ascontiguousarray(spans.T)
+        self._longest = int((self._last - first).max()) if held else 0
+        # As lists: one number is looked up at a time, for which numpy takes ten times as long.
+        self._first: list[int] = first.tolist()
+        self._last_by: list[int] = np.maximum.accumulate(self._last).tolist()
 
     def between(self, begin: int, end: int) -> list[ChunkEntry]:
-        low = int(np.searchsorted(self._first, begin - self._longest))
-        high = int(np.searchsorted(self._first, end))
+        low = bisect_left(self._first, begin - self._longest)
+        high = bisect_left(self._first, end)
         rows = np.flatnonzero(self._last[low:high] >= begin) + low
         return [self._chunks[row] for row in rows.tolist()]
 
     def before(self, latest: int) -> Iterator[tuple[ChunkEntry, int]]:
-        place = int(np.searchsorted(self._first, latest, "right"))
+        place = bisect_right(self._first, latest)
         while place > 0:
             place -= 1
-            yield self._chunks[place], int(self._last_by[place])
+            yield self._chunks[place], self._last_by[place]

@@ -53,7 +53,8 @@ def last_message(
         if best is not None and last < best.log_time:
             break
         chunk = read(entry)
-        row = _last_row(chunk.batch, channels, latest)
+        others = not all(channel in channels for channel in entry.stats)
+        row = _last_row(chunk.batch, channels if others else None, latest)
         if row is not None:
             place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
             if best is None or place > (best.log_time, best.seq):
@@ -61,11 +62,15 @@ def last_message(
     return best
 
 
-def _last_row(batch: Batch, channels: Collection[int], latest: int) -> int | None:
-    is_wanted = np.zeros(max(int(batch.channel.max()), *channels) + 1, np.bool_)
-    is_wanted[list(channels)] = True
-    (rows,) = (is_wanted[batch.channel] & (batch.log_time <= latest)).nonzero()
+def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> int | None:
+    """The row of the last message; `channels` is None when the batch has no others."""
+    fits = batch.log_time <= latest
+    if channels is not None:
+        is_wanted = np.zeros(max(channels) + 2, np.bool_)  # the last one stands for all others
+        is_wanted[list(channels)] = True
+        fits &= is_wanted.take(batch.channel, mode="clip")
+    (rows,) = fits.nonzero()
     if not len(rows):
         return None
     # Rows are in the order of arrival: of equal times the last one counts.
-    return int(rows[-1 - int(batch.log_time[rows][::-1].argmax())])
+    return int(rows[-1 - batch.log_time[rows][::-1].argmax()])
