@@ -33,8 +33,9 @@ BATCH_MESSAGES = 16384
 """Most messages of one batch."""
 
 MAX_CHUNK = 1 << 30
-_TOO_MUCH = 1 << 63  # for BSON, and for the size of any file
 """Largest chunk or payload, in uncompressed bytes, that a source will unpack."""
+
+_TOO_MUCH = 1 << 63  # for BSON, and for the size of any file
 
 
 @dataclass(frozen=True, slots=True)
