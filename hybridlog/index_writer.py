@@ -65,33 +65,52 @@ class _Parcel:
 
 
 class _Few:
-    """Chunks of few messages, which wait until there are more of them.
+    """Chunks of few messages, which wait until there are more of them. Thread safe.
 
     A topic that says four things a second has a chunk of four messages each second, so that
     no more can be lost. To make documents of such a chunk, and to insert them, costs as much
-    as of one of a hundred.
+    as of one of a hundred; and so does to wake the thread that makes documents.
     """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._chunks: list[StoredChunk] = []
+        self._ungathered: deque[StoredChunk] = deque()  # of these, in the order of the file
         self._channels: dict[int, Channel] = {}
         self._size = 0
         self._since = 0.0
 
-    @staticmethod
-    def takes(chunk: StoredChunk) -> bool:
-        """Whether a chunk is one of these."""
-        return len(chunk.batch) <= _FEW and len(chunk.batch.buffer) <= _FEW_BYTES
+    def add(
+        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_gathered: bool
+    ) -> bool:
+        """Have a chunk wait, if it is one of these, and there is room.
 
-    def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Have a chunk wait; of a recording that is recovered each segment has its channels."""
-        self._channels.update(channels)
-        if not self._chunks:
-            self._since = time.monotonic()
-        # A copy: its buffer may have room for a hundred times as much.
-        content = bytes(chunk.batch.buffer)
-        self._chunks.append(replace(chunk, batch=replace(chunk.batch, buffer=content)))
-        self._size += len(content)
+        Args:
+            chunk: The chunk.
+            channels: What it is about; of a recording that is recovered each segment has its
+                own.
+            is_gathered: Whether its columns have been made.
+
+        Returns:
+            Whether it does.
+        """
+        size = len(chunk.batch.buffer)
+        if len(chunk.batch) > _FEW or size > _FEW_BYTES:
+            return False
+        with self._lock:
+            if self.is_full:
+                return False
+            if not self._chunks:
+                self._since = time.monotonic()
+            # A copy: its buffer may have room for a hundred times as much.
+            batch = replace(chunk.batch, buffer=bytes(chunk.batch.buffer))
+            waits = replace(chunk, batch=batch)
+            self._channels.update(channels)
+            self._chunks.append(waits)
+            if not is_gathered:
+                self._ungathered.append(waits)
+            self._size += size
+        return True
 
     @property
     def is_full(self) -> bool:
@@ -103,10 +122,32 @@ class _Few:
         """Seconds for which the first one has waited; 0 without any."""
         return time.monotonic() - self._since if self._chunks else 0.0
 
+    def ungathered(
+        self, before: StoredChunk | None = None
+    ) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
+        """Those of which columns are to be made now, in the order of the file.
+
+        Args:
+            before: Only those that lie before this chunk; None for all.
+        """
+        found = []
+        with self._lock:
+            while self._ungathered:
+                first = self._ungathered[0]
+                if before is not None and _place(first) > _place(before):
+                    break
+                found.append(self._ungathered.popleft())
+        return found, self._channels
+
     def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
         """All that wait, which do so no longer, and their channels."""
-        chunks, self._chunks, self._size = self._chunks, [], 0
+        with self._lock:
+            chunks, self._chunks, self._size = self._chunks, [], 0
         return chunks, self._channels
+
+
+def _place(chunk: StoredChunk) -> tuple[int, int]:
+    return chunk.segment, chunk.offset
 
 
 class Lag:
@@ -263,6 +304,10 @@ class IndexWriter:
         if self._crash is not None:
             raise self._crash
         self._channels = channels
+        if self.failure is None and self._few.add(chunk, channels, is_gathered=False):
+            if self._few.is_full:
+                self._maker.submit(self._make_few).add_done_callback(self._done)
+            return
         if not self._room.acquire(blocking=self._lag is None):
             self._forget(chunk)
             self._catch_up()
@@ -433,22 +478,29 @@ class IndexWriter:
             return
         if self._lag is not None and not _is_large(chunk):
             self._lag.wait()
-        if self._gatherer is not None and not is_gathered:
-            self._gatherer.add(chunk, channels)
-        if not self._few.takes(chunk):
+        if not is_gathered:
+            # Columns are laid down in the order of the file, for as long as that can be.
+            self._gather(*self._few.ungathered(before=chunk))
+            self._gather([chunk], channels)
+        if not self._few.add(chunk, channels, is_gathered=True):
             self._index([chunk], channels)
-            return
-        self._few.add(chunk, channels)
-        if self._few.is_full:
+        elif self._few.is_full:
             self._make_few()
 
     def _make_few(self) -> None:
         """Make documents of the chunks that wait for others."""
+        if self._lag is not None:
+            self._lag.wait()
         chunks, channels = self._few.take()
+        self._gather(*self._few.ungathered())
         if chunks:
-            if self._lag is not None:
-                self._lag.wait()
             self._index(chunks, channels)
+
+    def _gather(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
+        """Make columns of chunks."""
+        if self._gatherer is not None:
+            for chunk in chunks:
+                self._gatherer.add(chunk, channels)
 
     def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
         self._parcel.add(*self._indexer.documents_of(chunks, channels))

@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog import index_writer
+from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.demo.write import write_bag
 from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
@@ -733,6 +734,44 @@ def test_no_more_than_so_many_chunks_wait_for_others(
         wait_for(lambda: together == [4, 4])
     assert together == [4, 4, 2]
     assert recording.close().indexed == 10
+    assert store.verify().findings == []
+
+
+def test_columns_are_made_in_the_order_of_the_file(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of chunks that wait, too: together, or when one comes that does not wait."""
+    monkeypatch.setattr(live, "_patience", lambda _: 1e9)
+    gathered: list[int] = []
+    real = FieldGatherer.add
+
+    def seen(self: FieldGatherer, chunk: StoredChunk, *args: Any) -> None:
+        gathered.append(chunk.offset)
+        real(self, chunk, *args)
+
+    monkeypatch.setattr(FieldGatherer, "add", seen)
+    slow, large = channel("/slow"), channel("/large")
+    with store.start("talk", flush_interval_s=0.05) as recording:
+        totals = recording._capture.writer.totals
+
+        def say(own: Channel, size: int) -> None:
+            before = totals.chunks
+            recording.write(own, text(b"y" * size))
+            wait_for(lambda: totals.chunks == before + 1)
+
+        say(slow, 2000)
+        say(slow, 2000)
+        assert not gathered
+        say(large, 200_000)
+        wait_for(lambda: len(gathered) == 3)
+        say(slow, 2000)
+        assert len(gathered) == 3
+    assert len(gathered) == 4
+    assert gathered == sorted(set(gathered))
+    (entry,) = store.recordings()
+    columns = store.columns(entry.id)
+    assert columns is not None
+    assert all(columns.has(entry, own.topic, {}) for own in (slow, large))
     assert store.verify().findings == []
 
 
