@@ -41,9 +41,9 @@ _PARCEL_CHUNKS = 32
 BACKLOG = 8
 """Chunks that may wait for the index in memory, if nobody says."""
 _FEW = 32  # messages, and
-_FEW_BYTES = 128 << 10  # bytes of a chunk up to which it is not worth documents of its own
+_FEW_BYTES = 1 << 20  # bytes of a chunk up to which it is not worth documents of its own
 _FEW_CHUNKS = 512  # that wait for others, at most
-_FEW_WAITING = 4 << 20  # and bytes of them
+_FEW_WAITING = 16 << 20  # and bytes of them
 _MOST_LATEST = 4096  # chunks: far more than a server that is killed has not in its journal
 
 

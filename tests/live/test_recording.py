@@ -321,6 +321,13 @@ def test_the_index_falls_behind_and_catches_up(
     assert store.verify().findings == []
 
 
+@pytest.fixture
+def each_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No chunk waits for others to be indexed with it."""
+    monkeypatch.setattr(index_writer, "_FEW_BYTES", 0)
+
+
+@pytest.mark.usefixtures("each_by_itself")
 def test_what_was_let_go_does_not_keep_others_waiting(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,6 +371,7 @@ def test_what_was_let_go_does_not_keep_others_waiting(
     assert store.verify().findings == []
 
 
+@pytest.mark.usefixtures("each_by_itself")
 def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -408,6 +416,7 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
 
 @pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
+@pytest.mark.usefixtures("each_by_itself")
 def test_the_index_waits_while_messages_wait_for_their_turn(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
 ) -> None:
@@ -762,7 +771,7 @@ def test_columns_are_made_in_the_order_of_the_file(
         say(slow, 2000)
         say(slow, 2000)
         assert not gathered
-        say(large, 200_000)
+        say(large, 1_200_000)
         wait_for(lambda: len(gathered) == 3)
         say(slow, 2000)
         assert len(gathered) == 3
