@@ -113,7 +113,9 @@ def summary(state: RecorderState) -> str:
 def _index(state: RecorderState) -> str:
     if state.index_failure:
         return f"index {state.lag} behind: {in_short(state.index_failure)}"
-    return f"index {state.lag} behind" if state.lag else "index up to date"
+    if state.lag > state.waiting:
+        return f"index {state.lag} behind"
+    return "index within seconds" if state.lag else "index up to date"
 
 
 def in_short(reason: str) -> str:

@@ -101,6 +101,7 @@ class RecorderState:
         lost: Messages lost so far, by cause, as far as they can be counted.
         filled: Share of the memory budget that is spent, 0 to 1.
         lag: Messages that are not in the index yet.
+        waiting: Of these, those that wait some seconds for others, to be indexed with them.
         index_failure: Why the index does not go on; empty while it does.
         free_bytes: What the disk has left.
         stored_bytes: Payload bytes stored so far.
@@ -115,6 +116,7 @@ class RecorderState:
     lost: Mapping[str, int]
     filled: float
     lag: int
+    waiting: int
     index_failure: str
     free_bytes: int
     stored_bytes: int
@@ -317,6 +319,7 @@ class Recorder:
             lost,
             self._target.filled,
             self._target.lag,
+            self._target.waiting,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._store_path).free,
             stored_bytes,

@@ -326,6 +326,11 @@ class LiveRecording:
         return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)
 
     @property
+    def waiting(self) -> int:
+        """Of these, messages that wait some seconds for others, to be indexed with them."""
+        return self._capture.index.waiting
+
+    @property
     def index_failure(self) -> HybridlogError | None:
         """Why the index does not go on, None while it does."""
         return self._capture.index.failure

@@ -329,8 +329,10 @@ def test_a_robot_that_was_never_there_is_told(tmp_path: Path) -> None:
     assert "nothing was received" in run("info", store=tmp_path / "store").out
 
 
-def state_with(lost: dict[str, int], *, lag: int = 0, failure: str = "") -> RecorderState:
-    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, failure, 10**9, 10**6)
+def state_with(
+    lost: dict[str, int], *, lag: int = 0, waiting: int = 0, failure: str = ""
+) -> RecorderState:
+    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, waiting, failure, 10**9, 10**6)
 
 
 @pytest.mark.parametrize(
@@ -355,3 +357,15 @@ def test_an_index_that_lags_says_why() -> None:
     failure = "MongoDB at localhost:1 does not answer. Is it running? See the log."
     line = summary(state_with({}, lag=238, failure=failure))
     assert "index 238 behind: MongoDB at localhost:1 does not answer ·" in line
+
+
+@pytest.mark.parametrize(
+    ("lag", "waiting", "told"),
+    [
+        (0, 0, "index up to date"),
+        (80, 80, "index within seconds"),
+        (81, 80, "index 81 behind"),
+    ],
+)
+def test_what_waits_on_purpose_is_not_behind(lag: int, waiting: int, told: str) -> None:
+    assert told in summary(state_with({}, lag=lag, waiting=waiting)).split(" · ")
