@@ -78,7 +78,6 @@ class _Few:
         self._ungathered: deque[StoredChunk] = deque()  # of these, in the order of the file
         self._channels: dict[int, Channel] = {}
         self._size = 0
-        self.messages = 0
         self._since = 0.0
 
     def add(
@@ -111,7 +110,6 @@ class _Few:
             if not is_gathered:
                 self._ungathered.append(waits)
             self._size += size
-            self.messages += len(waits.batch)
         return True
 
     @property
@@ -144,8 +142,7 @@ class _Few:
     def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
         """All that wait, which do so no longer, and their channels."""
         with self._lock:
-            chunks, self._chunks = self._chunks, []
-            self._size = self.messages = 0
+            chunks, self._chunks, self._size = self._chunks, [], 0
         return chunks, self._channels
 
 
@@ -292,11 +289,6 @@ class IndexWriter:
     def database(self) -> Database:
         """Where documents go now."""
         return self._database
-
-    @property
-    def waiting(self) -> int:
-        """Messages that wait for others, to be indexed with them."""
-        return self._few.messages
 
     def totals(self) -> ChannelTotals:
         """Statistics of the channels, of all chunks that are in the index."""

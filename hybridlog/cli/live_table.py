@@ -113,8 +113,8 @@ def summary(state: RecorderState) -> str:
 def _index(state: RecorderState) -> str:
     if state.index_failure:
         return f"index {state.lag} behind: {in_short(state.index_failure)}"
-    if state.lag > state.waiting:
-        return f"index {state.lag} behind"
+    if state.late:
+        return f"index {state.late} behind"
     return "index within seconds" if state.lag else "index up to date"
 
 

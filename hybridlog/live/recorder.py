@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.live.budget import usual_budget
 from hybridlog.live.door import Door
 from hybridlog.live.policy import EVERY, SMALL, Keep, Priority, Rule, Throttle, first_fit, step
-from hybridlog.live.recording import LiveOptions, LiveRecording
+from hybridlog.live.recording import LiveOptions, LiveRecording, indexed_within_s
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
-from hybridlog.live.statistics import Tally, TopicRates, TopicState
+from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
@@ -101,7 +101,7 @@ class RecorderState:
         lost: Messages lost so far, by cause, as far as they can be counted.
         filled: Share of the memory budget that is spent, 0 to 1.
         lag: Messages that are not in the index yet.
-        waiting: Of these, those that wait some seconds for others, to be indexed with them.
+        late: Of these, those that have waited longer than messages of slow topics do.
         index_failure: Why the index does not go on; empty while it does.
         free_bytes: What the disk has left.
         stored_bytes: Payload bytes stored so far.
@@ -116,7 +116,7 @@ class RecorderState:
     lost: Mapping[str, int]
     filled: float
     lag: int
-    waiting: int
+    late: int
     index_failure: str
     free_bytes: int
     stored_bytes: int
@@ -177,6 +177,7 @@ class Recorder:
         self._started = time.monotonic()
         self._offset = time.time() - self._started
         self._looked = self._started
+        self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._state: RecorderState | None = None
@@ -308,7 +309,7 @@ class Recorder:
             for topic, rate in rates
             if rate.tallies or topic in self._present
         ]
-        stored, stored_bytes = self._target.stored
+        lag, (stored, stored_bytes) = self._target.lag, self._target.stored
         failure = self._target.index_failure
         state = RecorderState(
             self.name,
@@ -318,8 +319,8 @@ class Recorder:
             stored,
             lost,
             self._target.filled,
-            self._target.lag,
-            self._target.waiting,
+            lag,
+            self._lateness.late(now, stored, lag),
             "" if failure is None else str(failure),
             shutil.disk_usage(self._store_path).free,
             stored_bytes,

@@ -53,6 +53,7 @@ _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less
 _FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
 _PATIENCE = 4  # flush intervals for which chunks of few messages wait to be indexed together,
 _PATIENCE_S = 4.0  # and seconds at most
+_MAKING_S = 2.0  # that packing, writing, making documents and sending them may take
 _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
 _COPYING = 2  # threads that copy large messages at the same time
@@ -326,11 +327,6 @@ class LiveRecording:
         return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)
 
     @property
-    def waiting(self) -> int:
-        """Of these, messages that wait some seconds for others, to be indexed with them."""
-        return self._capture.index.waiting
-
-    @property
     def index_failure(self) -> HybridlogError | None:
         """Why the index does not go on, None while it does."""
         return self._capture.index.failure
@@ -594,6 +590,11 @@ def _check_payload(payload: object) -> None:
 def _patience(flush_interval_s: float) -> float:
     """Seconds for which chunks of few messages may wait to be indexed together."""
     return min(_PATIENCE * flush_interval_s, _PATIENCE_S)
+
+
+def indexed_within_s(flush_interval_s: float) -> float:
+    """Seconds after which an index that keeps up has a message, at the latest."""
+    return flush_interval_s + _patience(flush_interval_s) + _MAKING_S
 
 
 def _backlog(options: LiveOptions) -> int:

@@ -263,12 +263,6 @@ class Snapshots:
         return 0 if active is None else active.lag
 
     @property
-    def waiting(self) -> int:
-        """Of these, messages that wait some seconds for others, to be indexed with them."""
-        active = self._active
-        return 0 if active is None else active.waiting
-
-    @property
     def index_failure(self) -> HybridlogError | None:
         """Why the index does not go on, None while it does."""
         active = self._active

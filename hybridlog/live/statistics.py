@@ -137,3 +137,30 @@ class TopicRates:
                 deviation = math.sqrt(max(squares / count - (total / count) ** 2, 0.0)) / 1e6
                 worst = deviation if worst is None else max(worst, deviation)
         return worst
+
+
+class Lateness:
+    """Tells messages that the index should have by now from those that came a moment ago.
+
+    Args:
+        within_s: Seconds after which the index has a message that came.
+    """
+
+    def __init__(self, within_s: float) -> None:
+        self._within_s = within_s
+        self._seen: deque[tuple[float, int]] = deque()
+
+    def late(self, now: float, stored: int, lag: int) -> int:
+        """Messages that are not in the index, and should be.
+
+        Args:
+            now: Monotonic, seconds.
+            stored: Messages so far.
+            lag: Of these, those that are not in the index.
+        """
+        self._seen.append((now, stored))
+        due = now - self._within_s
+        while len(self._seen) > 1 and self._seen[1][0] <= due:
+            self._seen.popleft()
+        at, expected = self._seen[0]
+        return max(expected - (stored - lag), 0) if at <= due else 0

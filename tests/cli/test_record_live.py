@@ -330,9 +330,9 @@ def test_a_robot_that_was_never_there_is_told(tmp_path: Path) -> None:
 
 
 def state_with(
-    lost: dict[str, int], *, lag: int = 0, waiting: int = 0, failure: str = ""
+    lost: dict[str, int], *, lag: int = 0, late: int = 0, failure: str = ""
 ) -> RecorderState:
-    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, waiting, failure, 10**9, 10**6)
+    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, late, failure, 10**9, 10**6)
 
 
 @pytest.mark.parametrize(
@@ -360,12 +360,8 @@ def test_an_index_that_lags_says_why() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lag", "waiting", "told"),
-    [
-        (0, 0, "index up to date"),
-        (80, 80, "index within seconds"),
-        (81, 80, "index 81 behind"),
-    ],
+    ("lag", "late", "told"),
+    [(0, 0, "index up to date"), (80, 0, "index within seconds"), (81, 5, "index 5 behind")],
 )
-def test_what_waits_on_purpose_is_not_behind(lag: int, waiting: int, told: str) -> None:
-    assert told in summary(state_with({}, lag=lag, waiting=waiting)).split(" · ")
+def test_what_came_a_moment_ago_is_not_behind(lag: int, late: int, told: str) -> None:
+    assert told in summary(state_with({}, lag=lag, late=late)).split(" · ")
