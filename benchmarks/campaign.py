@@ -220,7 +220,7 @@ def _plan(name: str, choices: Choices) -> _Planned:
     module = import_module(part.module)
     usual = module.Settings.usual(quick=choices.quick)
     asked: dict[str, Any] = {
-        "sizes": _numbers(choices.sizes, "--sizes", parse_size),
+        "sizes": _numbers(choices.sizes, "--sizes", _message_size),
         "rates": _numbers(choices.rates, "--rates", _rate),
         "messages": choices.messages,
         "topics": choices.topics,
@@ -243,6 +243,15 @@ def _numbers(text: str | None, option: str, parse: Any) -> list[Any] | None:
     if numbers[0] <= 0:
         raise UsageError(f"{option}: {numbers[0]} is not above 0.")
     return numbers
+
+
+def _message_size(text: str) -> int:
+    from benchmarks.loads.streams import MIN_SIZE
+
+    size = parse_size(text)
+    if 0 < size < MIN_SIZE:
+        raise UsageError(f"{text}: a message of a stream has {MIN_SIZE} bytes at least.")
+    return size
 
 
 def _rate(text: str) -> float:

@@ -22,7 +22,8 @@ _EXIT_CODES = (
     "    1  a run failed, or backends gave different answers\n"
     "    2  the question is wrong: an option, a name, a directory\n"
     "    3  a log cannot be read\n"
-    "  130  interrupted (Ctrl-C); the same command goes on where it stopped"
+    "  130  interrupted (Ctrl-C); the same command goes on where it stopped\n"
+    "  143  ended (SIGTERM); so does it then"
 )
 
 app = typer.Typer(
@@ -67,7 +68,8 @@ BackendsOption = Annotated[
     typer.Option(
         "--backends",
         "-b",
-        help="Only these, with commas between them; the beginning of a name will do. Repeatable.",
+        help="Only these, with commas between them; the beginning of a name will do if no "
+        "other begins so. Repeatable.",
         metavar="NAME,…",
     ),
 ]

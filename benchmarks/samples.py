@@ -18,6 +18,8 @@ from benchmarks.disturbance import share_taken
 
 Status = Literal["ok", "missing", "failed"]
 NAME = "samples.jsonl"
+DAMAGE = "damage"
+"""Value of a sample of a log that could not be read whole: what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)

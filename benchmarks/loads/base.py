@@ -37,6 +37,7 @@ class Load:
         offset: int64[n], byte in the payload file.
         length: int64[n], bytes of the payload.
         payloads: The payload file.
+        damage: What of a log could not be read and is left out; empty when all was.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Load:
     offset: NDArray[np.int64]
     length: NDArray[np.int64]
     payloads: Path
+    damage: str = ""
 
     def __len__(self) -> int:
         """Number of messages."""
@@ -82,6 +84,7 @@ class Load:
         about = {
             "name": self.name,
             "seed": self.seed,
+            "damage": self.damage,
             "channels": [_channel_to_json(channel) for channel in self.channels],
         }
         # Last: a directory without it is a load that was not finished.
@@ -102,6 +105,7 @@ class Load:
                 seed=about["seed"],
                 channels=tuple(_channel_from_json(value) for value in about["channels"]),
                 payloads=directory / PAYLOADS,
+                damage=about["damage"],
                 **{name: columns[name] for name in columns.files},
             )
 

@@ -12,17 +12,18 @@ from hybridlog.sources.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from benchmarks.loads.base import Load
-    from hybridlog.sources.base import Source
+    from hybridlog.sources.base import Damage, Source
 
 
 def from_log(path: Path, directory: Path, *, seconds: float | None = None) -> Load:
     """Make a load of a log: each message is due when it was recorded.
 
     Messages go in the order of their log times; of equal ones, that of the file counts.
-    What of the log is damaged is left out.
+    What of the log is damaged is left out, and told in the load.
 
     Args:
         path: A file or a directory.
@@ -39,7 +40,14 @@ def from_log(path: Path, directory: Path, *, seconds: float | None = None) -> Lo
         if not _copy(source, spool, seconds):
             lost = source.damage[0].reason if source.damage else "it is empty"
             raise SourceError(f"{path}: no message can be read ({lost}); choose another log")
-        return spool.finish(log_name(path), None, source.channels, seconds)
+        return spool.finish(log_name(path), None, source.channels, seconds, _damage(source.damage))
+
+
+def _damage(places: Sequence[Damage]) -> str:
+    if not places:
+        return ""
+    rest = f", and {len(places) - 1} more" if len(places) > 1 else ""
+    return f"{places[0].reason}{rest}"
 
 
 def _copy(source: Source, spool: Spool, seconds: float | None) -> int:

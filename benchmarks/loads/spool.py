@@ -132,6 +132,7 @@ class Spool:
         seed: int | None,
         channels: Sequence[Channel],
         seconds: float | None = None,
+        damage: str = "",
     ) -> Load:
         """Order what was added by log time, and save it.
 
@@ -143,6 +144,7 @@ class Spool:
             seed: From which it was made; None for a real log.
             channels: One a topic.
             seconds: Leave out what is due this long after the start, or later.
+            damage: What of a log could not be read.
 
         Raises:
             UsageError: There is no message.
@@ -171,6 +173,7 @@ class Spool:
             offset=offset[order],
             length=length[order],
             payloads=self._directory / PAYLOADS,
+            damage=damage,
         )
         load.save(self._directory)
         return load

@@ -22,7 +22,7 @@ from benchmarks.report.book import (
 from benchmarks.report.look import OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number
-from benchmarks.samples import Sample
+from benchmarks.samples import DAMAGE, Sample
 from benchmarks.studies.search import Verdict, bracket, verdict
 
 STUDY = "persistence"
@@ -135,6 +135,10 @@ def findings(book: Book) -> list[str]:
         )
     if kept_by_all:
         found.append(f"Of {listed(kept_by_all)}, every backend that took part kept everything.")
+    for (log,), group in _logs(book.good(STUDY)).items():
+        damage = next((str(one.values[DAMAGE]) for one in group if DAMAGE in one.values), "")
+        if damage:
+            found.append(f"Of {log} only what can be read was published: {damage}.")
     for (log,), group in _logs(_trials(book)).items():
         bounds = [f"{title(name)} {_bound(of)}" for name, of in by_backend(group).items()]
         if bounds:

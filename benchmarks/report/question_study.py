@@ -40,6 +40,12 @@ def section(book: Book) -> Section | None:
         "was the right gripper closed. Q2: every viewpoint that was behind the robot. Q3: how "
         "often was the gripper moved within a region. Q4: how many grasps with the camera in "
         "front, within a time window of half a second to either side, as in the paper's code.",
+        "Beside these stand what the paper only names, and what is asked of logs. Q2 positions: "
+        "the coordinates of the viewpoints of Q2, as a frame. Q4 ±0.1 s: Q4 within a tenth of a "
+        "second, as in the paper's text. Viewpoint changes: how often the user changed the "
+        "viewpoint. Closed minutes: minutes, none of which overlap, in which the gripper was "
+        "closed. Before errors: messages of all topics in the five minutes before each error, "
+        "each counted once.",
         "hybridlog has four rows: through pymongo, word for word what MongoDB is asked, and the "
         "same questions through its own API; each without and with the indexes that the indexed "
         "row of MongoDB has: the paper's, and one on the time of every topic. MongoDB is asked "

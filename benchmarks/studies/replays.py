@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.loads.base import Load
 from benchmarks.loads.cut import cut
 from benchmarks.loads.logs import from_log, log_name
+from hybridlog.cli.output import note
 from hybridlog.sources.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 
@@ -207,8 +208,15 @@ def _real(path: Path, seconds: float, taken: Iterable[str]) -> Replay:
         {**_case(name, seconds), "bytes": size},
         {"version": _VERSION, "files": files, "seconds": seconds},
         lasts,
-        partial(from_log, path, seconds=seconds),
+        partial(_read, path, seconds=seconds),
     )
+
+
+def _read(path: Path, directory: Path, *, seconds: float) -> Load:
+    load = from_log(path, directory, seconds=seconds)
+    if load.damage:
+        note(f"benchmarks: {path} is damaged, the rest of it is published: {load.damage}")
+    return load
 
 
 def _case(name: str, seconds: float) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from benchmarks.disturbance import MOST_RUNS, is_disturbed
 from benchmarks.harness.run import Setting
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
-from benchmarks.samples import Journal, Sample, Status
+from benchmarks.samples import DAMAGE, Journal, Sample, Status
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -134,7 +134,8 @@ class Context:
         setting = Setting(speed=speed, intake=backend.intake, timeout_s=self.timeout_s)
         with run_directory(self.work) as directory:
             outcome = run_load(load, backend, directory, setting)
-        return _filled(wanted, outcome.status, outcome.values, outcome.reason)
+        damage = {DAMAGE: load.damage} if load.damage else {}
+        return _filled(wanted, outcome.status, {**outcome.values, **damage}, outcome.reason)
 
 
 def chosen(

@@ -284,6 +284,7 @@ def test_no_report_when_none_is_wanted(study: Study, tmp_path: Path) -> None:
         (["-b", ","], "names none"),
         (["--sizes", "big"], "'big' is no size"),
         (["--sizes", "0"], "not above 0"),
+        (["--sizes", "5kB,127"], "has 128 bytes at least"),
         (["--sizes", ","], "--sizes is empty"),
         (["--rates", "x"], "'x' is no rate"),
         (["--rates", "-4"], "no rate that a topic can have"),

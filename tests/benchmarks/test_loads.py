@@ -28,6 +28,7 @@ from benchmarks.loads.mit_like import mit_like
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.timing import received, steady
 from benchmarks.loads.truth import NAME, Truth
+from hybridlog.sources.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 from hybridlog_storage.messages import Channel
 from tests import independent
@@ -591,7 +592,13 @@ def test_damaged_logs(path: Path, tmp_path: Path) -> None:
         assert not Load.is_complete(tmp_path)
         assert not (tmp_path / PAYLOADS).exists()
     else:
-        assert len(from_log(path, tmp_path)) > 0
+        load = from_log(path, tmp_path)
+        assert len(load) > 0
+        with open_source(path) as source:
+            for _ in source.batches():
+                pass
+            assert bool(load.damage) == bool(source.damage)
+        assert Load.open(tmp_path).damage == load.damage
 
 
 @needs_data

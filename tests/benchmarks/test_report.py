@@ -29,7 +29,7 @@ from benchmarks.report.model import Line, Panel, Report, Section, Table, Value
 from benchmarks.report.page import page
 from benchmarks.report.terminal import show
 from benchmarks.report.write import write
-from benchmarks.samples import Journal, Sample
+from benchmarks.samples import DAMAGE, Journal, Sample
 
 HEADER = {
     "quick": False,
@@ -87,6 +87,15 @@ def stream(backend: str, share: float, repetition: int = 0, **more: float) -> Sa
 
 def whole_log(log: str, backend: str, share: float, **more: float) -> Sample:
     return Sample("persistence", {"log": log}, backend, 0, "ok", run_values(share, **more))
+
+
+def test_a_damaged_log_is_said_to_be_one(tmp_path: Path) -> None:
+    whole, half = whole_log("whole", "mcap", 1.0), whole_log("half", "mcap", 1.0)
+    half = replace(half, values={**half.values, DAMAGE: "it ends in a record"})
+    told = report(journal(tmp_path, whole, half)).findings
+    assert [text for text in told if "can be read" in text] == [
+        "Of half only what can be read was published: it ends in a record."
+    ]
 
 
 def question(name: str, backend: str, ms: float, answer: Any = 3) -> Sample:
