@@ -531,6 +531,7 @@ class Store:
             (report.entry,) = self.select([report.entry.id])
         except DatabaseError as error:
             report.failure = error
+            self.disconnect()  # what it does not know of, the segments do
             self.without_database = error
             return
         report.indexed, report.missed, report.failure = report.entry.messages, 0, None

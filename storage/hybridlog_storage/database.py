@@ -45,6 +45,7 @@ _MOST_TOGETHER = 100
 """Most questions that travel in one command."""
 _BYTES_TOGETHER = 4 << 20
 
+_PING_S = 1.0
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = frozenset({14031})
@@ -186,12 +187,18 @@ class Database:
 
     def close(self) -> None:
         """Close all connections. The object cannot be used any more."""
-        self._client.close()
+        from pymongo import timeout
 
-    def ping(self) -> bool:
-        """Whether the server answers."""
+        # It tells the server which sessions are over, and would wait for one that has ended.
+        with timeout(_PING_S):
+            self._client.close()
+
+    def ping(self, *, timeout_s: float = _PING_S) -> bool:
+        """Whether the server answers within some seconds, however long others wait for it."""
+        from pymongo import timeout
+
         try:
-            with _mapped(self._address):
+            with _mapped(self._address), timeout(timeout_s):
                 self._client.admin.command("ping")
         except DatabaseError:
             return False

@@ -648,6 +648,29 @@ def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.
     assert not store.verify().findings
 
 
+def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object, **__: object) -> int:
+        raise DatabaseError("MongoDB refuses it.")
+
+    own = channel("/talk")
+    recording = store.start("talk")
+    with monkeypatch.context() as broken:
+        broken.setattr(Database, "insert_raw", refused)
+        recording.write(own, text(b"kept"), log_time=1)
+        report = recording.close()
+        assert (report.indexed, report.missed) == (0, 1)
+        assert isinstance(report.failure, DatabaseError)
+    assert store.database is None
+    assert [m.raw for m in store.topic("/talk")] == [text(b"kept")]
+    with pytest.raises(DatabaseError, match="refuses it"):
+        store.topic("/talk").where("data == 'kept'").count()
+    with hl.open(store.directory.path) as again:
+        assert again.topic("/talk").where("data == 'kept'").count() == 1
+        assert again.verify().findings == []
+
+
 def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     store: hl.Store,
 ) -> None:
