@@ -105,7 +105,7 @@ class Load:
                 seed=about["seed"],
                 channels=tuple(_channel_from_json(value) for value in about["channels"]),
                 payloads=directory / PAYLOADS,
-                damage=about["damage"],
+                damage=about.get("damage", ""),  # loads are kept from run to run, older ones too
                 **{name: columns[name] for name in columns.files},
             )
 
