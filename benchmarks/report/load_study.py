@@ -119,7 +119,8 @@ def findings(book: Book) -> list[str]:
     """What Figure 5 shows, in sentences."""
     found = []
     kept_by_all = []
-    for (log,), group in _logs(book.good(STUDY)).items():
+    logs = _logs(book.good(STUDY))
+    for (log,), group in logs.items():
         by_name = by_backend(group)
         whole = [name for name, of in by_name.items() if is_whole(of)]
         rest = [name for name in by_name if name not in whole]
@@ -135,7 +136,7 @@ def findings(book: Book) -> list[str]:
         )
     if kept_by_all:
         found.append(f"Of {listed(kept_by_all)}, every backend that took part kept everything.")
-    for (log,), group in _logs(book.good(STUDY)).items():
+    for (log,), group in logs.items():
         damage = next((str(one.values[DAMAGE]) for one in group if DAMAGE in one.values), "")
         if damage:
             found.append(f"Of {log} only what can be read was published: {damage}.")

@@ -45,7 +45,7 @@ _MOST_TOGETHER = 100
 """Most questions that travel in one command."""
 _BYTES_TOGETHER = 4 << 20
 
-_PING_S = 1.0
+_GONE_S = 1.0  # without an answer, after which a server is taken to have ended
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = frozenset({14031})
@@ -190,15 +190,15 @@ class Database:
         from pymongo import timeout
 
         # It tells the server which sessions are over, and would wait for one that has ended.
-        with timeout(_PING_S):
+        with timeout(_GONE_S):
             self._client.close()
 
-    def ping(self, *, timeout_s: float = _PING_S) -> bool:
-        """Whether the server answers within some seconds, however long others wait for it."""
+    def ping(self) -> bool:
+        """Whether the server answers within a second, however long others wait for it."""
         from pymongo import timeout
 
         try:
-            with _mapped(self._address), timeout(timeout_s):
+            with _mapped(self._address), timeout(_GONE_S):
                 self._client.admin.command("ping")
         except DatabaseError:
             return False

@@ -89,15 +89,6 @@ def whole_log(log: str, backend: str, share: float, **more: float) -> Sample:
     return Sample("persistence", {"log": log}, backend, 0, "ok", run_values(share, **more))
 
 
-def test_a_damaged_log_is_said_to_be_one(tmp_path: Path) -> None:
-    whole, half = whole_log("whole", "mcap", 1.0), whole_log("half", "mcap", 1.0)
-    half = replace(half, values={**half.values, DAMAGE: "it ends in a record"})
-    told = report(journal(tmp_path, whole, half)).findings
-    assert [text for text in told if "can be read" in text] == [
-        "Of half only what can be read was published: it ends in a record."
-    ]
-
-
 def question(name: str, backend: str, ms: float, answer: Any = 3) -> Sample:
     return Sample("queries", {"question": name}, backend, 0, "ok", {"ms": ms, "answer": answer})
 
@@ -693,6 +684,15 @@ def test_an_older_report_is_replaced_whole(tmp_path: Path) -> None:
 
 def _left(directory: Path) -> Iterator[Path]:
     return directory.rglob("*.new")
+
+
+def test_a_damaged_log_is_said_to_be_one(tmp_path: Path) -> None:
+    whole, half = whole_log("whole", "mcap", 1.0), whole_log("half", "mcap", 1.0)
+    half = replace(half, values={**half.values, DAMAGE: "it ends in a record"})
+    told = report(journal(tmp_path, whole, half)).findings
+    assert [text for text in told if "can be read" in text] == [
+        "Of half only what can be read was published: it ends in a record."
+    ]
 
 
 def test_logs_that_all_keep_are_told_in_one_sentence(tmp_path: Path) -> None:
