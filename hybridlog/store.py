@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 DEFAULT_STORE = "hybridlog-store"
 EMBEDDED = "embedded"  # in place of a URI: the MongoDB that comes with hybridlog
-_MOST_OPEN_SEGMENTS = 256
+_MOST_OPEN = 256  # segments, and files of columns
 _MOST_WORDS = 128  # topics and predicates whose meaning is remembered
 
 
@@ -430,9 +430,7 @@ class Store:
         with self._lock:
             reader = self._segments.get(key)
             if reader is None:
-                if len(self._segments) >= _MOST_OPEN_SEGMENTS:
-                    # It is closed when the last thread that reads from it lets go of it.
-                    self._segments.pop(next(iter(self._segments)))
+                _make_room(self._segments)
                 path = self.directory.recording(recording) / f"{number:06d}.mcap"
                 reader = self._segments[key] = SegmentReader(path, number)
             return reader
@@ -441,6 +439,7 @@ class Store:
         """The columns that lie beside the segments of a recording; None without good ones."""
         with self._lock:
             if recording not in self._columns:
+                _make_room(self._columns)
                 self._columns[recording] = None
                 with suppress(FileNotFoundError, StoreError):  # the index has the same
                     found = FieldColumns(self.directory.recording(recording))
@@ -643,6 +642,15 @@ def check_claim(database: Database, store_id: str | None = None) -> bool:
             "another store. Name a database of its own in the URI: mongodb://host/NAME."
         )
     return mark is not None
+
+
+def _make_room(opened: dict[Any, Any]) -> None:
+    """Let go of the file that was opened first, if there are many.
+
+    It is closed when the last thread that reads from it lets go of it, too.
+    """
+    if len(opened) >= _MOST_OPEN:
+        del opened[next(iter(opened))]
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.judged import Judged
+    from hybridlog.columns.stored import FieldColumns
     from hybridlog.query.column_filter import Single
     from hybridlog.query.plan import Counters, Lane
     from hybridlog.query.predicate import Predicate
@@ -62,7 +64,7 @@ class _Way(NamedTuple):
     """A way to get columns: what it costs, about, in seconds."""
 
     price: float
-    load: Callable[[Query, Mapping[str, str], bool], TopicColumns]
+    load: Callable[[Mapping[str, str], bool, Counters], TopicColumns]
 
 
 class Asked(NamedTuple):
@@ -287,13 +289,19 @@ class KeptColumns:
 
     def _cheapest_way(self, recording: RecordingEntry, topic: str, wanted: _Wanted) -> _Way:
         """How columns are got for the least."""
-        messages = recording.messages_of(topic)
-        ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, _from_index)]
         file, known = self._store.columns(recording.id), self.types(recording, topic) or {}
-        types = {path: kind for path, kind in known.items() if path in wanted.fields}
-        if file is not None and file.has(recording, topic, types):
-            size = file.size(topic, wanted.fields, ordered=wanted.ordered)
-            ways.append(_Way(_OPEN_S + _STORED_BYTE_S * size, _from_file))
+        if file is not None:
+            types = {path: kind for path, kind in known.items() if path in wanted.fields}
+            with suppress(StoreError):  # of what is damaged, the index has the same
+                if file.has(recording, topic, types):
+                    # It has no more bytes than the payloads, and there is nobody to be asked.
+                    size = file.size(topic, wanted.fields, ordered=wanted.ordered)
+                    # Of many recordings not all files are kept open until then.
+                    load = partial(_from_file, partial(self._store.columns, recording.id), topic)
+                    return _Way(_OPEN_S + _STORED_BYTE_S * size, load)
+        question = partial(self._question, recording, topic)
+        messages = recording.messages_of(topic)
+        ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, partial(_from_index, question))]
         encodings = {lane.channel.message_encoding for lane in self._lanes(recording, topic)}
         if encodings <= SINGLE_READ:
             # Small messages of all topics share chunks, large ones have their own.
@@ -304,7 +312,7 @@ class KeptColumns:
                 if c.topic == topic or (_is_small(c.stats) and not is_own)
             ]
             size = sum(s.payload_bytes + _RECORD_BYTES * s.messages for s in read)
-            ways.append(_Way(_QUESTION_S + _BYTE_S * size, _from_segments))
+            ways.append(_Way(_QUESTION_S + _BYTE_S * size, partial(_from_segments, question)))
         return min(ways, key=lambda way: way.price)
 
     def _load(
@@ -318,19 +326,21 @@ class KeptColumns:
         known = self.types(recording, topic) or {}
         if not wanted.fields <= known.keys():
             raise UnfitError  # all was forgotten meanwhile, and the recording is another one
+        types = {path: known[path] for path in wanted.fields}
+        columns = way.load(types, wanted.ordered, counters)
+        if len(columns) != recording.messages_of(topic) or columns.fields.keys() != wanted.fields:
+            raise UnfitError
+        return columns
+
+    def _question(self, recording: RecordingEntry, topic: str) -> Query:
+        """What asks for all messages of a topic of a recording."""
         assert recording.span is not None
         first, last = recording.span
         query = self._store.query([topic], [recording.id])
         if last + 1 < TIME_LIMIT:
             # The documents of other recordings need not be looked at.
             query = query.between(f"{first}ns", f"{last + 1}ns")
-        columns = way.load(query, {path: known[path] for path in wanted.fields}, wanted.ordered)
-        counters.bytes_read += query.counters.bytes_read
-        counters.chunks_read += query.counters.chunks_read
-        counters.documents_read += query.counters.documents_read
-        if len(columns) != recording.messages_of(topic) or columns.fields.keys() != wanted.fields:
-            raise UnfitError
-        return columns
+        return query
 
     def _keep(self, found: Mapping[tuple[str, str], TopicColumns], generation: int) -> None:
         """Keep these, and of the others those that were used last, as many as have room."""
@@ -360,22 +370,30 @@ def cost_s(messages: float, *, windows: int = 1, as_rows: bool = False) -> float
     return _QUESTION_S * (1 + windows / 14) + messages * (_DOCUMENT_S if as_rows else _LOOK_S)
 
 
-def _from_file(query: Query, types: Mapping[str, str], ordered: bool) -> TopicColumns:  # noqa: FBT001
+def _from_file(
+    opened: Callable[[], FieldColumns | None],
+    topic: str,
+    types: Mapping[str, str],
+    ordered: bool,  # noqa: FBT001
+    counters: Counters,
+) -> TopicColumns:
     """Columns that were laid down with the recording."""
-    (topic,), (recording,) = query.topics, query.recording_ids
-    file = query.store.columns(recording)
+    file = opened()
     if file is None:
         raise UnfitError
     try:
         columns = file.read(topic, types, ordered=ordered)
     except StoreError as error:
         raise UnfitError from error  # the index has what is damaged here
-    query.counters.bytes_read += file.size(topic, types, ordered=ordered)
+    counters.bytes_read += file.size(topic, types, ordered=ordered)
     return columns
 
 
-def _from_segments(query: Query, types: Mapping[str, str], _: object) -> TopicColumns:
+def _from_segments(
+    question: Callable[[], Query], types: Mapping[str, str], _: object, counters: Counters
+) -> TopicColumns:
     """Columns out of payloads."""
+    query = question()
     plan = query.plan()
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Single]]] = []
     try:
@@ -390,11 +408,16 @@ def _from_segments(query: Query, types: Mapping[str, str], _: object) -> TopicCo
                 parts.append((batch.log_time, seq, singles(decoded.records, types)))
     except SegmentError as error:
         raise UnfitError from error  # the index has what is damaged here
+    counters.bytes_read += query.counters.bytes_read
+    counters.chunks_read += query.counters.chunks_read
     return _joined(parts)
 
 
-def _from_index(query: Query, types: Mapping[str, str], _: object) -> TopicColumns:
+def _from_index(
+    question: Callable[[], Query], types: Mapping[str, str], _: object, counters: Counters
+) -> TopicColumns:
     """Columns out of index documents."""
+    query = question()
     projection = {"_id": 1, **dict.fromkeys(types, 1)}
     (topic,) = query.topics
     parts = []
@@ -408,6 +431,7 @@ def _from_index(query: Query, types: Mapping[str, str], _: object) -> TopicColum
                 parts.append((part.reference.t, part.reference.seq, fields))
     except StoreError as error:
         raise UnfitError from error
+    counters.documents_read += query.counters.documents_read
     return _joined(parts)
 
 

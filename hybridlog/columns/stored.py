@@ -33,6 +33,7 @@ ORDERED: Final = "ordered"
 """Noted of a topic: whether its rows are by log time and arrival."""
 RECORDING: Final = "recording"
 """Noted of a topic: the number of its recording."""
+_SPECIAL: Final = {"string": TEXT, "time": "<i8", "duration": "<i8"}
 
 
 class FieldColumns:
@@ -56,16 +57,22 @@ class FieldColumns:
             entry: The recording.
             topic: Full name.
             types: Of the fields, by path, as the definition says.
+
+        Raises:
+            StoreError: What there is of the topic is damaged.
         """
         stored = self._file.types(topic)
-        wanted = {LOG_TIME: "int64", SEQ: "int64", **types}
-        if not all(_fits(stored.get(name), kind) for name, kind in wanted.items()):
+        if not (stored.get(LOG_TIME) == stored.get(SEQ) == "<i8"):
             return False
-        notes = self._file.notes(topic)
-        if notes.get(RECORDING) != entry.key or self._file.rows(topic) != entry.messages_of(topic):
+        if not all(_fits(stored.get(name), kind) for name, kind in types.items()):
+            return False
+        stats = entry.stats_of(topic)
+        if self._file.notes(topic).get(RECORDING) != entry.key:
+            return False
+        if self._file.rows(topic) != sum(part.messages for part in stats):
             return False
         # What is no UTF-8 becomes three bytes; more text than that is not of these messages.
-        most = 3 * sum(stats.payload_bytes for stats in entry.stats_of(topic))
+        most = 3 * sum(part.payload_bytes for part in stats)
         texts = (path for path, kind in types.items() if kind == "string")
         return all(self._file.memory(topic, path) <= most for path in texts)
 
@@ -137,8 +144,7 @@ def _fits(stored: str | None, kind: str) -> bool:
     """Whether columns of a type hold what a definition calls so."""
     if kind in {"byte", "char"}:
         return stored in {"|u1", "|i1"}  # one in ROS 1, the other in ROS 2
-    special = {"string": TEXT, "time": "<i8", "duration": "<i8"}
-    return stored == (special.get(kind) or np.dtype(kind).str)
+    return stored == (_SPECIAL.get(kind) or np.dtype(kind).str)
 
 
 def values_of(column: Single) -> Values:

@@ -4,8 +4,11 @@ What such a file holds follows from other files and can be made again. So nobody
 until it is on the disk; checksums say whether it got there. It grows a block at a time, a
 block being some rows of one column, and is visible under its name only when it is whole.
 
+What there is of a table stands on a page of its own, so that who asks about one table need
+not read about the others.
+
 ```
-magic, blocks, directory, table of blocks, tail, magic
+magic, blocks, pages, directory, tail, magic
 ```
 """
 
@@ -17,8 +20,6 @@ import struct
 from collections.abc import Collection, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
-from itertools import accumulate
-from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -31,11 +32,11 @@ from hybridlog_storage.errors import StoreError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MAGIC: Final = b"\x89HLC1\r\n\n"
+MAGIC: Final = b"\x89HLC2\r\n\n"
 TEXT: Final = "text"
 """Type of a column of strings; all others have a numpy type."""
 
-_TAIL = struct.Struct("<QQI")  # bytes of the directory, number of blocks, checksum of both
+_TAIL = struct.Struct("<QI")  # bytes of the directory, its checksum
 
 
 class _Block(NamedTuple):
@@ -53,7 +54,7 @@ _ENTRY = np.dtype([*zip(_Block._fields, ("<u4", "<u4", "<u8", "<u8", "<u4", "<u4
 _TYPES = frozenset({"|b1", "|i1", "|u1", *(f"<{k}{n}" for k in "iu" for n in (2, 4, 8))})
 _KNOWN = _TYPES | {"<f4", "<f8", TEXT}
 _MOST_ROWS = 1 << 31  # of a block
-_MOST_DIRECTORY = 256 << 20  # bytes of directory and table of blocks
+_MOST_DIRECTORY = 256 << 20  # bytes of the directory, and of all pages together
 _CURE = "Run `hybridlog reindex`; until then MongoDB answers."
 
 
@@ -144,41 +145,30 @@ class ColumnFileWriter:
         Raises:
             OSError: It cannot be written.
         """
-        kept = [name for name in self._tables if name in tables]
-        parts = {
-            name: [rows.blocks for rows in sorted(self._blocks[name], key=lambda rows: rows.place)]
-            for name in kept
-        }
-        directory = json.dumps(
-            {
-                "tables": [
-                    {
-                        "name": name,
-                        "columns": [
-                            [column, kind, len(parts[name])]
-                            for column, kind in self._tables[name].items()
-                        ],
-                        "notes": tables[name],
-                    }
-                    for name in kept
-                ]
-            },
-            separators=(",", ":"),
-        ).encode()
-        # Those of a column lie together.
-        blocks = b"".join(np.array(parts[name]).T.tobytes() for name in kept)
-        crc = crc32(blocks, crc32(directory))
-        if len(directory) + len(blocks) > _MOST_DIRECTORY:
-            kept = []
+        pages = [self._page(name, tables[name]) for name in self._tables if name in tables]
+        directory: dict[str, _Page] = {}
+        at = self._end
+        for name, about, blocks in pages:
+            count = len(blocks) // _ENTRY.itemsize
+            directory[name] = _Page(at, len(about), count, crc32(blocks, crc32(about)))
+            at += directory[name].size
+        told = _as_json(directory)
         try:
-            if kept:
-                tail = _TAIL.pack(len(directory), len(blocks) // _ENTRY.itemsize, crc)
-                self._write([directory, blocks, tail, MAGIC])
+            if pages and at - self._end + len(told) <= _MOST_DIRECTORY:
+                tail = _TAIL.pack(len(told), crc32(told))
+                self._write([part for page in pages for part in page[1:]])
+                self._write([told, tail, MAGIC])
                 self._part.replace(self._path)
             else:
                 self._path.unlink(missing_ok=True)
         finally:
             self.discard()
+
+    def _page(self, name: str, notes: Mapping[str, object]) -> tuple[str, bytes, bytes]:
+        """A table's name, what there is of it, and its blocks: those of a column together."""
+        about = _as_json({"columns": [*self._tables[name].items()], "notes": notes})
+        parts = sorted(self._blocks[name], key=lambda rows: rows.place)
+        return name, about, np.array([rows.blocks for rows in parts]).T.tobytes()
 
     def discard(self) -> None:
         """Leave nothing of what was not given its name, as far as the system lets us."""
@@ -212,10 +202,10 @@ class ColumnFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._fd = -1
+        self._tables: dict[str, _Table] = {}
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-            size = os.fstat(self._fd).st_size
-            self._tables, self._blocks = self._directory(size)
+            self._start, self._pages = self._directory(os.fstat(self._fd).st_size)
         except FileNotFoundError:
             raise
         except OSError as error:
@@ -226,33 +216,35 @@ class ColumnFile:
             os.close(self._fd)
 
     def rows(self, table: str) -> int:
-        """Rows of a table; 0 when there is none of that name."""
-        found = self._tables.get(table)
-        # As many as its first column has.
-        return 0 if found is None else int(self._blocks_of(found, 0)["rows"].sum())
+        """Rows of a table; 0 when there is none of that name.
+
+        Raises:
+            StoreError: What there is of it is damaged; so do all that name a table.
+        """
+        return self._table(table).rows if table in self._pages else 0
 
     def memory(self, table: str, column: str) -> int:
         """Bytes that a column takes when it has been read, without where its strings begin."""
-        blocks = self._of(table, column)
+        blocks = self._table(table).blocks[column]
         times = np.where(blocks["same"] == 1, blocks["rows"], 1).astype(np.float64)
         return int((times * blocks["size"]).sum())
 
     def types(self, table: str) -> Mapping[str, str]:
-        """Types of a table's columns by name."""
-        found = self._tables.get(table)
-        return {} if found is None else found.types
+        """Types of a table's columns by name; none when there is no such table."""
+        return self._table(table).types if table in self._pages else {}
 
     def notes(self, table: str) -> Mapping[str, object]:
         """What is noted of a table."""
-        return self._tables[table].notes
+        return self._table(table).notes
 
     def tables(self) -> AbstractSet[str]:
         """Names of all tables."""
-        return self._tables.keys()
+        return self._pages.keys()
 
     def size(self, table: str, columns: Collection[str]) -> int:
         """Bytes to be read for some columns of a table."""
-        return sum(int(self._of(table, name)["size"].sum()) for name in columns)
+        found = self._table(table)
+        return sum(int(found.blocks[name]["size"].sum()) for name in columns)
 
     def read(self, table: str, column: str) -> Values:
         """A whole column.
@@ -260,15 +252,13 @@ class ColumnFile:
         Raises:
             StoreError: It is damaged.
         """
-        kind, entries = self._tables[table].types[column], self._of(table, column)
-        rows = self.rows(table)
-        if int(entries["rows"].sum()) != rows:
-            raise self._damaged(f"rows of {column!r} of {table!r} are missing")
+        found = self._table(table)
+        kind, blocks = found.types[column], _blocks(found.blocks[column])
         if kind == TEXT:
-            return self._text(_blocks(entries))
-        values = np.empty(rows, kind)
+            return self._text(blocks)
+        values = np.empty(found.rows, kind)
         at = 0
-        for block in _blocks(entries):
+        for block in blocks:
             self._fill(block, values[at : at + block.rows])
             at += block.rows
         return values
@@ -279,55 +269,79 @@ class ColumnFile:
         Raises:
             StoreError: Something is damaged.
         """
-        for table in self._tables:
-            for column in self._tables[table].types:
-                for block in _blocks(self._of(table, column)):
+        for name in self._pages:
+            table = self._table(name)
+            for entries in table.blocks.values():
+                for block in _blocks(entries):
                     self._raw(block)
 
-    def _directory(self, size: int) -> tuple[dict[str, _Table], NDArray[np.void]]:
+    def _directory(self, size: int) -> tuple[int, dict[str, Any]]:
+        """Where it begins, and where the page of each table is, as it says."""
         least = len(MAGIC) * 2 + _TAIL.size
         if size < least or self._read(0, len(MAGIC)) != MAGIC:
             raise self._damaged("it is too short, or no file of columns")
-        tail = self._read(size - least + len(MAGIC), _TAIL.size + len(MAGIC))
-        length, count, crc = _TAIL.unpack_from(tail)
-        whole = length + count * _ENTRY.itemsize
-        start = size - least + len(MAGIC) - whole
-        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC) or whole > _MOST_DIRECTORY:
+        end = size - least + len(MAGIC)
+        tail = self._read(end, _TAIL.size + len(MAGIC))
+        length, crc = _TAIL.unpack_from(tail)
+        start = end - length
+        if tail[_TAIL.size :] != MAGIC or start < len(MAGIC) or length > _MOST_DIRECTORY:
             raise self._damaged("its end is missing")
-        data = self._read(start, whole)
+        data = self._read(start, length)
         if crc32(data) != crc:
             raise self._damaged("the checksum of its directory differs")
-        tables: dict[str, _Table] = {}
-        end = 0
         try:
-            for table in json.loads(data[:length])["tables"]:
-                name, columns = str(table["name"]), table["columns"]
-                names, kinds, counts = zip(*columns, strict=True)
-                types = dict(zip(names, kinds, strict=True))
-                if len(types) != len(columns) or name in tables or min(counts) < 0:
-                    raise self._damaged("its directory has a name twice, or fewer blocks than none")
-                if not _KNOWN.issuperset(kinds):
-                    raise self._damaged("its directory has types that are not known")
-                begins = list(accumulate(map(index, counts), initial=end))
-                end = begins[-1]
-                tables[name] = _Table(types, begins, dict(table["notes"]))
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            pages = json.loads(data)
+        except (ValueError, RecursionError) as error:
             raise self._damaged("its directory cannot be read") from error
-        blocks = np.frombuffer(data[length:], _ENTRY)
-        ends = blocks["offset"] + blocks["size"]
-        beyond = (ends < blocks["offset"]) | (ends > start) | (blocks["rows"] >= _MOST_ROWS)
-        if end != len(blocks) or bool(beyond.any()):
+        if not isinstance(pages, dict):
+            raise self._damaged("its directory cannot be read")
+        return start, pages
+
+    def _page(self, name: str) -> _Page:
+        try:
+            page = _Page(*self._pages[name])
+        except TypeError as error:
+            raise self._damaged("its directory cannot be read") from error
+        if not all(type(part) is int and part >= 0 for part in page):
+            raise self._damaged("its directory cannot be read")
+        if page.offset + page.size > self._start or page.size > _MOST_DIRECTORY:
             raise self._damaged("its directory names places outside of it")
-        return tables, blocks
+        return page
 
-    def _of(self, table: str, column: str) -> NDArray[np.void]:
-        """The blocks of a column, in order."""
-        found = self._tables[table]
-        return self._blocks_of(found, list(found.types).index(column))
+    def _table(self, name: str) -> _Table:
+        """What there is of a table, read when it is first asked for."""
+        table = self._tables.get(name)
+        if table is None:
+            table = self._tables[name] = self._read_table(name)
+        return table
 
-    def _blocks_of(self, table: _Table, column: int) -> NDArray[np.void]:
-        begin, end = table.begins[column : column + 2]
-        return self._blocks[begin:end]
+    def _read_table(self, name: str) -> _Table:
+        page = self._page(name)
+        try:
+            data = self._read(page.offset, page.size)
+        except OSError as error:
+            raise self._damaged(f"it cannot be read: {error.strerror}") from error
+        if crc32(data) != page.crc:
+            raise self._damaged(f"the checksum of what it says of {name!r} differs")
+        try:
+            about = json.loads(data[: page.length])
+            columns, notes = about["columns"], dict(about["notes"])
+            types = {str(column): kind for column, kind in columns}
+            # Each time rows were added, every column got a block.
+            blocks = np.frombuffer(data, _ENTRY, offset=page.length).reshape(len(types), -1)
+            is_known = (
+                len(types) == len(columns) and blocks.size and _KNOWN.issuperset(types.values())
+            )
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise self._damaged(f"what it says of {name!r} cannot be read") from error
+        rows = blocks["rows"]
+        if not is_known or (rows != rows[0]).any() or int(rows.max()) >= _MOST_ROWS:
+            raise self._damaged(f"columns of {name!r} are unknown or unequal")
+        offset, ends = blocks["offset"], blocks["offset"] + blocks["size"]
+        # What is added up beyond 64 bits is less than its parts.
+        if (ends < offset).any() or int(ends.max()) > self._start:
+            raise self._damaged(f"it names places outside of it for {name!r}")
+        return _Table(types, notes, int(rows[0].sum()), dict(zip(types, blocks, strict=True)))
 
     def _fill(self, block: _Block, values: NDArray[Any]) -> None:
         """Rows of a block of numbers, read to where they belong."""
@@ -378,10 +392,27 @@ class ColumnFile:
         return StoreError(f"The columns in {self.path} are damaged: {problem}. {_CURE}")
 
 
+class _Page(NamedTuple):
+    """Where a table's page is: its description in JSON, and its blocks behind that."""
+
+    offset: int
+    length: int  # of the description, bytes
+    blocks: int  # their number
+    crc: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of all of it."""
+        return self.length + self.blocks * _ENTRY.itemsize
+
+
 class _Table(NamedTuple):
-    types: dict[str, str]
-    begins: list[int]  # where the blocks of each column begin among all, and where the last end
+    """What there is of a table."""
+
+    types: dict[str, str]  # of its columns, by name
     notes: dict[str, object]
+    rows: int
+    blocks: dict[str, NDArray[np.void]]  # of each column, in order
 
 
 class _Rows(NamedTuple):
@@ -389,6 +420,10 @@ class _Rows(NamedTuple):
 
     place: tuple[int, int]
     blocks: NDArray[np.void]
+
+
+def _as_json(value: object) -> bytes:
+    return json.dumps(value, separators=(",", ":")).encode()
 
 
 def _blocks(entries: NDArray[np.void]) -> Iterable[_Block]:

@@ -10,6 +10,7 @@ import time
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from hybridlog.columns.kept import MOST_BYTES
 from hybridlog.columns.topic import TopicColumns
 from hybridlog.query.column_filter import ColumnFilter, column_filter
 from hybridlog.reader import Query
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.segment_writer import SegmentSettings
 
@@ -130,17 +132,20 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         yield opened
 
 
-WAYS = {
-    "file": kept_columns._from_file,
-    "segments": kept_columns._from_segments,
-    "index": kept_columns._from_index,
-}
-
-
 def get_by(patch: pytest.MonkeyPatch, way: str, price: float = 0.0) -> None:
     """Let columns be got in one way only, and cost so much."""
-    only = kept_columns._Way(price, WAYS[way])
-    patch.setattr(kept_columns.KeptColumns, "_cheapest_way", lambda *_: only)
+    from_others = {"segments": kept_columns._from_segments, "index": kept_columns._from_index}
+
+    def only(
+        kept: kept_columns.KeptColumns, recording: RecordingEntry, topic: str, _: object
+    ) -> kept_columns._Way:
+        if way == "file":
+            opened = partial(kept._store.columns, recording.id)
+            return kept_columns._Way(price, partial(kept_columns._from_file, opened, topic))
+        question = partial(kept._question, recording, topic)
+        return kept_columns._Way(price, partial(from_others[way], question))
+
+    patch.setattr(kept_columns.KeptColumns, "_cheapest_way", only)
 
 
 @pytest.fixture
@@ -149,7 +154,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     get_by(monkeypatch, "segments")
 
 
-@pytest.fixture(params=WAYS)
+@pytest.fixture(params=["file", "segments", "index"])
 def each_way(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """The same, in each of the ways."""
     get_by(monkeypatch, request.param)

@@ -19,6 +19,7 @@ from hypothesis.extra import numpy as arrays
 from hybridlog_storage.column_file import ColumnFile, ColumnFileWriter, Text, Values
 from hybridlog_storage.errors import StoreError
 
+MAGIC = b"\x89HLC2\r\n\n"
 TYPES = ["|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8"]
 
 
@@ -40,39 +41,45 @@ def strings(column: Values) -> list[str]:
 def plain(path: Path) -> dict[str, dict[str, list[Any]]]:
     """What a file holds, read as its specification says, with `struct` alone."""
     content = path.read_bytes()
-    magic = b"\x89HLC1\r\n\n"
-    assert content.startswith(magic)
-    assert content.endswith(magic)
-    at = len(content) - 8 - 20
-    length, count, crc = struct.unpack_from("<QQI", content, at)
-    start = at - 32 * count - length
-    assert zlib.crc32(content[start:at]) == crc
-    tables = json.loads(content[start : start + length])["tables"]
-    found: dict[str, dict[str, list[Any]]] = {
-        t["name"]: {name: [] for name, *_ in t["columns"]} for t in tables
-    }
-    owners = [(t["name"], *c) for t in tables for c in t["columns"] for _ in range(c[2])]
-    assert len(owners) == count
-    for number, (table, name, kind, _) in enumerate(owners):
-        entry = struct.unpack_from("<IIQQII", content, start + length + 32 * number)
-        rows, same, offset, size, check, _ = entry
-        block = content[offset : offset + size]
-        assert zlib.crc32(block) == check
-        stored = 1 if same else rows
-        cells: list[Any]
-        if kind == "text" and same:
-            cells = [block.decode()]
-        elif kind == "text":
-            lengths = struct.unpack_from(f"<{rows}I", block)
-            ends = [4 * rows + sum(lengths[: n + 1]) for n in range(rows)]
-            cells = [block[e - n : e].decode() for e, n in zip(ends, lengths, strict=True)]
-        else:
-            code = {"b1": "?", "f4": "f", "f8": "d"}.get(kind[1:])
-            code = code or {1: "b", 2: "h", 4: "i", 8: "q"}[int(kind[2:])]
-            code = code.upper() if kind[1] == "u" else code
-            cells = list(struct.unpack(f"<{stored}{code}", block))
-        found[table][name] += cells * (rows if same else 1)
+    assert content.startswith(MAGIC)
+    assert content.endswith(MAGIC)
+    end = len(content) - 8 - 12
+    length, crc = struct.unpack_from("<QI", content, end)
+    assert zlib.crc32(content[end - length : end]) == crc
+    found: dict[str, dict[str, list[Any]]] = {}
+    for table, (at, about_length, count, crc) in json.loads(content[end - length : end]).items():
+        page = content[at : at + about_length + 32 * count]
+        assert zlib.crc32(page) == crc
+        about = json.loads(page[:about_length])
+        found[table] = {name: [] for name, _ in about["columns"]}
+        each = count // len(found[table])
+        owners = [c for c in about["columns"] for _ in range(each)]
+        assert len(owners) == count
+        for number, (name, kind) in enumerate(owners):
+            entry = struct.unpack_from("<IIQQII", page, about_length + 32 * number)
+            found[table][name] += cells_of(content, kind, entry)
     return found
+
+
+def cells_of(content: bytes, kind: str, entry: tuple[int, ...]) -> list[Any]:
+    """The rows of one block."""
+    rows, same, offset, size, check, _ = entry
+    block = content[offset : offset + size]
+    assert zlib.crc32(block) == check
+    stored = 1 if same else rows
+    cells: list[Any]
+    if kind == "text" and same:
+        cells = [block.decode()]
+    elif kind == "text":
+        lengths = struct.unpack_from(f"<{rows}I", block)
+        ends = [4 * rows + sum(lengths[: n + 1]) for n in range(rows)]
+        cells = [block[e - n : e].decode() for e, n in zip(ends, lengths, strict=True)]
+    else:
+        code = {"b1": "?", "f4": "f", "f8": "d"}.get(kind[1:])
+        code = code or {1: "b", 2: "h", 4: "i", 8: "q"}[int(kind[2:])]
+        code = code.upper() if kind[1] == "u" else code
+        cells = list(struct.unpack(f"<{stored}{code}", block))
+    return cells * (rows if same else 1)
 
 
 kinds = st.sampled_from([*TYPES, "text"])
@@ -200,36 +207,84 @@ def test_every_changed_byte_and_every_cut_is_noticed(tmp_path: Path) -> None:
     assert bits(ColumnFile(path).read("poses", "x")) == 2 * bits(columns["x"])
 
 
+def file_of(path: Path, directory: bytes, page: bytes = b"", blocks: bytes = b"") -> ColumnFile:
+    """A file made by hand; its directory may name the place of the page."""
+    start = len(MAGIC) + len(blocks)
+    told = directory.replace(b"START", b"%d" % start).replace(b"CRC", b"%d" % zlib.crc32(page))
+    tail = struct.pack("<QI", len(told), zlib.crc32(told))
+    path.write_bytes(MAGIC + blocks + page + told + tail + MAGIC)
+    return ColumnFile(path)
+
+
 @pytest.mark.parametrize(
-    "directory",
-    [
-        b"",
-        b"[]",
-        b"{}",
-        b"[" * 100_000,
-        b'{"tables":3}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8"]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",0]],"notes":3}]}',
-        b'{"tables":[{"name":"a","columns":[["x","O",0]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x",["<f8"],0]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",0],["x","<f8",0]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",0]],"notes":{}},'
-        b'{"name":"a","columns":[["x","<f8",0]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",1]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",1],["y","<f8",-1]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",1e400]],"notes":{}}]}',
-        b'{"tables":[{"name":"a","columns":[["x","<f8",null]],"notes":{}}]}',
-        b"\xff",
-    ],
+    "directory", [b"", b"[]", b"3", b"[" * 100_000, b'{"a":' * 100_000, b"\xff", b"{1:2}"]
 )
 def test_a_hostile_directory_is_refused(tmp_path: Path, directory: bytes) -> None:
-    path = tmp_path / "some"
-    magic = b"\x89HLC1\r\n\n"
-    tail = struct.pack("<QQI", len(directory), 0, zlib.crc32(directory))
-    path.write_bytes(magic + directory + tail + magic)
     with pytest.raises(StoreError, match="damaged"):
-        ColumnFile(path)
+        file_of(tmp_path / "some", directory)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        b"3",
+        b"null",
+        b'"abcd"',
+        b"[]",
+        b"[8,0,0]",
+        b"[8,0,0,0,0]",
+        b"[8,0,0,null]",
+        b"[8,true,0,0]",
+        b"[8.0,0,0,0]",
+        b"[1e400,0,0,0]",
+        b"[-1,8,0,0]",
+        b"[8,-8,0,0]",
+        b"[8,0,-1,0]",
+        b"[8,0,1000,0]",
+        b"[1000000,0,0,0]",
+        b"[8,10000000000000000000000000,0,0]",
+        b"[8,0,0,1]",
+        b"[8,0,0,0]",
+        b'{"offset":8,"length":0,"blocks":0,"crc":0}',
+    ],
+)
+def test_a_hostile_place_of_a_page_is_refused(tmp_path: Path, place: bytes) -> None:
+    file = file_of(tmp_path / "some", b'{"a":' + place + b"}")
+    for ask in (file.types, file.rows, file.notes):
+        with pytest.raises(StoreError, match="damaged"):
+            ask("a")
+    with pytest.raises(StoreError, match="damaged"):
+        file.check()
+    assert not file.rows("b")
+
+
+@pytest.mark.parametrize(
+    ("about", "count"),
+    [
+        (b"", 1),
+        (b"[]", 1),
+        (b"{}", 1),
+        (b"[" * 100_000, 1),
+        (b'{"columns":3,"notes":{}}', 1),
+        (b'{"columns":[],"notes":{}}', 0),
+        (b'{"columns":[],"notes":{}}', 1),
+        (b'{"columns":[["x","<f8"]],"notes":3}', 1),
+        (b'{"columns":[["x","<f8"]],"notes":{}}', 0),
+        (b'{"columns":[["x"]],"notes":{}}', 1),
+        (b'{"columns":[["x","O"]],"notes":{}}', 1),
+        (b'{"columns":[["x",["<f8"]]],"notes":{}}', 1),
+        (b'{"columns":[["x","<f8"],["x","<f8"]],"notes":{}}', 1),
+        (b'{"columns":[["x","<f8"],["x","<f8"]],"notes":{}}', 2),
+        (b'{"columns":[["x","<f8"],["y","<f8"]],"notes":{}}', 3),
+        (b"\xff", 1),
+    ],
+)
+def test_a_hostile_page_is_refused(tmp_path: Path, about: bytes, count: int) -> None:
+    page = about + struct.pack("<IIQQII", 1, 0, 8, 8, zlib.crc32(bytes(8)), 0) * count
+    told = b'{"a":[START,%d,%d,CRC]}' % (len(about), count)
+    file = file_of(tmp_path / "some", told, page, bytes(8))
+    with pytest.raises(StoreError, match="damaged"):
+        file.types("a")
 
 
 @pytest.mark.parametrize(
@@ -245,31 +300,62 @@ def test_a_hostile_directory_is_refused(tmp_path: Path, directory: bytes) -> Non
     ],
 )
 def test_hostile_blocks_are_refused(tmp_path: Path, entry: tuple[Any, ...]) -> None:
-    path = tmp_path / "some"
-    magic = b"\x89HLC1\r\n\n"
     column, *block = entry
-    counts = {"x": 0, "s": 0, column: 1}
-    directory = (
-        b'{"tables":[{"name":"a","columns":[["x","<f8",%d],["s","text",%d]],"notes":{}}]}'
-        % (counts["x"], counts["s"])
-    )
-    blocks = struct.pack("<IIQQII", *block)
-    tail = struct.pack("<QQI", len(directory), 1, zlib.crc32(directory + blocks))
-    path.write_bytes(magic + bytes(8) + directory + blocks + tail + magic)
+    kind = {"x": b"<f8", "s": b"text"}[column]
+    about = b'{"columns":[["%s","%s"]],"notes":{}}' % (column.encode(), kind)
+    told = b'{"a":[START,%d,1,CRC]}' % len(about)
     with pytest.raises(StoreError, match="damaged"):
-        ColumnFile(path).read("a", column)
+        file_of(tmp_path / "some", told, about + struct.pack("<IIQQII", *block), bytes(8)).read(
+            "a", column
+        )
 
 
-@pytest.mark.parametrize(("length", "count"), [((1 << 40) - 8, 0), (0, 1 << 27)])
-def test_a_directory_of_gigabytes_is_not_read(tmp_path: Path, length: int, count: int) -> None:
-    path, magic = tmp_path / "some", b"\x89HLC1\r\n\n"
+def test_columns_of_unequal_length_are_refused(tmp_path: Path) -> None:
+    about = b'{"columns":[["x","<f8"],["y","<f8"]],"notes":{}}'
+    crc = zlib.crc32(bytes(8))
+    page = about + struct.pack("<IIQQII", 1, 0, 8, 8, crc, 0)
+    page += struct.pack("<IIQQII", 2, 1, 8, 8, crc, 0)
+    file = file_of(tmp_path / "some", b'{"a":[START,%d,2,CRC]}' % len(about), page, bytes(8))
+    with pytest.raises(StoreError, match="unequal"):
+        file.read("a", "x")
+
+
+def test_a_directory_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "some"
     with path.open("wb") as file:
-        file.write(magic)
+        file.write(MAGIC)
         file.truncate(1 << 40)
         file.seek(0, os.SEEK_END)
-        file.write(struct.pack("<QQI", length, count, 0) + magic)
+        file.write(struct.pack("<QI", (1 << 40) - 8, 0) + MAGIC)
     with pytest.raises(StoreError, match="its end is missing"):
         ColumnFile(path)
+
+
+def test_a_page_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "some"
+    told = b'{"a":[8,0,%d,0]}' % (1 << 30)
+    with path.open("wb") as file:
+        file.write(MAGIC)
+        file.truncate(1 << 40)
+        file.seek(0, os.SEEK_END)
+        file.write(told + struct.pack("<QI", len(told), zlib.crc32(told)) + MAGIC)
+    with pytest.raises(StoreError, match="places outside of it"):
+        ColumnFile(path).rows("a")
+
+
+def test_one_damaged_page_leaves_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "some"
+    writer = ColumnFileWriter(path)
+    for name in ("one", "two"):
+        writer.append(name, {"x": np.arange(3)})
+    writer.close({"one": {}, "two": {}})
+    content = path.read_bytes()
+    place = json.loads(content[content.rindex(b'{"one"') : -20])["two"][0]
+    path.write_bytes(content[:place] + b"?" + content[place + 1 :])
+    file = ColumnFile(path)
+    assert bits(file.read("one", "x")) == np.arange(3).tobytes()
+    with pytest.raises(StoreError, match="what it says of 'two' differs"):
+        file.types("two")
 
 
 def test_without_a_table_there_is_no_file(tmp_path: Path) -> None:
