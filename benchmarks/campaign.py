@@ -499,7 +499,7 @@ def _finish(journal: Journal, out: Path, *, write: bool, as_json: bool) -> int:
     if as_json:
         print_json(_as_json(found, journal, files))
     else:
-        show(found, Book(journal.samples.values()))
+        show(found, Book(journal))
         for path in files:
             note(f"benchmarks: wrote {path}")
     sys.stdout.flush()

@@ -72,6 +72,8 @@ class Journal:
         self.samples: dict[str, Sample] = {}
         """By key, the last of each; of several that succeeded, that which the machine
         disturbed least."""
+        self.runs: dict[str, int] = {}
+        """By the same keys: in which run each was taken, as a place in `headers`."""
         self._successes: Counter[str] = Counter()
         self._end = 0
         """Of the last whole line. What is behind it was cut off in the middle, and goes when
@@ -119,6 +121,7 @@ class Journal:
             ):
                 return
         self.samples[sample.key] = sample
+        self.runs[sample.key] = len(self.headers) - 1
 
     def _append(self, line: Mapping[str, Any]) -> None:
         data = json.dumps(line, allow_nan=False).encode() + b"\n"

@@ -38,7 +38,7 @@ def from_log(path: Path, directory: Path, *, seconds: float | None = None) -> Lo
         raise UsageError(f"{seconds:g} s of a log are nothing; choose more than 0 s")
     with open_source(path) as source, Spool(directory) as spool:
         if not _copy(source, spool, seconds):
-            lost = source.damage[0].reason if source.damage else "it is empty"
+            lost = _damage(source.damage) or "it is empty"
             raise SourceError(f"{path}: no message can be read ({lost}); choose another log")
         return spool.finish(log_name(path), None, source.channels, seconds, _damage(source.damage))
 

@@ -10,7 +10,7 @@ from benchmarks.disturbance import is_disturbed
 from benchmarks.report import numbers
 from benchmarks.report.look import ordered
 from benchmarks.report.model import Cell, Value
-from benchmarks.samples import Sample
+from benchmarks.samples import Journal, Sample
 
 MB = 1e6
 GB = 1e9
@@ -22,11 +22,12 @@ class Book:
     """Samples by study.
 
     Args:
-        samples: All of a journal.
+        journal: Of which.
     """
 
-    def __init__(self, samples: Iterable[Sample]) -> None:
-        self.all = list(samples)
+    def __init__(self, journal: Journal) -> None:
+        self.all = list(journal.samples.values())
+        self._runs = journal.runs
 
     def good(self, study: str) -> list[Sample]:
         """Samples of a study that went well."""
@@ -35,6 +36,16 @@ class Book:
     def bad(self, status: str) -> list[Sample]:
         """Samples that are `missing` or `failed`, of all studies."""
         return [one for one in self.all if one.status == status]
+
+    def in_same_runs(
+        self, one: Sequence[Sample], other: Sequence[Sample]
+    ) -> tuple[Sequence[Sample], Sequence[Sample]] | None:
+        """Of two groups of samples those of the runs that both have; None without such a run."""
+        runs = {self._runs[s.key] for s in one} & {self._runs[s.key] for s in other}
+        if not runs:
+            return None
+        mine, theirs = ([s for s in of if self._runs[s.key] in runs] for of in (one, other))
+        return mine, theirs
 
 
 def grouped(samples: Iterable[Sample], key: Callable[[Sample], K]) -> dict[K, list[Sample]]:

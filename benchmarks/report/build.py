@@ -25,7 +25,7 @@ def report(journal: Journal) -> Report:
     Args:
         journal: Of one or more runs.
     """
-    book = Book(journal.samples.values())
+    book = Book(journal)
     quick = any(header.get("quick") for header in journal.headers)
     marks = []
     if quick:
@@ -59,7 +59,7 @@ def report(journal: Journal) -> Report:
         cost.timing(book),
         noise.section(book, journal.headers),
         conditions.not_run(book),
-        conditions.machine(journal.headers),
+        conditions.machine(journal),
     ]
     return Report(
         title=f"{TITLE} (quick run)" if quick else TITLE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +13,7 @@ from benchmarks.report.look import ordered, title
 from benchmarks.report.model import Cell, Section, Table
 from benchmarks.report.numbers import listed
 from benchmarks.report.paper import NOT_RUN
-from benchmarks.samples import Sample
+from benchmarks.samples import Journal, Sample
 
 _MACHINE = (
     ("cpu", "processor"),
@@ -165,14 +166,13 @@ def findings(book: Book) -> list[str]:
     return found
 
 
-def machine(headers: Sequence[Mapping[str, Any]]) -> Section:
+def machine(journal: Journal) -> Section:
     """Machine, versions, seeds, settings, of each run that the journal has."""
     # A run that was stopped and taken up again is the same one to a reader.
-    distinct: list[Mapping[str, Any]] = []
-    for header in headers:
-        same = [{k: v for k, v in one.items() if k not in _MOMENT} for one in distinct]
-        if {k: v for k, v in header.items() if k not in _MOMENT} not in same:
-            distinct.append(header)
+    together: dict[str, list[int]] = {}
+    for place, header in enumerate(journal.headers):
+        together.setdefault(_lasting(header), []).append(place)
+    distinct = [journal.headers[places[0]] for places in together.values()]
     shared: dict[str, object] = {}
     different: dict[str, list[object]] = {}
     for key, name in (*_MACHINE, *_settings(distinct)):
@@ -189,11 +189,12 @@ def machine(headers: Sequence[Mapping[str, Any]]) -> Section:
         )
     ]
     if len(distinct) > 1:
-        tables.append(_runs(distinct, different))
+        numbers = {place: n for n, own in enumerate(together.values(), 1) for place in own}
+        tables += [_runs(distinct, different), _taken(journal, numbers)]
         text = ["To run them again: the commands in the last column, in their order."]
     else:
-        commands = list(dict.fromkeys(_command(header) for header in headers))
-        text = [f"To run it again: `{command}`" for command in commands if command]
+        commands = [command for header in distinct if (command := _command(header))]
+        text = [f"To run it again: `{command}`" for command in commands]
     text.append(
         "The same command goes on where it was stopped; `--restart` begins anew. "
         "`python -m benchmarks report` draws this report again from the journal alone. "
@@ -201,6 +202,35 @@ def machine(headers: Sequence[Mapping[str, Any]]) -> Section:
     )
     return Section(
         "rerun", "Machine, versions, and how to run it again", tuple(text), (), tuple(tables)
+    )
+
+
+def _lasting(header: Mapping[str, Any]) -> str:
+    """What a run has in common with itself taken up again."""
+    kept = {name: part for name, part in header.items() if name not in _MOMENT}
+    return json.dumps(kept, sort_keys=True)
+
+
+def _taken(journal: Journal, numbers: Mapping[int, int]) -> Table:
+    """Which run each figure was taken in: by backend, and what was measured."""
+    good = [one for one in journal.samples.values() if one.status == "ok"]
+    whats = sorted({coverage.what(one) for one in good})
+    rows = []
+    for backend, own in by_backend(good).items():
+        cells: list[Cell] = [title(backend)]
+        for what in whats:
+            days: dict[str, dict[int, None]] = {}
+            for place in sorted(journal.runs[o.key] for o in own if coverage.what(o) == what):
+                day = str(journal.headers[place].get("started", ""))[:10]
+                days.setdefault(day, {})[numbers[place]] = None
+            shown = [f"{day}: {', '.join(map(str, runs))}" for day, runs in days.items()]
+            cells.append("; ".join(shown) or None)
+        rows.append(tuple(cells))
+    return Table(
+        "What is of which run",
+        ("", *(name for _, name in whats)),
+        tuple(rows),
+        "The day, and the numbers that the runs have in the table above.",
     )
 
 
@@ -239,7 +269,7 @@ def _runs(headers: Sequence[Mapping[str, Any]], different: Mapping[str, list[obj
     return Table("The runs", ("run", *plain, "settings", "command"), tuple(rows))
 
 
-_MOMENT = frozenset({"started", "load_1min", "command"})
+_MOMENT = frozenset({"started", "load_1min"})
 
 
 def _settings(headers: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:

@@ -11,6 +11,7 @@ from benchmarks.report.book import (
     by_case,
     cpu_per_gb,
     ends,
+    middle,
     named,
     number,
     ratio,
@@ -54,26 +55,35 @@ def findings(book: Book) -> list[str]:
     """
     told: dict[int, list[str]] = {}
     for (length, rate), group in by_case(book.good(_STUDY), "size", "rate").items():
-        if text := _beside_databases(length, rate, group):
+        if text := _beside_databases(book, length, rate, group):
             told.setdefault(length, []).append(text)
     return [text for length in ends(told) for text in ends(told[length])]
 
 
-def _beside_databases(length: int, rate: float, samples: Sequence[Sample]) -> str:
-    """CPU time of ours and of the thriftiest database; empty when either was not measured."""
+def _beside_databases(book: Book, length: int, rate: float, samples: Sequence[Sample]) -> str:
+    """CPU time of ours and of the thriftiest database; empty when either was not measured.
+
+    A machine is faster on one day than on another, so it is that of runs of both, if any.
+    """
+    groups = by_backend(samples)
     medians = {
         name: one.median
-        for name, group in by_backend(samples).items()
+        for name, group in groups.items()
         if (one := value(group, _cpu_both)) is not None
     }
     others = [name for name in databases(medians) if medians[name]]
     if not medians.get(OURS) or not others:
         return ""
     best = min(others, key=lambda name: medians[name])
+    ours, theirs, where = medians[OURS], medians[best], ""
+    if (both := book.in_same_runs(groups[OURS], groups[best])) is not None:
+        mine, other = (middle(group, _cpu_both) for group in both)
+        if mine and other:
+            ours, theirs, where = mine, other, " in the same runs"
     return (
         f"At {size(length)} a message and {rate:g} Hz a topic, a GB costs hybridlog "
-        f"{shown(medians[OURS])} s of CPU time; the thriftiest database, {title(best)}, takes "
-        f"{shown(medians[best])} s ({times(medians[best] / medians[OURS])} as much)."
+        f"{shown(ours)} s of CPU time; the thriftiest database, {title(best)}, takes "
+        f"{shown(theirs)} s{where} ({times(theirs / ours)} as much)."
     )
 
 

@@ -44,6 +44,13 @@ _STUDIES = {
 }
 
 
+def what(sample: Sample) -> tuple[tuple[int, float], str]:
+    """What a sample is of, in the words of its study, behind its place among all studies."""
+    rate = float(sample.case.get("rate", 0)) if sample.study == "throughput" else 0.0
+    name = f"streams, {rate:g} Hz" if rate else _STUDIES[sample.study].title
+    return (list(_STUDIES).index(sample.study), rate), name
+
+
 def table(book: Book) -> Table | None:
     """What each study lacks; None when nothing does."""
     rows = tuple(

@@ -42,9 +42,10 @@ def _section(section: Section, figures: Mapping[str, str]) -> list[str]:
 
 
 def _table(table: Table) -> str:
+    side = "---" if table.is_words else "---:"
     lines = [
         _row(table.columns),
-        _row(["---", *(["---:"] * (len(table.columns) - 1))], raw=True),
+        _row(["---", *([side] * (len(table.columns) - 1))], raw=True),
     ]
     for row in table.rows:
         shown = [cell(one) for one in row]

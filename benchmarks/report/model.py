@@ -33,6 +33,8 @@ class Value:
         return cls(float(median(known)), float(known[0]), float(known[-1]), len(known))
 
 
+_LONGEST_NUMBER = 40  # characters
+
 Cell = str | Value | None
 """None is what was not measured: it is shown as a dash, never as a zero."""
 
@@ -54,6 +56,12 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
     emphasis: str = ""
+
+    @property
+    def is_words(self) -> bool:
+        """Whether the cells are sentences, which stand on the left."""
+        cells = (cell for row in self.rows for cell in row[1:])
+        return any(isinstance(cell, str) and len(cell) > _LONGEST_NUMBER for cell in cells)
 
 
 @dataclass(frozen=True, slots=True)

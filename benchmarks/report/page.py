@@ -75,16 +75,11 @@ def _table(table: Table) -> str:
         cells = "".join(f"<td>{_spread(one)}</td>" for one in others)
         rows.append(f'<tr{mark}><th scope="row">{name}</th>{cells}</tr>')
     note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
-    kind = "words" if _is_words(table) else "numbers"
+    kind = "words" if table.is_words else "numbers"
     return (
         f'<h3>{_text(table.title)}</h3><div class="wide"><table class="{kind}">'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>{note}"
     )
-
-
-def _is_words(table: Table) -> bool:
-    """Whether the cells are sentences, which stand on the left."""
-    return any(isinstance(one, str) and len(one) > 40 for row in table.rows for one in row[1:])
 
 
 def _spread(text: str) -> str:

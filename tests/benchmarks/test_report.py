@@ -255,6 +255,21 @@ def test_cost_is_compared_at_the_same_rate(tmp_path: Path) -> None:
     ]
 
 
+def test_cost_is_compared_in_runs_of_both(tmp_path: Path) -> None:
+    def cost(backend: str, repetition: int, cpu_s: float) -> Sample:
+        return stream(backend, 1.0, repetition, cpu_s=cpu_s, server_cpu_s=0.0)
+
+    def told() -> str:
+        (one,) = (text for text in report(Journal(tmp_path)).findings if "of CPU time" in text)
+        return one
+
+    journal(tmp_path, cost("sqlite_udf", 0, 1.0), cost("sqlite_udf", 1, 1.0))
+    journal(tmp_path, cost("hybridlog", 0, 4.0), cpu="slow")
+    assert "takes 10 s (0.25 times as much)" in told()
+    journal(tmp_path, cost("hybridlog", 1, 4.0), cost("sqlite_udf", 2, 5.0), cpu="slow")
+    assert "takes 50 s in the same runs (1.25 times as much)" in told()
+
+
 def ceiling_trial(backend: str, rate: int, share: float, repetition: int = 0) -> Sample:
     case = {"size": 5000, "rate": rate, "topics": 20, "messages": 500}
     return Sample("ceiling", case, backend, repetition, "ok", run_values(share, mb=rate / 10))
@@ -487,8 +502,7 @@ def test_runs_of_other_machines_are_noted(tmp_path: Path) -> None:
     found = report(journal(tmp_path, started="later"))
     assert found.warnings == ()
     assert len(table(found, "Machine, versions").columns) == 2
-    found = report(journal(tmp_path, command=["python", "-m", "benchmarks", "taken up"]))
-    assert "To run it again: `python -m benchmarks 'taken up'`" in all_text(found)
+    assert "To run it again: `python -m benchmarks all --out 'a b'`" in all_text(found)
     found = report(journal(tmp_path, cpu="another"))
     assert any("processor" in text and "not alike" in text for text in found.warnings)
     assert "processor" not in dict(table(found, "Machine, versions").rows)
@@ -496,6 +510,24 @@ def test_runs_of_other_machines_are_noted(tmp_path: Path) -> None:
     place = runs.columns.index("processor")
     assert [row[place] for row in runs.rows] == ["a processor", "another"]
     assert "python -m benchmarks all --out 'a b'" in all_text(found)
+
+
+def test_it_says_which_run_each_figure_was_taken_in(tmp_path: Path) -> None:
+    second = {"started": "2026-11-25T20:00:00+00:00", "command": ["benchmarks", "again"]}
+    journal(tmp_path, stream("hybridlog", 1.0), started="2026-11-24T10:00:00+00:00")
+    journal(tmp_path, stream("mongo_json", 0.5), started="2026-11-25T10:00:00+00:00")
+    journal(tmp_path, stream("hybridlog", 0.9, 1), stream("mcap", 1.0, 1), **second)
+    found = report(journal(tmp_path, question("Q1", "hybridlog", 3.0), cpu="another"))
+    taken = table(found, "What is of which run")
+    assert taken.columns == ("", "streams, 64 Hz", "questions")
+    first, again = "2026-11-24: 1", "2026-11-25: 2"
+    assert taken.rows == (
+        ("hybridlog", f"{first}; {again}", f"{HEADER['started']}: 3"),
+        ("MongoDB", "2026-11-25: 1", None),
+        ("plain MCAP", again, None),
+    )
+    # The run that was taken up again is one, the one with another command is not.
+    assert len(table(found, "The runs").rows) == 3
 
 
 def test_what_runs_share_is_said_once(tmp_path: Path) -> None:
@@ -655,7 +687,7 @@ def test_the_terminal_shows_no_control_characters(
 ) -> None:
     failed = Sample("persistence", {"log": "x\x1b"}, "mcap", 0, "failed", {}, "no\x1b[2J")
     found = journal(tmp_path, failed)
-    show(report(found), Book(found.samples.values()))
+    show(report(found), Book(found))
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "1 run failed" in said
