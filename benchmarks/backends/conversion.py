@@ -373,7 +373,7 @@ def _replace_nul(value: object) -> object:
     return [_replace_nul(item) for item in value] if isinstance(value, list) else value
 
 
-def _encode(document: Document) -> str:
+def _encode(value: object) -> str:
     import orjson
 
-    return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+    return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -202,10 +202,12 @@ def test_what_a_crash_has_left_gets_all_its_columns(recorded: hl.Store) -> None:
     assert not list(path.glob("**/*.part"))
 
 
-def test_damage_is_found_told_and_mended(recorded: hl.Store) -> None:
+@pytest.mark.parametrize("part", ["block", "page", "directory"])
+def test_damage_is_found_told_and_mended(recorded: hl.Store, part: str) -> None:
     file = file_of(recorded)
     content = bytearray(file.read_bytes())
-    content[20] ^= 1
+    page = content.index(b'{"columns"')
+    content[{"block": 20, "page": page + 4, "directory": len(content) - 30}[part]] ^= 1
     file.write_bytes(content)
     recorded.refresh()
     assert [recorded.topic("/state").where("i8 == 1").count() for _ in range(3)] == [16] * 3
