@@ -16,6 +16,7 @@ MB = 1e6
 GB = 1e9
 
 K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
 
 
 class Book:
@@ -48,11 +49,11 @@ class Book:
         return mine, theirs
 
 
-def grouped(samples: Iterable[Sample], key: Callable[[Sample], K]) -> dict[K, list[Sample]]:
-    """Samples by what `key` says of each, in their order."""
-    found: dict[K, list[Sample]] = defaultdict(list)
-    for sample in samples:
-        found[key(sample)].append(sample)
+def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Samples, or what else there is, by what `key` says of each, in their order."""
+    found: dict[K, list[T]] = defaultdict(list)
+    for item in items:
+        found[key(item)].append(item)
     return dict(found)
 
 

@@ -169,9 +169,7 @@ def findings(book: Book) -> list[str]:
 def machine(journal: Journal) -> Section:
     """Machine, versions, seeds, settings, of each run that the journal has."""
     # A run that was stopped and taken up again is the same one to a reader.
-    together: dict[str, list[int]] = {}
-    for place, header in enumerate(journal.headers):
-        together.setdefault(_lasting(header), []).append(place)
+    together = grouped(range(len(journal.headers)), lambda place: _lasting(journal.headers[place]))
     distinct = [journal.headers[places[0]] for places in together.values()]
     shared: dict[str, object] = {}
     different: dict[str, list[object]] = {}
@@ -215,17 +213,19 @@ def _taken(journal: Journal, numbers: Mapping[int, int]) -> Table:
     """Which run each figure was taken in: by backend, and what was measured."""
     good = [one for one in journal.samples.values() if one.status == "ok"]
     whats = sorted({coverage.what(one) for one in good})
+
+    def day(place: int) -> str:
+        return str(journal.headers[place].get("started", ""))[:10]
+
+    def shown(samples: Sequence[Sample]) -> str | None:
+        days = grouped(sorted({journal.runs[one.key] for one in samples}), day)
+        runs = {when: dict.fromkeys(str(numbers[p]) for p in of) for when, of in days.items()}
+        return "; ".join(f"{when}: {', '.join(of)}" for when, of in runs.items()) or None
+
     rows = []
     for backend, own in by_backend(good).items():
-        cells: list[Cell] = [title(backend)]
-        for what in whats:
-            days: dict[str, dict[int, None]] = {}
-            for place in sorted(journal.runs[o.key] for o in own if coverage.what(o) == what):
-                day = str(journal.headers[place].get("started", ""))[:10]
-                days.setdefault(day, {})[numbers[place]] = None
-            shown = [f"{day}: {', '.join(map(str, runs))}" for day, runs in days.items()]
-            cells.append("; ".join(shown) or None)
-        rows.append(tuple(cells))
+        by_what = grouped(own, coverage.what)
+        rows.append((title(backend), *(shown(by_what.get(what, ())) for what in whats)))
     return Table(
         "What is of which run",
         ("", *(name for _, name in whats)),

@@ -66,13 +66,9 @@ def _beside_databases(book: Book, length: int, rate: float, samples: Sequence[Sa
     A machine is faster on one day than on another, so it is that of runs of both, if any.
     """
     groups = by_backend(samples)
-    medians = {
-        name: one.median
-        for name, group in groups.items()
-        if (one := value(group, _cpu_both)) is not None
-    }
-    others = [name for name in databases(medians) if medians[name]]
-    if not medians.get(OURS) or not others:
+    medians = {name: one for name, of in groups.items() if (one := middle(of, _cpu_both))}
+    others = databases(medians)
+    if OURS not in medians or not others:
         return ""
     best = min(others, key=lambda name: medians[name])
     ours, theirs, where = medians[OURS], medians[best], ""

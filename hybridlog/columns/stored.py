@@ -62,17 +62,14 @@ class FieldColumns:
             StoreError: What there is of the topic is damaged.
         """
         stored = self._file.types(topic)
-        if not (stored.get(LOG_TIME) == stored.get(SEQ) == "<i8"):
+        wanted = {LOG_TIME: "int64", SEQ: "int64", **types}
+        if not all(_fits(stored.get(name), kind) for name, kind in wanted.items()):
             return False
-        if not all(_fits(stored.get(name), kind) for name, kind in types.items()):
-            return False
-        stats = entry.stats_of(topic)
-        if self._file.notes(topic).get(RECORDING) != entry.key:
-            return False
-        if self._file.rows(topic) != sum(part.messages for part in stats):
+        notes = self._file.notes(topic)
+        if notes.get(RECORDING) != entry.key or self._file.rows(topic) != entry.messages_of(topic):
             return False
         # What is no UTF-8 becomes three bytes; more text than that is not of these messages.
-        most = 3 * sum(part.payload_bytes for part in stats)
+        most = 3 * sum(stats.payload_bytes for stats in entry.stats_of(topic))
         texts = (path for path, kind in types.items() if kind == "string")
         return all(self._file.memory(topic, path) <= most for path in texts)
 

@@ -145,10 +145,10 @@ class ColumnFileWriter:
         Raises:
             OSError: It cannot be written.
         """
-        pages = [self._page(name, tables[name]) for name in self._tables if name in tables]
+        pages = {name: self._page(name, tables[name]) for name in self._tables if name in tables}
         directory: dict[str, _Page] = {}
         at = self._end
-        for name, about, blocks in pages:
+        for name, (about, blocks) in pages.items():
             count = len(blocks) // _ENTRY.itemsize
             directory[name] = _Page(at, len(about), count, crc32(blocks, crc32(about)))
             at += directory[name].size
@@ -156,7 +156,7 @@ class ColumnFileWriter:
         try:
             if pages and at - self._end + len(told) <= _MOST_DIRECTORY:
                 tail = _TAIL.pack(len(told), crc32(told))
-                self._write([part for page in pages for part in page[1:]])
+                self._write([part for page in pages.values() for part in page])
                 self._write([told, tail, MAGIC])
                 self._part.replace(self._path)
             else:
@@ -164,11 +164,11 @@ class ColumnFileWriter:
         finally:
             self.discard()
 
-    def _page(self, name: str, notes: Mapping[str, object]) -> tuple[str, bytes, bytes]:
-        """A table's name, what there is of it, and its blocks: those of a column together."""
+    def _page(self, name: str, notes: Mapping[str, object]) -> tuple[bytes, bytes]:
+        """What there is of a table, and its blocks: those of a column together."""
         about = _as_json({"columns": [*self._tables[name].items()], "notes": notes})
         parts = sorted(self._blocks[name], key=lambda rows: rows.place)
-        return name, about, np.array([rows.blocks for rows in parts]).T.tobytes()
+        return about, np.array([rows.blocks for rows in parts]).T.tobytes()
 
     def discard(self) -> None:
         """Leave nothing of what was not given its name, as far as the system lets us."""
@@ -209,7 +209,7 @@ class ColumnFile:
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise self._damaged(f"it cannot be read: {error.strerror}") from error
+            raise self._unreadable(error) from error
 
     def __del__(self) -> None:
         if self._fd >= 0:
@@ -317,10 +317,7 @@ class ColumnFile:
 
     def _read_table(self, name: str) -> _Table:
         page = self._page(name)
-        try:
-            data = self._read(page.offset, page.size)
-        except OSError as error:
-            raise self._damaged(f"it cannot be read: {error.strerror}") from error
+        data = self._read(page.offset, page.size)
         if crc32(data) != page.crc:
             raise self._damaged(f"the checksum of what it says of {name!r} differs")
         try:
@@ -381,12 +378,18 @@ class ColumnFile:
         try:
             count = os.preadv(self._fd, [data], block.offset)
         except OSError as error:
-            raise self._damaged(f"it cannot be read: {error.strerror}") from error
+            raise self._unreadable(error) from error
         if count != len(data) or crc32(data) != block.crc:
             raise self._damaged(f"the checksum of the block at byte {block.offset} differs")
 
     def _read(self, offset: int, size: int) -> bytes:
-        return os.pread(self._fd, size, offset)
+        try:
+            return os.pread(self._fd, size, offset)
+        except OSError as error:
+            raise self._unreadable(error) from error
+
+    def _unreadable(self, error: OSError) -> StoreError:
+        return self._damaged(f"it cannot be read: {error.strerror}")
 
     def _damaged(self, problem: str) -> StoreError:
         return StoreError(f"The columns in {self.path} are damaged: {problem}. {_CURE}")
