@@ -211,7 +211,12 @@ def _lasting(header: Mapping[str, Any]) -> str:
 
 def _taken(journal: Journal, numbers: Mapping[int, int]) -> Table:
     """Which run each figure was taken in: by backend, and what was measured."""
-    good = [one for one in journal.samples.values() if one.status == "ok"]
+    good = [
+        one
+        for key, one in journal.samples.items()
+        # A journal may come from elsewhere: of a study that is not known, or of no run.
+        if one.status == "ok" and one.study in coverage.STUDIES and journal.runs[key] in numbers
+    ]
     whats = sorted({coverage.what(one) for one in good})
 
     def day(place: int) -> str:

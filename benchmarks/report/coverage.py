@@ -34,7 +34,7 @@ def _rows(of: Mapping[str, Mapping[str, str]]) -> list[str]:
     return [row for rows in of.values() for row in rows]
 
 
-_STUDIES = {
+STUDIES = {
     "throughput": _Study("throughput", ("size", "rate"), "streams", list(BACKENDS)),
     "ceiling": _Study("ceilings", ("size",), "sizes", list(BACKENDS)),
     "persistence": _Study("whole logs", ("log",), "logs", list(BACKENDS)),
@@ -42,20 +42,21 @@ _STUDIES = {
     "queries": _Study("questions", ("question",), "questions", _rows(ASKERS)),
     "reading": _Study("reading back", ("task",), "tasks", _rows(READERS)),
 }
+"""By the names that samples have for them."""
 
 
 def what(sample: Sample) -> tuple[tuple[int, float], str]:
     """What a sample is of, in the words of its study, behind its place among all studies."""
     rate = float(sample.case.get("rate", 0)) if sample.study == "throughput" else 0.0
-    name = f"streams, {rate:g} Hz" if rate else _STUDIES[sample.study].title
-    return (list(_STUDIES).index(sample.study), rate), name
+    name = f"streams, {rate:g} Hz" if rate else STUDIES[sample.study].title
+    return (list(STUDIES).index(sample.study), rate), name
 
 
 def table(book: Book) -> Table | None:
     """What each study lacks; None when nothing does."""
     rows = tuple(
         (study.title, text)
-        for name, study in _STUDIES.items()
+        for name, study in STUDIES.items()
         if (text := _lacks(study, book.good(name)))
     )
     return Table("What was not measured", ("study", "without"), rows) if rows else None

@@ -530,6 +530,16 @@ def test_it_says_which_run_each_figure_was_taken_in(tmp_path: Path) -> None:
     assert len(table(found, "The runs").rows) == 3
 
 
+def test_a_journal_with_what_is_not_known_is_reported(tmp_path: Path) -> None:
+    stray, whole = Journal(tmp_path), tmp_path / "samples.jsonl"
+    stray.add(stream("hybridlog", 1.0))  # of no run
+    journal(tmp_path, Sample("tomorrow's", {}, "mcap", 0, "ok", {"ms": 1.0}))
+    found = report(journal(tmp_path, stream("mongo_json", 0.5), cpu="another"))
+    assert whole.read_bytes().startswith(b'{"kind": "sample"')
+    taken = table(found, "What is of which run")
+    assert taken.rows == (("MongoDB", f"{HEADER['started']}: 2"),)
+
+
 def test_what_runs_share_is_said_once(tmp_path: Path) -> None:
     journal(tmp_path, stream("hybridlog", 1.0), packages={"mcap": "1", "numpy": "2"})
     found = report(journal(tmp_path, packages={"mcap": "1", "numpy": "3"}, python="3.99"))
