@@ -43,7 +43,9 @@ class Capture:
         behind: Says whether it has so much more that the index waits, falls behind, and
             reads back later from the segments what is no longer in memory. None when
             whoever appends may wait for the index.
-        backlog: Most chunks that wait for the index in memory.
+        backlog: Most chunks that wait for the index in memory,
+        backlog_bytes: and most bytes of more than the usual number of them.
+        short: Says whether memory is so short that no more than that number should wait.
         renew: With `behind`: another connection to the index when one has failed.
         on_written: Called, on another thread, when less waits for the disk. With it whoever
             appends never waits, and looks at `writer.waiting` instead.
@@ -68,6 +70,8 @@ class Capture:
         hurry: Callable[[], bool] | None = None,
         behind: Callable[[], bool] | None = None,
         backlog: int = BACKLOG,
+        backlog_bytes: int = 0,
+        short: Callable[[], bool] = lambda: False,
         renew: Callable[[], Database] | None = None,
         on_written: Callable[[], None] | None = None,
         check: Callable[[Catalog], None] | None = None,
@@ -88,7 +92,13 @@ class Capture:
             lag = Lag(recording, behind, renew)
         self._gatherer = FieldGatherer(recording)
         self.index = IndexWriter(
-            self.indexer, database, backlog=backlog, lag=lag, gatherer=self._gatherer
+            self.indexer,
+            database,
+            backlog=backlog,
+            backlog_bytes=backlog_bytes,
+            short=short,
+            lag=lag,
+            gatherer=self._gatherer,
         )
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(

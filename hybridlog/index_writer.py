@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridlog_storage.catalog import Catalog, ChannelTotals, ChunkEntry
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.messages import Channel
@@ -242,6 +242,8 @@ class IndexWriter:
         indexer: Makes the documents.
         database: Where they go.
         backlog: Most chunks in memory, waiting or under way, before `submit` waits.
+        backlog_bytes: With a lag, most bytes of these, where they are more than `BACKLOG`.
+        short: With a lag, says whether memory is too short for more than `BACKLOG` of them.
         lag: With it `submit` never waits: chunks beyond the backlog are read back.
         gatherer: Gets each chunk of which documents are made, once.
     """
@@ -252,6 +254,8 @@ class IndexWriter:
         database: Database,
         *,
         backlog: int = BACKLOG,
+        backlog_bytes: int = 0,
+        short: Callable[[], bool] = lambda: False,
         lag: Lag | None = None,
         gatherer: FieldGatherer | None = None,
     ) -> None:
@@ -271,7 +275,9 @@ class IndexWriter:
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(backlog)
+        self._backlog, self._backlog_bytes, self._short = backlog, backlog_bytes, short
         self._in_memory = 0  # chunks that wait or are under way
+        self._bytes_in_memory = 0
         self._is_asked = False  # for the next forgotten chunk
         self._has_ended = False  # nothing is taken any more
         self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
@@ -308,14 +314,25 @@ class IndexWriter:
             if self._few.is_full:
                 self._maker.submit(self._make_few).add_done_callback(self._done)
             return
-        if not self._room.acquire(blocking=self._lag is None):
+        size = len(chunk.batch.buffer)
+        if self._lag is not None and not self._has_room(size):
             self._forget(chunk)
             self._catch_up()
             return
+        self._room.acquire()
         with self._lock:
             self._in_memory += 1
+            self._bytes_in_memory += size
         future = self._maker.submit(self._make, chunk, channels)
-        future.add_done_callback(self._made)
+        future.add_done_callback(partial(self._made, size))
+
+    def _has_room(self, size: int) -> bool:
+        """Whether a chunk may wait in memory; nobody but the caller adds any."""
+        with self._lock:
+            count, total = self._in_memory, self._bytes_in_memory + size
+        if count < BACKLOG:
+            return count < self._backlog
+        return count < self._backlog and total <= self._backlog_bytes and not self._short()
 
     def prepare(self, channel: Channel) -> None:
         """Do now what a channel's first message would have to wait for."""
@@ -476,7 +493,7 @@ class IndexWriter:
                 with self._lock:
                     self.missed += len(chunk.batch)
             return
-        if self._lag is not None and not _is_large(chunk):
+        if self._lag is not None:
             self._lag.wait()
         if not is_gathered:
             # Columns are laid down in the order of the file, for as long as that can be.
@@ -559,10 +576,11 @@ class IndexWriter:
         with self._lock:
             self._collections.add(collection)
 
-    def _made(self, future: Future[None]) -> None:
-        self._room.release()
+    def _made(self, size: int, future: Future[None]) -> None:
         with self._lock:
             self._in_memory -= 1
+            self._bytes_in_memory -= size
+        self._room.release()
         self._done(future)
         self._catch_up()
 
@@ -576,11 +594,3 @@ class IndexWriter:
         error = future.exception()
         if error is not None and self._crash is None:
             self._crash = error
-
-
-def _is_large(chunk: StoredChunk) -> bool:
-    """Whether documents of a chunk cost less than to let it go and read it again.
-
-    Of large messages they take little, and nearly none of it under the interpreter's lock.
-    """
-    return len(chunk.batch.buffer) >= COPIED_AT_ONCE * len(chunk.batch)

@@ -23,14 +23,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Capture
-from hybridlog.index_writer import BACKLOG
 from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
 from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
+from hybridlog.live.provision import Provision
 from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
-from hybridlog_storage.buffers import buffers
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
@@ -61,11 +60,10 @@ _NO_TURN = nullcontext()
 _CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
 _LATE_S = 0.01  # a large message that waits so long to be laid down is late: both happen, too,
 _LATE_TIMES = 20  # for so many times as long as it has waited
-_AT_HAND = 128 << 20  # bytes of buffers that are there before the first message, at most
-_AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
-_LOOK_S = 0.25  # how often one looks how many that are
-_PAUSE_S = 0.005  # after each new one, since to get it takes as long
-_MOST_BACKLOG = 96  # chunks that wait for the index in memory, where the budget allows it
+_LOOK_S = 0.25  # how often one looks how much comes
+# Chunks that wait for the index in memory, where the budget allows it. Topics of one rate and
+# size close theirs at one time, and what finds no room then must be read again.
+_MOST_BACKLOG = 96
 _MOST_NS = 1 << 63
 
 
@@ -159,7 +157,6 @@ class LiveRecording:
         self._inbox_bytes = 0
         self._worth_waking = min(_ENOUGH, options.budget_bytes // 4)
         self._taken_bytes = 0  # taken, and not laid into a chunk yet
-        self._at_work = AT_WORK * options.settings.chunk_size
         self._beyond = 0  # bytes closed beyond those, as last counted; `write` asks each time
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
@@ -176,10 +173,6 @@ class LiveRecording:
         """What is missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that were taken and found no room on the disk, by topic; known at the end."""
-        self._at_hand = min(_AT_HAND, options.budget_bytes // 8)
-        buffers.prepare(options.settings.chunk_size, self._at_hand)
-        self._getting: threading.Thread | None = None
-        self._enough = threading.Event()
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -193,13 +186,16 @@ class LiveRecording:
                 settings=options.settings,
                 hurry=lambda: self._is_under(self._hurry),
                 behind=lambda: self._is_under(self._behind),
-                backlog=_backlog(options),
+                backlog=_MOST_BACKLOG,
+                backlog_bytes=options.budget_bytes // 8,
+                short=self._is_short,
                 renew=renew,
                 on_written=self._make_room,
             )
             self._held = self._held.pop_all()
         self.id = self._capture.entry.id
         """Recording id."""
+        self._provision = Provision(self._capture.writer, options.budget_bytes)
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
 
@@ -405,7 +401,8 @@ class LiveRecording:
 
     def _closed_beyond(self) -> int:
         """Bytes in closed chunks beyond those at work."""
-        return max(self._capture.writer.waiting - self._at_work, 0)
+        writer = self._capture.writer
+        return max(writer.waiting - AT_WORK * writer.chunk_size, 0)
 
     def _unwritten(self) -> int:
         """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
@@ -432,6 +429,9 @@ class LiveRecording:
     def _is_under(self, strain: _Strain) -> bool:
         return strain.is_felt(self._unwritten()) and not self._ended
 
+    def _is_short(self) -> bool:
+        return self._provision.is_short()
+
     def _stop(self) -> None:
         # Who lays down a message at this moment has it in the recording.
         with self._laying, self._lock:
@@ -439,10 +439,7 @@ class LiveRecording:
             self._room.notify_all()
         self._wake()
         self._thread.join()
-        self._enough.set()
-        if self._getting is not None:
-            self._getting.join()
-        buffers.settle()
+        self._provision.close()
 
     def _run(self) -> None:
         """What the writing thread does."""
@@ -473,26 +470,8 @@ class LiveRecording:
                         told = now
                 if now - looked >= _LOOK_S:
                     stored = self._capture.writer.totals.payload_bytes
-                    self._look_ahead((stored - seen) / (now - looked))
+                    self._provision.look((stored - seen) / (now - looked))
                     looked, seen = now, stored
-
-    def _look_ahead(self, rate: float) -> None:
-        """Get memory for a disk that stands still, before it does: then it takes too long.
-
-        Args:
-            rate: Bytes that come in a second.
-        """
-        need = int(min(rate * _AHEAD_S, self._options.budget_bytes / 2))
-        if need > self._at_hand and (self._getting is None or not self._getting.is_alive()):
-            self._at_hand = need
-            self._getting = threading.Thread(
-                target=buffers.prepare,
-                args=(self._options.settings.chunk_size, need),
-                kwargs={"pause_s": _PAUSE_S, "enough": self._enough},
-                name="hybridlog-memory",
-                daemon=True,
-            )
-            self._getting.start()
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -595,16 +574,6 @@ def _patience(flush_interval_s: float) -> float:
 def indexed_within_s(flush_interval_s: float) -> float:
     """Seconds after which an index that keeps up has a message, at the latest."""
     return flush_interval_s + _patience(flush_interval_s) + _MAKING_S
-
-
-def _backlog(options: LiveOptions) -> int:
-    """Chunks that may wait for the index in memory.
-
-    Topics of one rate and size close theirs at one time: what finds no room then must be
-    read again.
-    """
-    room = options.budget_bytes // 8 // options.settings.chunk_size
-    return max(BACKLOG, min(_MOST_BACKLOG, room))
 
 
 def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import mmap
 import threading
+import time
 import weakref
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -58,12 +59,18 @@ class Buffers:
         weakref.finalize(array, self._give, memory).atexit = False
         return array
 
+    def is_short(self, size: int, share: float) -> bool:
+        """Whether of the buffers of a size that are there less than a share is spare."""
+        size = _rounded(size)
+        with self._lock:
+            return len(self._spare.get(size, ())) < share * self._there[size]
+
     def prepare(
         self,
         size: int,
         total: int,
         *,
-        pause_s: float = 0.0,
+        pause: float = 0.0,
         enough: threading.Event | None = None,
     ) -> None:
         """Have buffers, spare or taken, whose memory the system has given already.
@@ -73,7 +80,7 @@ class Buffers:
         Args:
             size: Bytes of each, as they will be taken.
             total: Bytes of all, about.
-            pause_s: How long to leave the system alone after each.
+            pause: For how many times as long as each took to leave the system alone after it.
             enough: Ends it early.
         """
         enough = enough or threading.Event()
@@ -82,11 +89,25 @@ class Buffers:
             missing = max(total // size - self._there[size], 0)
             self._most_spare = max(self._most_spare, total, self._spare_bytes + missing * size)
         for _ in range(missing):
+            since = time.monotonic()
             memory = self._make(size)
-            np.frombuffer(memory, np.uint8)[_HUGE_PAGE:].fill(0)
+            # Step by step, so that who copies at the same time is held up only as long.
+            for start in range(_HUGE_PAGE, size, _HUGE_PAGE):
+                if enough.wait(pause * (time.monotonic() - since)):
+                    break
+                since = time.monotonic()
+                np.frombuffer(memory, np.uint8)[start : start + _HUGE_PAGE].fill(0)
             self._give(memory)
-            if enough.wait(pause_s):
+            if enough.wait(pause * (time.monotonic() - since)):
                 return
+
+    def release(self, size: int) -> None:
+        """Give back to the system the spare buffers of a size."""
+        size = _rounded(size)
+        with self._lock:
+            spare = self._spare.pop(size, [])
+            self._spare_bytes -= size * len(spare)
+            self._there[size] -= len(spare)
 
     def settle(self) -> None:
         """Give back to the system what is more than usually spare."""

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 _HEAD = MESSAGE_HEAD.itemsize
 _ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
-COPIED_AT_ONCE = 1 << 18
+COPIED_AT_ONCE = 1 << 20
 """Bytes below which a payload is copied without giving up the interpreter.
 
-That takes some ten microseconds. To let others have the interpreter meanwhile takes as
-long, and when one of them computes, it comes back only five milliseconds later.
+That takes a tenth of a millisecond at most, or two. When others have the interpreter
+meanwhile, it comes back after each of them, and where one computes, five milliseconds later.
 """
 
 
@@ -39,7 +39,8 @@ class ChunkBuilder:
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
+        self.capacity = capacity
+        """As given; it may be changed while nothing is laid down."""
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
@@ -118,7 +119,7 @@ class ChunkBuilder:
         length = len(payload)
         start = self._used + _HEAD
         # The buffer stays where it is as long as anything is copied into it.
-        self._grow(max(start + length, self._capacity))
+        self._grow(max(start + length, self.capacity))
         if not self._used:
             self.first_log_time = log_time
             self.opened = time.monotonic()
@@ -202,8 +203,8 @@ class ChunkBuilder:
             return
         # Memory that is not used is not touched either, so where payloads are large there
         # is room for the whole chunk at once, and nothing is copied twice.
-        large = size * 8 > self._capacity
-        larger = buffers.take(max(size, self._capacity if large else 2 * size))
+        large = size * 8 > self.capacity
+        larger = buffers.take(max(size, self.capacity if large else 2 * size))
         larger[: self._used] = self._buffer[: self._used]
         self._buffer = larger
 

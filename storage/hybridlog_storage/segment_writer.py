@@ -531,6 +531,8 @@ class RecordingWriter:
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
+        self.chunk_size = self.settings.chunk_size
+        """Bytes at which the chunks close that are opened from now on."""
         self.totals = RecordingTotals()
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
@@ -626,8 +628,9 @@ class RecordingWriter:
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
             is_far = away >= self._span_of(len(builder), builder.messages)
-            if (key != _SHARED and is_far) or size > self.settings.chunk_size:
+            if (key != _SHARED and is_far) or size > builder.capacity:
                 self._close_chunk(key)
+                builder = self._builder(key)
         copy = builder.place_one(
             payload,
             channel=known.channel_id,
@@ -639,7 +642,7 @@ class RecordingWriter:
         self._next_seq += 1
         self.totals.messages += 1
         self.totals.payload_bytes += len(payload)
-        if len(builder) >= self.settings.chunk_size:
+        if len(builder) >= builder.capacity:
             try:
                 self._close_chunk(key)
             except BaseException:
@@ -737,17 +740,19 @@ class RecordingWriter:
         """The open chunk of a cluster."""
         builder = self._clusters.get(key)
         if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
+            builder = self._clusters[key] = ChunkBuilder(self.chunk_size)
+        elif not len(builder):
+            builder.capacity = self.chunk_size
         return builder
 
     def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
         """Lay messages into a cluster's chunk, closing chunks at their bounds."""
-        builder = self._builder(key)
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
         start, total = 0, len(batch)
         while start < total:
+            builder = self._builder(key)
             before = int(sizes[start - 1]) if start else 0
-            room = self.settings.chunk_size - len(builder)
+            room = builder.capacity - len(builder)
             end = int(np.searchsorted(sizes, before + room, side="right"))
             if not len(builder):
                 end = max(end, start + 1)  # a message larger than a chunk is a chunk
@@ -757,7 +762,7 @@ class RecordingWriter:
                 rows = slice(start, end)
                 builder.append(batch.take(rows), seq[rows])
                 start = end
-            if start < total or len(builder) >= self.settings.chunk_size:
+            if start < total or len(builder) >= builder.capacity:
                 self._close_chunk(key)
 
     def _span_of(self, held: _Count, messages: _Count) -> _Count:

@@ -25,10 +25,10 @@ from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.demo.write import write_bag
 from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
-from hybridlog.live import LiveRecording
+from hybridlog.live import LiveRecording, provision
 from hybridlog.live import recording as live
-from hybridlog_storage import append_file
-from hybridlog_storage.buffers import buffers
+from hybridlog_storage import append_file, chunk_builder
+from hybridlog_storage.buffers import Buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
@@ -153,23 +153,6 @@ def test_while_the_disk_stands_still_the_budget_is_still_taken(
         if written[number]:  # one may have come when others had taken all the room
             assert [m.raw for m in store.topic(f"/topic{number}")] == written[number]
     assert store.verify().findings == []
-
-
-@pytest.mark.parametrize("rate", [0, 1e9])
-def test_memory_for_a_disk_that_stands_still_is_there_before(store: hl.Store, rate: float) -> None:
-    settings, budget = SegmentSettings(chunk_size=1 << 18), 32 << 20
-    set_up = buffers._there[1 << 18]
-    with store.start("talk", budget_bytes=budget, settings=settings) as recording:
-        assert buffers._there[1 << 18] == max(set_up, budget // 8 // settings.chunk_size)
-        recording._look_ahead(rate)
-        if rate:
-            # No more than half of the budget.
-            wanted = budget // 2 // settings.chunk_size
-            wait_for(lambda: buffers._there[1 << 18] >= wanted)
-        there = buffers._there[1 << 18]
-        assert there == max(set_up, (budget // 2 if rate else budget // 8) // settings.chunk_size)
-        recording._look_ahead(rate)
-        assert buffers._there[1 << 18] == there
 
 
 def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> None:
@@ -332,7 +315,7 @@ def test_what_was_let_go_does_not_keep_others_waiting(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chunks in memory come first, or those behind them would have to be let go as well."""
-    monkeypatch.setattr(live, "_backlog", lambda _: 2)
+    monkeypatch.setattr(live, "_MOST_BACKLOG", 2)
     made: list[int] = []
     began, go_on = threading.Event(), threading.Event()
     real_documents = ChunkIndexer.documents_of
@@ -372,10 +355,10 @@ def test_what_was_let_go_does_not_keep_others_waiting(
 
 
 @pytest.mark.usefixtures("each_by_itself")
-def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
+def test_chunks_are_let_go_only_beyond_the_backlog(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However much waits to be written; what is let go is read when the disk can spare it."""
+    """So many bytes of them; and nothing is made or read before the disk can spare it."""
     busy = True
     monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: busy)
     read, made = [], []
@@ -387,29 +370,70 @@ def test_chunks_of_large_messages_are_let_go_only_beyond_the_backlog(
 
     monkeypatch.setattr(Lag, "read", seen)
     real_documents = ChunkIndexer.documents_of
-    go_on = threading.Event()
 
-    def held_up(self: ChunkIndexer, *args: Any) -> Any:
-        go_on.wait(30)
+    def counted(self: ChunkIndexer, *args: Any) -> Any:
         made.append(args)
         return real_documents(self, *args)
 
-    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
+    monkeypatch.setattr(ChunkIndexer, "documents_of", counted)
     own = channel("/talk")
-    payloads = [text(os.urandom(COPIED_AT_ONCE)) for _ in range(40)]
-    settings = SegmentSettings(chunk_size=COPIED_AT_ONCE)
+    payloads = [text(os.urandom(1 << 18)) for _ in range(40)]
+    settings = SegmentSettings(chunk_size=1 << 18)
     backlog = 32
-    budget = 8 * backlog * COPIED_AT_ONCE
+    budget = 8 * (backlog * ((1 << 18) + 100))  # and what stands before each message
     with store.start("talk", settings=settings, budget_bytes=budget) as recording:
         for number, payload in enumerate(payloads):
             recording.write(own, payload, log_time=number)
         wait_for(lambda: recording._capture.writer.totals.chunks == 40)
-        go_on.set()
-        wait_for(lambda: len(made) == backlog)
+        time.sleep(0.2)
+        assert not made
         assert not read
         busy = False
         wait_for(lambda: recording.lag == 0)
         assert len(read) == 40 - backlog
+    assert [m.raw for m in store.topic("/talk")] == payloads
+    assert store.verify().findings == []
+
+
+@pytest.mark.usefixtures("each_by_itself")
+def test_few_chunks_wait_for_the_index_where_memory_is_short(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They lie in memory that is needed for what comes; they are read again afterwards."""
+    read: list[object] = []
+    real = Lag.read
+
+    def seen(self: Lag, chunk: Any) -> StoredChunk:
+        read.append(chunk)
+        return real(self, chunk)
+
+    monkeypatch.setattr(Lag, "read", seen)
+    go_on = threading.Event()
+    real_documents = ChunkIndexer.documents_of
+
+    def held_up(self: ChunkIndexer, *args: Any) -> Any:
+        go_on.wait(30)
+        return real_documents(self, *args)
+
+    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
+    own = channel("/talk")
+    payloads = [text(os.urandom(1 << 18)) for _ in range(64)]
+    settings = SegmentSettings(chunk_size=1 << 18)
+    pool = Buffers()
+    monkeypatch.setattr(provision, "buffers", pool)
+    monkeypatch.setattr(chunk_builder, "buffers", pool)
+    # Payloads are larger than the chunk size, and so are their buffers, by the next power.
+    monkeypatch.setattr(LiveRecording, "_is_short", lambda _: pool.is_short(1 << 19, 0.5))
+    pool.prepare(1 << 19, 40 << 19)
+    with store.start("talk", settings=settings, budget_bytes=1 << 30) as recording:
+        for number, payload in enumerate(payloads):
+            recording.write(own, payload, log_time=number)
+            wait_for(lambda: recording.filled == 0)
+        wait_for(lambda: recording._capture.writer.totals.chunks == 64)
+        assert pool._there[1 << 19] == 40
+        go_on.set()
+        wait_for(lambda: recording.lag == 0)
+        assert 64 - 24 <= len(read) <= 64 - 18
     assert [m.raw for m in store.topic("/talk")] == payloads
     assert store.verify().findings == []
 
@@ -436,17 +460,12 @@ def test_the_index_waits_while_messages_wait_for_their_turn(
             time.sleep(10 * live._LATE_S)
         thread.join()
         wait_for(lambda: recording.stored[0] == 1)
-        if size >= COPIED_AT_ONCE:
-            # Of large messages documents are made all the same, of others behind them not.
-            wait_for(lambda: recording.lag == 0)
-            recording.write(channel("/small"), text(b"x"))
-            wait_for(lambda: recording.stored[0] == 2)
         if late:
             time.sleep(1)
         else:
             wait_for(lambda: recording.lag == 0)
         assert recording.lag == late
-    assert recording.close().indexed == (2 if size >= COPIED_AT_ONCE else 1)
+    assert recording.close().indexed == 1
 
 
 def in_segments_so_far(store: hl.Store, recording: str) -> list[Path]:

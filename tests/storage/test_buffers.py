@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import threading
 
 import numpy as np
 import pytest
@@ -100,3 +101,48 @@ def test_what_is_spare_of_another_size_is_not_in_the_way(made: list[int]) -> Non
     held = [pool.take(2 * SIZE) for _ in range(3)]
     assert len(made) == 3
     del held
+
+
+def test_spare_buffers_of_one_size_are_given_back(made: list[int]) -> None:
+    pool = Buffers()
+    held = [pool.take(SIZE) for _ in range(4)]
+    pool.prepare(2 * SIZE, 4 * SIZE)
+    del held[1:]
+    pool.release(SIZE)
+    assert dict(pool._there) == {SIZE: 1, 2 * SIZE: 2}
+    assert pool._spare_bytes == 4 * SIZE
+    del made[:]
+    held += [pool.take(SIZE), pool.take(2 * SIZE)]
+    assert made == [SIZE]
+
+
+def test_whether_few_buffers_are_spare() -> None:
+    pool = Buffers()
+    assert not pool.is_short(SIZE, 0.5)
+    held = [pool.take(SIZE) for _ in range(4)]
+    assert pool.is_short(SIZE, 0.5)
+    held.pop()
+    assert pool.is_short(SIZE, 0.5)
+    held.pop()
+    assert not pool.is_short(SIZE, 0.5)
+    assert pool.is_short(SIZE - 5, 0.51)
+
+
+def test_memory_is_got_with_pauses_and_ended_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pause after each huge page, since whoever records is held up as long as one takes."""
+    waited: list[float] = []
+
+    class Enough(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            waited.append(timeout or 0)
+            return len(waited) >= 7
+
+    clock = iter(range(1000))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    pool = Buffers()
+    pool.prepare(8 << 20, 80 << 20, pause=3, enough=Enough())
+    assert waited[:7] == [3.0] * 7
+    assert len(waited) == 8  # and once more, when it was given to the pool
+    # The one that was begun is whole: whoever takes it has all of it.
+    assert pool._there[8 << 20] == 2
+    assert pool.take(8 << 20)[-1] == 0

@@ -92,7 +92,7 @@ def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
 def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None:
     """By any thread and in any order; the chunks keep theirs."""
     chunks: list[StoredChunk] = []
-    setup = SegmentSettings(chunk_size=750_000, compression="none")
+    setup = SegmentSettings(chunk_size=3 * COPIED_AT_ONCE, compression="none")
     writer = RecordingWriter(
         tmp_path, RECORDING, lambda c, _: chunks.append(c), setup, on_written=lambda: None
     )
@@ -101,7 +101,7 @@ def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None
         writer.place_one(CHANNELS[n % 2], payload, n, n, n) for n, payload in enumerate(payloads)
     ]
     # All closed chunks but none can be packed, and whoever placed did not wait.
-    assert writer.waiting > 4_000_000
+    assert writer.waiting > 16 * COPIED_AT_ONCE
     time.sleep(0.05)
     assert not chunks
     threads = [threading.Thread(target=copy) for copy in reversed(copies)]
@@ -123,7 +123,7 @@ def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from([0, 1, 40_000, COPIED_AT_ONCE - 1, COPIED_AT_ONCE, 400_000]),
+            st.sampled_from([0, 1, 40_000, COPIED_AT_ONCE - 1, COPIED_AT_ONCE, 1_500_000]),
             st.sampled_from([bytes, bytearray, memoryview]),
         ),
         max_size=30,
@@ -150,6 +150,58 @@ def test_payloads_that_are_copied_at_once_and_those_that_are_not_share_chunks(
     ]
 
 
+@settings(max_examples=20, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([1 << 20, 2 << 20, 8 << 20]),
+            st.lists(st.sampled_from([0, 10, 30_000, 700_000, 1_200_000, 3_000_000]), max_size=9),
+            st.booleans(),
+        ),
+        max_size=5,
+    )
+)
+def test_the_chunk_size_may_change_while_messages_come(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, list[int], bool]]
+) -> None:
+    """Each chunk has the bound of when it was opened, and nothing is lost or out of order."""
+    chunks: list[StoredChunk] = []
+    writer = RecordingWriter(
+        tmp_path_factory.mktemp("segments"),
+        RECORDING,
+        lambda c, _: chunks.append(c),
+        SegmentSettings(compression="none"),
+    )
+    payloads: list[bytes] = []
+    opened_with: list[int] = []  # the bound when each message came
+    for chunk_size, sizes, by_batch in steps:
+        writer.chunk_size = chunk_size
+        first = len(payloads)
+        payloads += [bytes([first + n + 1]) * size for n, size in enumerate(sizes)]
+        opened_with += [chunk_size] * len(sizes)
+        if by_batch:
+            rows = [(0, payloads[n], n, n, n) for n in range(first, len(payloads))]
+            writer.append(batch_of(rows), CHANNELS)
+        else:
+            copies = [
+                writer.place_one(CHANNELS[0], payloads[n], n, n, n)
+                for n in range(first, len(payloads))
+            ]
+            for copy in reversed(copies):
+                copy()
+    (path,) = writer.close()
+    assert messages_in(path) == [
+        (CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)
+    ]
+    for number, chunk in enumerate(chunks):
+        bound = opened_with[int(chunk.seq[0])]
+        size = len(chunk.batch.buffer)
+        assert size <= bound or len(chunk.batch) == 1
+        # It was closed because it was full: the next message would not have found room.
+        if number + 1 < len(chunks) and size < bound:
+            assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
+
+
 def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(tmp_path: Path) -> None:
     """Also those that were closed before: topics of one rate close theirs at one time."""
     chunks: list[StoredChunk] = []
@@ -158,11 +210,11 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(tmp_path:
         tmp_path,
         RECORDING,
         lambda c, _: chunks.append(c),
-        SegmentSettings(chunk_size=500_000),
+        SegmentSettings(chunk_size=COPIED_AT_ONCE),
         hurry=lambda: hurried,
         on_written=lambda: None,
     )
-    payloads = [bytes([n]) * 500_000 for n in range(8)]
+    payloads = [bytes([n]) * COPIED_AT_ONCE for n in range(8)]
     copies = [writer.place_one(CHANNELS[0], p, n, n, n) for n, p in enumerate(payloads)]
     for n, copy in enumerate(copies):
         if n == 4:
@@ -171,7 +223,7 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(tmp_path:
             hurried = True
         copy()
     (path,) = writer.close()
-    assert [chunk.compressed_size < 10_000 for chunk in chunks] == [True] * 4 + [False] * 4
+    assert [chunk.compressed_size < 20_000 for chunk in chunks] == [True] * 4 + [False] * 4
     assert [data for _, _, data in messages_in(path)] == payloads
 
 
