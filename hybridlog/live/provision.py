@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from collections import deque
 
 from hybridlog_storage.buffers import buffers
-
-if TYPE_CHECKING:
-    from hybridlog_storage.segment_writer import RecordingWriter
 
 _AT_HAND = 128 << 20  # bytes of buffers that are there before the first message, at most
 _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand still for so long
 _PAUSE = 1.0  # times as long as it takes to get one: it holds up who records meanwhile
 _RESERVE = 0.25  # of them, which are for what comes and not for what waits
-_STEADY = 1.25  # times the rate of the look before: of one that rises more one cannot tell
+_LOOKS = 16  # of which the highest rate counts: sources pause, and disks stand still
+_STEADY = 1.25  # times the highest so far: of a rate that rises more one cannot tell yet
 _CHUNKS = 100  # a second: of more than that each chunk's price is too much, so they are larger
-_LARGEST = 4  # times the chunk size of the settings, where they are
+_LARGEST = 4  # times the usual chunk size, where they are
 _SHARE = 32  # of the budget that one chunk may take
 
 
@@ -25,47 +23,54 @@ class Provision:
 
     A disk may stand still; to get memory only then takes too long. And a chunk has its
     price, whatever is in it: when so much comes that it would be paid hundreds of times a
-    second, chunks are two or four times as large. Still none spans more time than usual.
+    second, chunks are two or four times as large.
 
     Args:
-        writer: Its chunk size is set. It has been given no message yet.
+        chunk_size: Usual bytes of a chunk.
         budget_bytes: Of the recording; half of it is at hand at most.
     """
 
-    def __init__(self, writer: RecordingWriter, budget_bytes: int) -> None:
-        self._writer = writer
-        self._usual = writer.chunk_size
+    def __init__(self, chunk_size: int, budget_bytes: int) -> None:
+        self.chunk_size = chunk_size
+        """Bytes at which chunks should close that are opened now; memory for them is there."""
+        self._usual = chunk_size
+        self._most = max(chunk_size, min(_LARGEST * chunk_size, budget_bytes // _SHARE))
         self._budget = budget_bytes
-        self._at_hand = min(_AT_HAND, budget_bytes // 8)
-        self._rate = 0.0  # as last looked at
+        self._first = self._at_hand = min(_AT_HAND, budget_bytes // 8)
+        self._rates: deque[float] = deque([0.0], maxlen=_LOOKS)
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
-        buffers.prepare(self._usual, self._at_hand)
+        buffers.prepare(chunk_size, self._at_hand)
 
     def look(self, rate: float) -> None:
-        """Begin to provide for a rate that does not rise any more.
+        """Begin to provide for what comes, once it does not rise any more.
 
-        What was begun for an earlier one comes to its end before.
+        What was begun for an earlier rate comes to its end before.
 
         Args:
-            rate: Bytes that come in a second.
+            rate: Bytes that came in a second, since the last look.
         """
-        is_rising = rate > self._rate * _STEADY
-        self._rate = rate
-        if is_rising or (self._thread is not None and self._thread.is_alive()):
-            return  # once it is known how much that will be
-        need = int(min(rate * _AHEAD_S, self._budget / 2))
-        size = self._size_for(rate)
-        if need > self._at_hand or size != self._writer.chunk_size:
-            self._at_hand = max(need, self._at_hand)
+        before = max(self._rates)
+        self._rates.append(rate)
+        highest = max(self._rates)
+        is_rising = rate > before * _STEADY
+        if is_rising or not highest or (self._thread is not None and self._thread.is_alive()):
+            return
+        need = int(min(highest * _AHEAD_S, self._budget / 2))
+        size = self._size_for(highest)
+        at_hand = self._at_hand if size == self.chunk_size else 0
+        if need > at_hand:
             self._thread = threading.Thread(
-                target=self._provide, args=(size,), name="hybridlog-memory", daemon=True
+                target=self._provide,
+                args=(size, max(need, self._first)),
+                name="hybridlog-memory",
+                daemon=True,
             )
             self._thread.start()
 
     def is_short(self) -> bool:
         """Whether so little memory is left that none should be held without need."""
-        return buffers.is_short(self._writer.chunk_size, _RESERVE)
+        return buffers.is_short(self.chunk_size, _RESERVE)
 
     def close(self) -> None:
         """End what is being done, and give back what is too much."""
@@ -76,15 +81,25 @@ class Provision:
 
     def _size_for(self, rate: float) -> int:
         """The size of chunks; one that is too large is kept until it is far too large."""
-        most = min(_LARGEST * self._usual, self._budget // _SHARE)
         size = self._usual
-        while size * _CHUNKS < rate and 2 * size <= most:
+        while size * _CHUNKS < rate and 2 * size <= self._most:
             size *= 2
-        now = self._writer.chunk_size
+        now = self.chunk_size
         return now if size < now and rate * 4 > now * _CHUNKS else size
 
-    def _provide(self, size: int) -> None:
-        buffers.prepare(size, self._at_hand, pause=_PAUSE, enough=self._ended)
-        before, self._writer.chunk_size = self._writer.chunk_size, size
+    def _provide(self, size: int, total: int) -> None:
+        before = self.chunk_size
+        try:
+            buffers.prepare(size, total, pause=_PAUSE, enough=self._ended)
+        except (MemoryError, OSError):
+            # There is none. It must do as it is, and whoever records goes on.
+            if size == before:
+                self._at_hand = total
+            else:
+                self._most = before
+                buffers.release(size, keep=before)
+            return
+        self._at_hand = total
         if size != before:
-            buffers.release(before)
+            self.chunk_size = size
+            buffers.release(before, keep=size)

@@ -173,6 +173,7 @@ class LiveRecording:
         """What is missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that were taken and found no room on the disk, by topic; known at the end."""
+        self._provision = Provision(options.settings.chunk_size, options.budget_bytes)
         self._held = ExitStack()
         with self._held:
             self._held.enter_context(directory.using_index())
@@ -188,14 +189,13 @@ class LiveRecording:
                 behind=lambda: self._is_under(self._behind),
                 backlog=_MOST_BACKLOG,
                 backlog_bytes=options.budget_bytes // 8,
-                short=self._is_short,
+                short=self._provision.is_short,
                 renew=renew,
                 on_written=self._make_room,
             )
             self._held = self._held.pop_all()
         self.id = self._capture.entry.id
         """Recording id."""
-        self._provision = Provision(self._capture.writer, options.budget_bytes)
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
 
@@ -429,9 +429,6 @@ class LiveRecording:
     def _is_under(self, strain: _Strain) -> bool:
         return strain.is_felt(self._unwritten()) and not self._ended
 
-    def _is_short(self) -> bool:
-        return self._provision.is_short()
-
     def _stop(self) -> None:
         # Who lays down a message at this moment has it in the recording.
         with self._laying, self._lock:
@@ -471,6 +468,7 @@ class LiveRecording:
                 if now - looked >= _LOOK_S:
                     stored = self._capture.writer.totals.payload_bytes
                     self._provision.look((stored - seen) / (now - looked))
+                    self._capture.writer.chunk_size = self._provision.chunk_size
                     looked, seen = now, stored
 
     @contextmanager

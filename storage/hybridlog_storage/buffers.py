@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 from collections import Counter
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 _LEAST = 1 << 18  # smaller buffers are malloc's business
 _SPARE_BYTES = 96 << 20
 _HUGE_PAGE = 2 << 20
+_FILLED = 8 << 20  # bytes of a new buffer; what is beyond is laid down by who can wait for it
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 
@@ -54,6 +56,9 @@ class Buffers:
                 self._spare_bytes -= size
         if memory is None:
             memory = self._make(size)
+            # Other threads go on meanwhile, as they could not when messages are laid there.
+            for part in _huge_pages(memory, _FILLED):
+                part.fill(0)
         # What is over this array keeps this array, and so the memory, from being taken again.
         array = np.frombuffer(memory, np.uint8)
         weakref.finalize(array, self._give, memory).atexit = False
@@ -91,23 +96,31 @@ class Buffers:
         for _ in range(missing):
             since = time.monotonic()
             memory = self._make(size)
-            # Step by step, so that who copies at the same time is held up only as long.
-            for start in range(_HUGE_PAGE, size, _HUGE_PAGE):
+            for part in _huge_pages(memory):
+                part.fill(0)
                 if enough.wait(pause * (time.monotonic() - since)):
                     break
                 since = time.monotonic()
-                np.frombuffer(memory, np.uint8)[start : start + _HUGE_PAGE].fill(0)
             self._give(memory)
-            if enough.wait(pause * (time.monotonic() - since)):
+            if enough.is_set():
                 return
 
-    def release(self, size: int) -> None:
-        """Give back to the system the spare buffers of a size."""
+    def release(self, size: int, *, keep: int) -> None:
+        """Give back to the system the spare buffers of a size.
+
+        Args:
+            size: Bytes.
+            keep: Bytes of buffers that are not given back, should they be the same ones.
+        """
         size = _rounded(size)
+        if size == _rounded(keep):
+            return
         with self._lock:
             spare = self._spare.pop(size, [])
-            self._spare_bytes -= size * len(spare)
-            self._there[size] -= len(spare)
+            count = len(spare)
+            self._spare_bytes -= size * count
+            self._there[size] -= count
+            self._most_spare = max(self._most_spare - size * count, _SPARE_BYTES)
 
     def settle(self) -> None:
         """Give back to the system what is more than usually spare."""
@@ -123,8 +136,6 @@ class Buffers:
         memory = _new(size)
         with self._lock:
             self._there[size] += 1
-        # Other threads go on while this is filled; the first bytes laid down would hold them up.
-        np.frombuffer(memory, np.uint8)[:_HUGE_PAGE].fill(0)
         return memory
 
     def _give(self, memory: mmap.mmap) -> None:
@@ -135,6 +146,12 @@ class Buffers:
                 self._spare_bytes += size
             else:
                 self._there[size] -= 1
+
+
+def _huge_pages(memory: mmap.mmap, most: int | None = None) -> Iterator[NDArray[np.uint8]]:
+    """The first bytes of a buffer, or all, in pieces of which each costs one page fault."""
+    array = np.frombuffer(memory, np.uint8)[:most]
+    return (array[start : start + _HUGE_PAGE] for start in range(0, len(array), _HUGE_PAGE))
 
 
 def _rounded(size: int) -> int:

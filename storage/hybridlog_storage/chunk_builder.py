@@ -26,9 +26,12 @@ _ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
 COPIED_AT_ONCE = 1 << 20
 """Bytes below which a payload is copied without giving up the interpreter.
 
-That takes a tenth of a millisecond at most, or two. When others have the interpreter
-meanwhile, it comes back after each of them, and where one computes, five milliseconds later.
+That takes a tenth of a millisecond, or two. When others have the interpreter meanwhile, it
+comes back after each of them, and where one computes, five milliseconds later.
 """
+
+_GROWTH = 4  # times as much as one chunk the next one may hold, before it is moved
+_LARGE_SHARE = 8  # so many times a payload fills a chunk, where payloads are large
 
 
 class ChunkBuilder:
@@ -43,6 +46,7 @@ class ChunkBuilder:
         """As given; it may be changed while nothing is laid down."""
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
+        self._expected = capacity  # bytes that the next chunk may well have
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self._rows: list[tuple[int, int, int, int, int, int, int]] = []
         self.copying: list[Lock] = []
@@ -119,7 +123,8 @@ class ChunkBuilder:
         length = len(payload)
         start = self._used + _HEAD
         # The buffer stays where it is as long as anything is copied into it.
-        self._grow(max(start + length, self.capacity))
+        room = self.capacity if length >= COPIED_AT_ONCE else self._room()
+        self._grow(max(start + length, room))
         if not self._used:
             self.first_log_time = log_time
             self.opened = time.monotonic()
@@ -166,6 +171,7 @@ class ChunkBuilder:
         self.copying, self.messages, self.opened = [], 0, math.inf
         buffer, used, pieces = self._buffer, self._used, self._pieces
         self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
+        self._expected = _GROWTH * used
         batches = [batch for batch, _ in pieces]
         content = buffer.data[:used]
         whole = Batch(
@@ -198,13 +204,24 @@ class ChunkBuilder:
         )
         self._pieces.append((batch, np.array(seq, np.int64)))
 
+    def _room(self) -> int:
+        """Bytes of buffer for a whole chunk, unless more comes than the one before lets expect.
+
+        What says little holds little memory, however much others say.
+        """
+        return min(self._expected, self.capacity)
+
     def _grow(self, size: int) -> None:
         if size <= len(self._buffer):
             return
-        # Memory that is not used is not touched either, so where payloads are large there
-        # is room for the whole chunk at once, and nothing is copied twice.
-        large = size * 8 > self.capacity
-        larger = buffers.take(max(size, self.capacity if large else 2 * size))
+        room = self._room()
+        # Where payloads are large there is room for the whole chunk at once, so that nothing
+        # is copied twice.
+        if size * _LARGE_SHARE < room:
+            room = 2 * size
+        elif size > room:
+            room = min(2 * size, self.capacity)
+        larger = buffers.take(max(size, room))
         larger[: self._used] = self._buffer[: self._used]
         self._buffer = larger
 

@@ -88,7 +88,8 @@ class SegmentSettings:
     """How segments are cut and packed.
 
     Attributes:
-        chunk_size: Bytes of uncompressed content at which a chunk closes.
+        chunk_size: Bytes of uncompressed content at which a chunk closes, if its writer is not
+            told otherwise, as it is where very much comes.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
         span_size: Bytes of content below which it may span four times as much, or below eight
             times these with fewer than four messages: what is read too much for a short slice

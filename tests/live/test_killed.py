@@ -41,7 +41,7 @@ def channels() -> list[Channel]:
 
 def payload(number: int) -> bytes:
     """A message that says its number in every byte; sizes of every kind of chunk."""
-    size = (0, 12, 700, 5000, 90_000, 400_000)[number % TOPICS]
+    size = (0, 12, 700, 5000, 90_000, 1_200_000)[number % TOPICS]
     content = (number * 2654435761 % (1 << 32)).to_bytes(4, "little") * (size // 4)
     return len(content).to_bytes(4, "little") + content
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import resource
 import threading
 
 import numpy as np
@@ -108,7 +109,9 @@ def test_spare_buffers_of_one_size_are_given_back(made: list[int]) -> None:
     held = [pool.take(SIZE) for _ in range(4)]
     pool.prepare(2 * SIZE, 4 * SIZE)
     del held[1:]
-    pool.release(SIZE)
+    pool.release(SIZE, keep=SIZE - 5)
+    assert dict(pool._there) == {SIZE: 4, 2 * SIZE: 2}
+    pool.release(SIZE, keep=2 * SIZE)
     assert dict(pool._there) == {SIZE: 1, 2 * SIZE: 2}
     assert pool._spare_bytes == 4 * SIZE
     del made[:]
@@ -128,21 +131,47 @@ def test_whether_few_buffers_are_spare() -> None:
     assert pool.is_short(SIZE - 5, 0.51)
 
 
-def test_memory_is_got_with_pauses_and_ended_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_got_with_pauses_and_ended_in_one(
+    made: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A pause after each huge page, since whoever records is held up as long as one takes."""
     waited: list[float] = []
 
     class Enough(threading.Event):
         def wait(self, timeout: float | None = None) -> bool:
-            waited.append(timeout or 0)
-            return len(waited) >= 7
+            assert timeout is not None
+            waited.append(timeout)
+            if len(waited) == 6:
+                self.set()
+            return self.is_set()
 
-    clock = iter(range(1000))
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    class Time:
+        def __init__(self) -> None:
+            self.now = 0.0
+
+        def monotonic(self) -> float:
+            self.now += 1
+            return self.now
+
+    monkeypatch.setattr(module, "time", Time())
     pool = Buffers()
     pool.prepare(8 << 20, 80 << 20, pause=3, enough=Enough())
-    assert waited[:7] == [3.0] * 7
-    assert len(waited) == 8  # and once more, when it was given to the pool
-    # The one that was begun is whole: whoever takes it has all of it.
-    assert pool._there[8 << 20] == 2
-    assert pool.take(8 << 20)[-1] == 0
+    assert waited == [3.0] * 6
+    assert made == [8 << 20] * 2
+    # The one that was begun can be taken, too.
+    held = [pool.take(8 << 20) for _ in range(2)]
+    assert made == [8 << 20] * 2
+    held.append(pool.take(8 << 20))
+    assert made == [8 << 20] * 3
+
+
+def test_new_memory_is_there_when_it_is_taken() -> None:
+    """Or whoever lays down messages would wait for it, and others with him."""
+    pool = Buffers()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    array = pool.take(8 << 20)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    assert after > before
+    array[:] = 1
+    # Not one a page of those that were written to.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - after < 100

@@ -171,6 +171,7 @@ def test_the_chunk_size_may_change_while_messages_come(
         RECORDING,
         lambda c, _: chunks.append(c),
         SegmentSettings(compression="none"),
+        on_written=lambda: None,
     )
     payloads: list[bytes] = []
     opened_with: list[int] = []  # the bound when each message came
@@ -200,6 +201,34 @@ def test_the_chunk_size_may_change_while_messages_come(
         # It was closed because it was full: the next message would not have found room.
         if number + 1 < len(chunks) and size < bound:
             assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
+
+
+def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
+    """From its second chunk on, and until one is larger than those before."""
+    writer = RecordingWriter(
+        tmp_path, RECORDING, lambda *_: None, SegmentSettings(), on_written=lambda: None
+    )
+    payloads = []
+
+    def place(*sizes: int) -> int:
+        for size in sizes:
+            payloads.append(bytes([len(payloads) % 251]) * size)
+            n = len(payloads)
+            writer.place_one(CHANNELS[0], payloads[-1], n, n, n)()
+        (builder,) = writer._clusters.values()
+        return len(builder._buffer)
+
+    assert place(5000) == 2 << 20
+    writer.flush()
+    writer.chunk_size = 8 << 20
+    assert place(5000) < 100_000
+    assert place(*[5000] * 100) < 2_000_000
+    # What is copied outside of the lock needs a place that stays.
+    assert place(COPIED_AT_ONCE) == 8 << 20
+    writer.flush()
+    assert place(5000) == 8 << 20
+    (path,) = writer.close()
+    assert [data for _, _, data in messages_in(path)] == payloads
 
 
 def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(tmp_path: Path) -> None:
