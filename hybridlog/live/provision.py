@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 
 from hybridlog_storage.buffers import buffers
 
@@ -38,6 +39,7 @@ class Provision:
         self._budget = budget_bytes
         self._first = self._at_hand = min(_AT_HAND, budget_bytes // 8)
         self._rates: deque[float] = deque([0.0], maxlen=_LOOKS)
+        self._given_up: int | None = None  # bytes of chunks that were usual until now
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
         buffers.prepare(chunk_size, self._at_hand)
@@ -45,28 +47,27 @@ class Provision:
     def look(self, rate: float) -> None:
         """Begin to provide for what comes, once it does not rise any more.
 
-        What was begun for an earlier rate comes to its end before.
+        What was begun for an earlier rate comes to its end before. Whoever looks again has
+        heard what `chunk_size` is now.
 
         Args:
             rate: Bytes that came in a second, since the last look.
         """
         before = max(self._rates)
         self._rates.append(rate)
-        highest = max(self._rates)
-        is_rising = rate > before * _STEADY
-        if is_rising or not highest or (self._thread is not None and self._thread.is_alive()):
+        if self._thread is not None and self._thread.is_alive():
             return
+        if self._given_up is not None:
+            # Since the look before none of them is taken any more.
+            self._start(self._release, self._given_up)
+            self._given_up = None
+            return
+        highest = max(self._rates)
         need = int(min(highest * _AHEAD_S, self._budget / 2))
         size = self._size_for(highest)
         at_hand = self._at_hand if size == self.chunk_size else 0
-        if need > at_hand:
-            self._thread = threading.Thread(
-                target=self._provide,
-                args=(size, max(need, self._first)),
-                name="hybridlog-memory",
-                daemon=True,
-            )
-            self._thread.start()
+        if need > at_hand and rate <= before * _STEADY:
+            self._start(self._provide, size, max(need, self._first))
 
     def is_short(self) -> bool:
         """Whether so little memory is left that none should be held without need."""
@@ -87,19 +88,24 @@ class Provision:
         now = self.chunk_size
         return now if size < now and rate * 4 > now * _CHUNKS else size
 
+    def _start(self, work: Callable[..., None], *arguments: int) -> None:
+        self._thread = threading.Thread(
+            target=work, args=arguments, name="hybridlog-memory", daemon=True
+        )
+        self._thread.start()
+
     def _provide(self, size: int, total: int) -> None:
-        before = self.chunk_size
         try:
             buffers.prepare(size, total, pause=_PAUSE, enough=self._ended)
         except (MemoryError, OSError):
-            # There is none. It must do as it is, and whoever records goes on.
-            if size == before:
-                self._at_hand = total
-            else:
-                self._most = before
-                buffers.release(size, keep=before)
-            return
+            # There is no more. It must do as it is, and whoever records goes on.
+            self._most = self.chunk_size
+            if size != self.chunk_size:
+                self._release(size)
+                return
         self._at_hand = total
-        if size != before:
-            self.chunk_size = size
-            buffers.release(before, keep=size)
+        if size != self.chunk_size:
+            self.chunk_size, self._given_up = size, self.chunk_size
+
+    def _release(self, size: int) -> None:
+        buffers.release(size, keep=self.chunk_size, pause=_PAUSE, enough=self._ended)

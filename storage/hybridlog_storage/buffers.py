@@ -105,22 +105,43 @@ class Buffers:
             if enough.is_set():
                 return
 
-    def release(self, size: int, *, keep: int) -> None:
+    def release(
+        self,
+        size: int,
+        *,
+        keep: int,
+        pause: float = 0.0,
+        enough: threading.Event | None = None,
+    ) -> None:
         """Give back to the system the spare buffers of a size.
 
         Args:
             size: Bytes.
             keep: Bytes of buffers that are not given back, should they be the same ones.
+            pause: For how many times as long as each took to leave the system alone after it.
+            enough: Ends it early.
         """
+        enough = enough or threading.Event()
         size = _rounded(size)
         if size == _rounded(keep):
             return
+        since = time.monotonic()
+        while self._drop_one(size) and not enough.wait(pause * (time.monotonic() - since)):
+            since = time.monotonic()
+
+    def _drop_one(self, size: int) -> bool:
+        """Give a spare buffer of a size back to the system, if there is one."""
         with self._lock:
-            spare = self._spare.pop(size, [])
-            count = len(spare)
-            self._spare_bytes -= size * count
-            self._there[size] -= count
-            self._most_spare = max(self._most_spare - size * count, _SPARE_BYTES)
+            spare = self._spare.get(size)
+            if not spare:
+                return False
+            memory = spare.pop()
+            self._spare_bytes -= size
+            self._there[size] -= 1
+            self._most_spare = max(self._most_spare - size, _SPARE_BYTES)
+        # Not under the lock: it takes as long as to get one.
+        del memory
+        return True
 
     def settle(self) -> None:
         """Give back to the system what is more than usually spare."""

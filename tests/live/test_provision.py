@@ -75,6 +75,9 @@ def test_as_much_as_comes_while_a_disk_stands_still_but_no_more_than_half_the_bu
         assert pool._there[SIZE] == rate * module._AHEAD_S // SIZE
         comes(provision, 100 * BUDGET)
         assert provision.chunk_size == 4 * SIZE
+        # The others are given back only when all have heard that they are not taken any more.
+        assert pool._there[SIZE] == rate * module._AHEAD_S // SIZE
+        comes(provision, 100 * BUDGET, looks=1)
         assert pool._there == {SIZE: 0, 4 * SIZE: BUDGET // 2 // (4 * SIZE)}
     assert pool._spare_bytes <= pool_module._SPARE_BYTES
 
@@ -100,7 +103,7 @@ def test_what_comes_by_fits_and_starts_is_provided_for() -> None:
 def test_a_disk_that_stands_still_changes_nothing(pool: Buffers) -> None:
     """Nothing comes then, for as long as the budget is spent."""
     with closing(Provision(SIZE, BUDGET)) as provision:
-        comes(provision, 1e12)
+        comes(provision, 1e12, looks=3)
         there, thread = dict(pool._there), provision._thread
         comes(provision, 0, looks=10 * module._LOOKS)
         comes(provision, 1e12)
