@@ -13,7 +13,7 @@ _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand stil
 _PAUSE = 1.0  # times as long as it takes to get one: it holds up who records meanwhile
 _RESERVE = 0.25  # of them, which are for what comes and not for what waits
 _LOOKS = 16  # of which the highest rate counts: sources pause, and disks stand still
-_STEADY = 1.25  # times the highest so far: of a rate that rises more one cannot tell yet
+_STEADY = 1.25  # times as much: of a rate that rises more one cannot tell yet; less is no matter
 _CHUNKS = 100  # a second: of more than that each chunk's price is too much, so they are larger
 _LARGEST = 4  # times the usual chunk size, where they are
 _SHARE = 32  # of the budget that one chunk may take
@@ -66,12 +66,13 @@ class Provision:
         need = int(min(highest * _AHEAD_S, self._budget / 2))
         size = self._size_for(highest)
         at_hand = self._at_hand if size == self.chunk_size else 0
-        if need > at_hand and rate <= before * _STEADY:
+        if need > at_hand * _STEADY and rate <= before * _STEADY:
             self._start(self._provide, size, max(need, self._first))
 
     def is_short(self) -> bool:
         """Whether so little memory is left that none should be held without need."""
-        return buffers.is_short(self.chunk_size, _RESERVE)
+        sizes = {self.chunk_size, self._given_up or self.chunk_size}
+        return any(buffers.is_short(size, _RESERVE) for size in sizes)
 
     def close(self) -> None:
         """End what is being done, and give back what is too much."""
@@ -105,7 +106,8 @@ class Provision:
                 return
         self._at_hand = total
         if size != self.chunk_size:
-            self.chunk_size, self._given_up = size, self.chunk_size
+            self._given_up = self.chunk_size
+            self.chunk_size = size
 
     def _release(self, size: int) -> None:
         buffers.release(size, keep=self.chunk_size, pause=_PAUSE, enough=self._ended)

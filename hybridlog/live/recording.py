@@ -452,6 +452,7 @@ class LiveRecording:
                     self._calls.get(timeout=tick)
                 ended = self._ended
                 with self._laying:
+                    self._capture.writer.chunk_size = self._provision.chunk_size
                     self._take()
                     if ended:
                         self._write_losses(everything=True)
@@ -470,7 +471,6 @@ class LiveRecording:
                 if now - looked >= _LOOK_S:
                     stored = self._capture.writer.totals.payload_bytes
                     self._provision.look((stored - seen) / (now - looked))
-                    self._capture.writer.chunk_size = self._provision.chunk_size
                     looked, seen = now, stored
 
     @contextmanager

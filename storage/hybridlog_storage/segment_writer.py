@@ -76,6 +76,7 @@ AT_WORK = 8
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
+_PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
 _SPARSE = 4  # times the usual span, for a chunk that holds little
 _FEW = 4  # messages: a chunk of fewer holds little, too,
 _LITTLE = 8  # with less than so many times the bytes of others: each costs more than a message
@@ -743,8 +744,18 @@ class RecordingWriter:
         if builder is None:
             builder = self._clusters[key] = ChunkBuilder(self.chunk_size)
         elif not len(builder):
-            builder.capacity = self.chunk_size
+            builder.capacity = self._next_capacity(key, builder.capacity)
         return builder
+
+    def _next_capacity(self, key: int, before: int) -> int:
+        """Bytes at which the next chunk of a cluster closes.
+
+        Topics of one rate would close theirs at one time, which is much to do at once where
+        chunks are large. So when they become twice as large or more, each cluster begins with
+        another size between half of it and all.
+        """
+        size = self.chunk_size
+        return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
     def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
         """Lay messages into a cluster's chunk, closing chunks at their bounds."""

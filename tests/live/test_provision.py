@@ -189,6 +189,19 @@ def test_memory_is_short_when_less_than_the_reserve_is_spare(pool: Buffers) -> N
         assert not provision.is_short()
 
 
+def test_memory_of_either_size_may_be_short_while_chunks_become_larger(pool: Buffers) -> None:
+    with closing(Provision(SIZE, BUDGET)) as provision:
+        held = [pool.take(SIZE) for _ in range(pool._there[SIZE])]
+        assert provision.is_short()
+        comes(provision, 1e12)
+        assert provision.chunk_size == 4 * SIZE
+        assert provision.is_short()  # somebody may still take small ones
+        comes(provision, 1e12, looks=1)
+        assert not provision.is_short()
+        held += [pool.take(4 * SIZE) for _ in range(pool._there[4 * SIZE])]
+        assert provision.is_short()
+
+
 def test_a_recording_of_much_has_larger_chunks(
     store: hl.Store, pool: Buffers, monkeypatch: pytest.MonkeyPatch
 ) -> None:

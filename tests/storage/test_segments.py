@@ -164,7 +164,7 @@ def test_payloads_that_are_copied_at_once_and_those_that_are_not_share_chunks(
 def test_the_chunk_size_may_change_while_messages_come(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, list[int], bool]]
 ) -> None:
-    """Each chunk has the bound of when it was opened, and nothing is lost or out of order."""
+    """No chunk exceeds the bound of when it was opened; nothing is lost or out of order."""
     chunks: list[StoredChunk] = []
     writer = RecordingWriter(
         tmp_path_factory.mktemp("segments"),
@@ -198,9 +198,42 @@ def test_the_chunk_size_may_change_while_messages_come(
         bound = opened_with[int(chunk.seq[0])]
         size = len(chunk.batch.buffer)
         assert size <= bound or len(chunk.batch) == 1
-        # It was closed because it was full: the next message would not have found room.
+        # It was closed because the next message would not have found room; where chunks had
+        # just become larger, in half of it.
         if number + 1 < len(chunks) and size < bound:
-            assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
+            assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound // 2
+
+
+def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
+    """Their first ones after the change are of many sizes, those behind them are not."""
+    chunks: list[StoredChunk] = []
+    writer = RecordingWriter(
+        tmp_path,
+        RECORDING,
+        lambda c, _: chunks.append(c),
+        SegmentSettings(chunk_size=100_000, compression="none"),
+        on_written=lambda: None,
+    )
+    topics = [Channel(f"/topic{n}", "ros1") for n in range(20)]
+
+    def speak(times: int) -> None:
+        for n in range(times):
+            for topic in topics:
+                writer.place_one(topic, bytes(5000), n, n, n)
+
+    speak(30)
+    writer.chunk_size = 400_000
+    speak(250)
+    writer.close()
+    of_topic: dict[int, list[int]] = {}
+    for chunk in chunks:
+        of_topic.setdefault(int(chunk.batch.channel[0]), []).append(len(chunk.batch))
+    small, full = 100_000 // 5031, 400_000 // 5031
+    begun = [sizes[2] for sizes in of_topic.values()]
+    assert all(sizes[:2] == [small] * 2 for sizes in of_topic.values())
+    assert all(set(sizes[3:-1]) == {full} for sizes in of_topic.values())
+    assert all(full // 2 <= size <= full for size in begun)
+    assert len(set(begun)) > 12
 
 
 def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
