@@ -214,7 +214,7 @@ def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
         SegmentSettings(chunk_size=100_000, compression="none"),
         on_written=lambda: None,
     )
-    topics = [Channel(f"/topic{n}", "ros1") for n in range(20)]
+    topics = [Channel(f"/topic{n}", "ros1", None) for n in range(20)]
 
     def speak(times: int) -> None:
         for n in range(times):
