@@ -275,7 +275,7 @@ class IndexWriter:
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(backlog)
-        self._backlog, self._backlog_bytes, self._short = backlog, backlog_bytes, short
+        self._backlog_bytes, self._short = backlog_bytes, short
         self._in_memory = 0  # chunks that wait or are under way
         self._bytes_in_memory = 0
         self._is_asked = False  # for the next forgotten chunk
@@ -315,24 +315,25 @@ class IndexWriter:
                 self._maker.submit(self._make_few).add_done_callback(self._done)
             return
         size = len(chunk.batch.buffer)
-        if self._lag is not None and not self._has_room(size):
+        if not self._find_room(size):
             self._forget(chunk)
             self._catch_up()
             return
-        self._room.acquire()
         with self._lock:
             self._in_memory += 1
             self._bytes_in_memory += size
         future = self._maker.submit(self._make, chunk, channels)
         future.add_done_callback(partial(self._made, size))
 
-    def _has_room(self, size: int) -> bool:
-        """Whether a chunk may wait in memory; nobody but the caller adds any."""
-        with self._lock:
-            count, total = self._in_memory, self._bytes_in_memory + size
-        if count < BACKLOG:
-            return count < self._backlog
-        return count < self._backlog and total <= self._backlog_bytes and not self._short()
+    def _find_room(self, size: int) -> bool:
+        """Have a chunk wait in memory; without a lag once there is room, else only if there is."""
+        if self._lag is not None:
+            with self._lock:
+                is_usual = self._in_memory < BACKLOG
+                is_much = self._bytes_in_memory + size > self._backlog_bytes
+            if not is_usual and (is_much or self._short()):
+                return False
+        return self._room.acquire(blocking=self._lag is None)
 
     def prepare(self, channel: Channel) -> None:
         """Do now what a channel's first message would have to wait for."""
@@ -577,10 +578,10 @@ class IndexWriter:
             self._collections.add(collection)
 
     def _made(self, size: int, future: Future[None]) -> None:
+        self._room.release()
         with self._lock:
             self._in_memory -= 1
             self._bytes_in_memory -= size
-        self._room.release()
         self._done(future)
         self._catch_up()
 

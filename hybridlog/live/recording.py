@@ -52,7 +52,7 @@ _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less
 _FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
 _PATIENCE = 4  # flush intervals for which chunks of few messages wait to be indexed together,
 _PATIENCE_S = 4.0  # and seconds at most
-_AT_WORK = 3  # large chunks on their way without anything being late: two packed, one written
+_LARGE_AT_WORK = 3  # large chunks on their way without anything being late: two packed, one written
 _MAKING_S = 2.0  # that packing, writing, making documents and sending them may take
 _HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
@@ -403,7 +403,8 @@ class LiveRecording:
     def _closed_beyond(self) -> int:
         """Bytes in closed chunks beyond those at work."""
         writer = self._capture.writer
-        at_work = max(AT_WORK * self._options.settings.chunk_size, _AT_WORK * writer.chunk_size)
+        usual = AT_WORK * self._options.settings.chunk_size
+        at_work = max(usual, _LARGE_AT_WORK * writer.chunk_size)
         return max(writer.waiting - at_work, 0)
 
     def _unwritten(self) -> int:

@@ -139,7 +139,7 @@ class Buffers:
             self._spare_bytes -= size
             self._there[size] -= 1
             self._most_spare = max(self._most_spare - size, _SPARE_BYTES)
-        # Not under the lock: it takes as long as to get one.
+        # Not under the lock, where it can be helped: it takes as long as to get one.
         del memory
         return True
 
@@ -147,11 +147,9 @@ class Buffers:
         """Give back to the system what is more than usually spare."""
         with self._lock:
             self._most_spare = _SPARE_BYTES
-            for size, spare in list(self._spare.items()):
-                while spare and self._spare_bytes > self._most_spare:
-                    spare.pop()
-                    self._spare_bytes -= size
-                    self._there[size] -= 1
+            for size in list(self._spare):
+                while self._spare_bytes > self._most_spare and self._drop_one(size):
+                    pass
 
     def _make(self, size: int) -> mmap.mmap:
         memory = _new(size)

@@ -6,9 +6,7 @@ import errno
 import mmap
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -33,12 +31,6 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> Buffers:
     own = Buffers()
     monkeypatch.setattr(module, "buffers", own)
     return own
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
-        yield opened
 
 
 def comes(provision: Provision, rate: float, looks: int = 2) -> None:

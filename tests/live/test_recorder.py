@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,12 +43,6 @@ from tests.test_faults import wait_for
 
 SECOND = 1_000_000_000
 FREE = RecorderOptions(reserve_bytes=0)
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
-        yield opened
 
 
 class Running:

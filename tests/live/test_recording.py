@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NoReturn
@@ -55,12 +55,6 @@ def channel(topic: str) -> Channel:
 
 def text(content: bytes) -> bytes:
     return len(content).to_bytes(4, "little") + content
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
-        yield opened
 
 
 def in_segments(store: hl.Store, recording: str) -> list[Seen]:

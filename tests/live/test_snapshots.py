@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -63,12 +61,6 @@ def test_latched_messages_stay_and_stand_in_front() -> None:
     assert (front.payload, front.log_time, front.publish_time) == (b"map", T + 55 * SECOND, T)
     assert len(rest) == 5
     assert not ring.is_short
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
-        yield opened
 
 
 class Robot:
