@@ -195,6 +195,7 @@ class LiveRecording:
                 on_written=self._make_room,
             )
             self._held = self._held.pop_all()
+        self._capture.writer.next_chunk_size = self._provision.next_chunk_size
         self.id = self._capture.entry.id
         """Recording id."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
@@ -402,10 +403,9 @@ class LiveRecording:
 
     def _closed_beyond(self) -> int:
         """Bytes in closed chunks beyond those at work."""
-        writer = self._capture.writer
         usual = AT_WORK * self._options.settings.chunk_size
-        at_work = max(usual, _LARGE_AT_WORK * writer.chunk_size)
-        return max(writer.waiting - at_work, 0)
+        at_work = max(usual, _LARGE_AT_WORK * self._provision.chunk_size)
+        return max(self._capture.writer.waiting - at_work, 0)
 
     def _unwritten(self) -> int:
         """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
@@ -453,7 +453,6 @@ class LiveRecording:
                     self._calls.get(timeout=tick)
                 ended = self._ended
                 with self._laying:
-                    self._capture.writer.chunk_size = self._provision.chunk_size
                     self._take()
                     if ended:
                         self._write_losses(everything=True)

@@ -11,14 +11,18 @@ import mmap
 import threading
 import time
 import weakref
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
+
+SLAB = 8 << 20
+"""Bytes that the system is asked for at a time; buffers of up to so many are cut from them."""
 
 _LEAST = 1 << 18  # smaller buffers are malloc's business
 _SPARE_BYTES = 96 << 20
@@ -29,15 +33,25 @@ _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 
 
 class Buffers:
-    """A pool of buffers. Thread safe."""
+    """A pool of buffers. Thread safe.
+
+    They are cut from slabs, all buffers of one from one size. When none of them is taken any
+    more, its memory may serve for another size: who begins to take larger buffers needs no
+    other memory than he had for small ones.
+    """
 
     def __init__(self) -> None:
-        # The collector may give a buffer back on a thread that is in here already.
-        self._lock = threading.RLock()
-        self._spare: dict[int, list[mmap.mmap]] = {}
-        self._spare_bytes = 0
-        self._most_spare = _SPARE_BYTES
-        self._there: Counter[int] = Counter()  # buffers that are spare or taken, by their size
+        self._lock = threading.Lock()
+        # Buffers that nobody has any more. The collector may give one back at any place, on a
+        # thread that has the lock already.
+        self._returned: deque[tuple[_Slab, int]] = deque()
+        self._whole: dict[int, list[_Slab]] = {}  # of which nothing is taken, by their size
+        self._whole_bytes = 0
+        self._most_whole = _SPARE_BYTES
+        # Of which something is taken and something is not, by the size of their buffers.
+        self._cut: dict[int, dict[_Slab, None]] = {}
+        self._given: Counter[int] = Counter()  # bytes that the system gave, by the slabs' size,
+        self._taken: Counter[int] = Counter()  # and those of them that are taken
 
     def take(self, size: int, *, whole_pages: bool = False) -> NDArray[np.uint8]:
         """A buffer of at least `size` bytes, whatever they are.
@@ -49,26 +63,27 @@ class Buffers:
         if size < _LEAST and not whole_pages:
             return np.empty(size, np.uint8)
         size = _rounded(size)
-        with self._lock:
-            spare = self._spare.get(size)
-            memory = spare.pop() if spare else None
-            if memory is not None:
-                self._spare_bytes -= size
-        if memory is None:
-            memory = self._make(size)
-            # Other threads go on meanwhile, as they could not when messages are laid there.
-            for part in _huge_pages(memory, _FILLED):
-                part.fill(0)
+        taken = self._take(size)
+        while taken is None:  # to make one may take long, and others shall not wait for it
+            taken = self._take(size, _Slab(_slab_size(size)))
+        slab, start, missing = taken
+        # Other threads go on meanwhile, as they could not when messages are laid there.
+        for part in missing:
+            part.fill(0)
         # What is over this array keeps this array, and so the memory, from being taken again.
-        array = np.frombuffer(memory, np.uint8)
-        weakref.finalize(array, self._give, memory).atexit = False
+        array = np.frombuffer(slab.memory, np.uint8, size, start)
+        weakref.finalize(array, self._give, slab, start).atexit = False
         return array
 
     def is_short(self, size: int, share: float) -> bool:
-        """Whether of the buffers of a size that are there less than a share is spare."""
+        """Whether a buffer would be of new memory, or of what there is less than a share spare."""
         size = _rounded(size)
+        kind = _slab_size(size)
         with self._lock:
-            return len(self._spare.get(size, ())) < share * self._there[size]
+            self._sort_in()
+            slab = self._find(size)
+            given = self._given[kind]
+            return slab is None or slab.is_new(size) or given - self._taken[kind] < share * given
 
     def prepare(
         self,
@@ -78,99 +93,170 @@ class Buffers:
         pause: float = 0.0,
         enough: threading.Event | None = None,
     ) -> None:
-        """Have buffers, spare or taken, whose memory the system has given already.
+        """Have memory, spare or taken, that the system has given already.
 
         As many bytes may then be spare until `settle`.
 
         Args:
-            size: Bytes of each, as they will be taken.
+            size: Bytes of a buffer that will be taken.
             total: Bytes of all, about.
-            pause: For how many times as long as each took to leave the system alone after it.
+            pause: For how many times as long as each page took to leave the system alone
+                after it.
             enough: Ends it early.
         """
         enough = enough or threading.Event()
         size = _rounded(size)
+        kind = _slab_size(size)
         with self._lock:
-            missing = max(total // size - self._there[size], 0)
-            self._most_spare = max(self._most_spare, total, self._spare_bytes + missing * size)
-        for _ in range(missing):
+            missing = total - self._given[kind]
+            self._most_whole = max(self._most_whole, total, self._whole_bytes + missing)
+        while missing >= size and not enough.is_set():
+            with self._lock:
+                # What is begun comes first.
+                whole = self._whole.get(kind)
+                slab = self._unkeep(whole[0]) if whole and whole[0].given < kind else None
+            slab = slab or _Slab(kind)
+            before = slab.given
             since = time.monotonic()
-            memory = self._make(size)
-            for part in _huge_pages(memory):
+            for part in slab.give(before + missing // size * size, kind):
                 part.fill(0)
                 if enough.wait(pause * (time.monotonic() - since)):
                     break
                 since = time.monotonic()
-            self._give(memory)
-            if enough.is_set():
-                return
-
-    def release(
-        self,
-        size: int,
-        *,
-        keep: int,
-        pause: float = 0.0,
-        enough: threading.Event | None = None,
-    ) -> None:
-        """Give back to the system the spare buffers of a size.
-
-        Args:
-            size: Bytes.
-            keep: Bytes of buffers that are not given back, should they be the same ones.
-            pause: For how many times as long as each took to leave the system alone after it.
-            enough: Ends it early.
-        """
-        enough = enough or threading.Event()
-        size = _rounded(size)
-        if size == _rounded(keep):
-            return
-        since = time.monotonic()
-        while self._drop_one(size) and not enough.wait(pause * (time.monotonic() - since)):
-            since = time.monotonic()
-
-    def _drop_one(self, size: int) -> bool:
-        """Give a spare buffer of a size back to the system, if there is one."""
-        with self._lock:
-            spare = self._spare.get(size)
-            if not spare:
-                return False
-            memory = spare.pop()
-            self._spare_bytes -= size
-            self._there[size] -= 1
-            self._most_spare = max(self._most_spare - size, _SPARE_BYTES)
-        # Not under the lock, where it can be helped: it takes as long as to get one.
-        del memory
-        return True
+            got = slab.given - before
+            with self._lock:
+                self._given[kind] += got
+                self._keep(slab)
+                # Others may get some as well, or have what is spare given back.
+                missing = min(missing - got, total - self._given[kind])
 
     def settle(self) -> None:
         """Give back to the system what is more than usually spare."""
         with self._lock:
-            self._most_spare = _SPARE_BYTES
-            for size in list(self._spare):
-                while self._spare_bytes > self._most_spare and self._drop_one(size):
-                    pass
+            self._sort_in()
+            self._most_whole = _SPARE_BYTES
+            for slab in [slab for whole in self._whole.values() for slab in whole]:
+                if self._whole_bytes > self._most_whole:
+                    self._given[slab.size] -= self._unkeep(slab).given
 
-    def _make(self, size: int) -> mmap.mmap:
-        memory = _new(size)
-        with self._lock:
-            self._there[size] += 1
-        return memory
+    def _take(
+        self, size: int, slab: _Slab | None = None
+    ) -> tuple[_Slab, int, Iterator[NDArray[np.uint8]]] | None:
+        """A slab, where in it a buffer starts, and the memory that it has not; None for none.
 
-    def _give(self, memory: mmap.mmap) -> None:
-        size = len(memory)
+        Args:
+            size: Bytes.
+            slab: The one to cut it from, when there was none.
+        """
         with self._lock:
-            if self._spare_bytes + size <= self._most_spare:
-                self._spare.setdefault(size, []).append(memory)
-                self._spare_bytes += size
+            self._sort_in()
+            if slab is None:
+                slab = self._find(size)
+                if slab is None:
+                    return None
+                if not slab.cut:
+                    self._unkeep(slab)
+            if not slab.cut:
+                slab.cut_into(size)
+            cut = self._cut.setdefault(size, {})
+            start = slab.spare.pop()
+            if slab.spare:
+                cut[slab] = None
             else:
-                self._there[size] -= 1
+                cut.pop(slab, None)
+            missing: Iterator[NDArray[np.uint8]] = iter(())
+            if slab.given < start + size:
+                self._given[slab.size] += start + size - slab.given
+                missing = slab.give(start + size, _FILLED)
+            self._taken[slab.size] += size
+            return slab, start, missing
+
+    def _find(self, size: int) -> _Slab | None:
+        """The slab to cut a buffer from; by who has the lock.
+
+        No new memory if it can be helped, and then the one with the least spare: so others
+        become whole again.
+        """
+        slabs = [*self._cut.get(size, ()), *self._whole.get(_slab_size(size), ())[-1:]]
+        return min(slabs, key=lambda slab: slab.price(size), default=None)
+
+    def _give(self, slab: _Slab, start: int) -> None:
+        self._returned.append((slab, start))
+        # Whoever has the lock may be this very thread. The next one that has it sees to it.
+        if self._lock.acquire(blocking=False):
+            try:
+                self._sort_in()
+            finally:
+                self._lock.release()
+
+    def _sort_in(self) -> None:
+        """Take back what was returned; by who has the lock."""
+        while self._returned:
+            slab, start = self._returned.popleft()
+            self._taken[slab.size] -= slab.cut
+            slab.spare.append(start)
+            cut = self._cut[slab.cut]
+            if slab.is_all_spare():
+                cut.pop(slab, None)
+                self._keep(slab)
+            else:
+                cut[slab] = None
+
+    def _keep(self, slab: _Slab) -> None:
+        """Have a whole slab spare, or give it back to the system; by who has the lock."""
+        slab.cut = 0
+        if self._whole_bytes + slab.size > self._most_whole:
+            self._given[slab.size] -= slab.given
+            return
+        # The last one is taken first.
+        whole = self._whole.setdefault(slab.size, [])
+        whole.insert(len(whole) if slab.given == slab.size else 0, slab)
+        self._whole_bytes += slab.size
+
+    def _unkeep(self, slab: _Slab) -> _Slab:
+        """Have a whole slab spare no more; by who has the lock."""
+        self._whole[slab.size].remove(slab)
+        self._whole_bytes -= slab.size
+        return slab
 
 
-def _huge_pages(memory: mmap.mmap, most: int | None = None) -> Iterator[NDArray[np.uint8]]:
-    """The first bytes of a buffer, or all, in pieces of which each costs one page fault."""
-    array = np.frombuffer(memory, np.uint8)[:most]
-    return (array[start : start + _HUGE_PAGE] for start in range(0, len(array), _HUGE_PAGE))
+class _Slab:
+    """Memory that is cut into buffers of one size."""
+
+    def __init__(self, size: int) -> None:
+        self.memory = _new(size)
+        self.size = size
+        self.given = 0  # bytes from its start that the system has given
+        self.cut = 0  # bytes of a buffer; 0 while it is whole
+        self.spare: list[int] = []  # where buffers start that are not taken, the next one last
+
+    def cut_into(self, size: int) -> None:
+        self.cut = size
+        self.spare = list(range(self.size - size, -1, -size))
+
+    def is_all_spare(self) -> bool:
+        return len(self.spare) * self.cut == self.size
+
+    def is_new(self, size: int) -> bool:
+        """Whether the next buffer would have memory that the system has yet to give."""
+        return self.given < (self.spare[-1] if self.cut else 0) + size
+
+    def price(self, size: int) -> tuple[bool, int]:
+        """The less the better it is to cut the next buffer from this one."""
+        return self.is_new(size), len(self.spare) if self.cut else self.size
+
+    def give(self, end: int, most: int) -> Iterator[NDArray[np.uint8]]:
+        """Memory up to an end that the system has yet to give, in pieces of a page fault each.
+
+        All of it counts as given; no more than so many bytes are in the pieces.
+        """
+        start, self.given = self.given, min(end, self.size)
+        array = np.frombuffer(self.memory, np.uint8)[start:end][:most]
+        return (array[at : at + _HUGE_PAGE] for at in range(0, len(array), _HUGE_PAGE))
+
+
+def _slab_size(size: int) -> int:
+    return max(size, SLAB)
 
 
 def _rounded(size: int) -> int:

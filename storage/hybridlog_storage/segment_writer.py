@@ -533,8 +533,9 @@ class RecordingWriter:
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
-        self.chunk_size = self.settings.chunk_size
-        """Bytes at which the chunks close that are opened from now on."""
+        chunk_size = self.settings.chunk_size
+        self.next_chunk_size: Callable[[], int] = lambda: chunk_size
+        """Gives the bytes at which a chunk closes that is opened now; may be replaced."""
         self.totals = RecordingTotals()
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
@@ -742,7 +743,7 @@ class RecordingWriter:
         """The open chunk of a cluster."""
         builder = self._clusters.get(key)
         if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self.chunk_size)
+            builder = self._clusters[key] = ChunkBuilder(self.next_chunk_size())
         elif not len(builder):
             builder.capacity = self._next_capacity(key, builder.capacity)
         return builder
@@ -754,7 +755,7 @@ class RecordingWriter:
         chunks are large. So when they become twice as large or more, each cluster begins with
         another size between half of it and all.
         """
-        size = self.chunk_size
+        size = self.next_chunk_size()
         return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
     def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:

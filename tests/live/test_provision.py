@@ -14,7 +14,7 @@ import hybridlog as hl
 from hybridlog.live import provision as module
 from hybridlog.live.provision import Provision
 from hybridlog_storage import buffers as pool_module
-from hybridlog_storage.buffers import Buffers
+from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -42,7 +42,7 @@ def comes(provision: Provision, rate: float, looks: int = 2) -> None:
 
 def test_an_eighth_of_the_budget_is_there_before_the_first_message(pool: Buffers) -> None:
     with closing(Provision(SIZE, BUDGET)) as provision:
-        assert pool._there[SIZE] == BUDGET // 8 // SIZE
+        assert pool._given == {SLAB: BUDGET // 8}
         comes(provision, 0)
         comes(provision, BUDGET / 8)
         assert provision._thread is None
@@ -64,14 +64,12 @@ def test_as_much_as_comes_while_a_disk_stands_still_but_no_more_than_half_the_bu
     rate = 0.5 * BUDGET
     with closing(Provision(SIZE, BUDGET)) as provision:
         comes(provision, rate)
-        assert pool._there[SIZE] == rate * module._AHEAD_S // SIZE
+        assert pool._given == {SLAB: rate * module._AHEAD_S}
         comes(provision, 100 * BUDGET)
-        assert provision.chunk_size == 4 * SIZE
-        # The others are given back only when all have heard that they are not taken any more.
-        assert pool._there[SIZE] == rate * module._AHEAD_S // SIZE
-        comes(provision, 100 * BUDGET, looks=1)
-        assert pool._there == {SIZE: 0, 4 * SIZE: BUDGET // 2 // (4 * SIZE)}
-    assert pool._spare_bytes <= pool_module._SPARE_BYTES
+        assert pool._given == {SLAB: BUDGET // 2}
+        comes(provision, 1000 * BUDGET, looks=10)
+        assert pool._given == {SLAB: BUDGET // 2}
+    assert pool._whole_bytes <= pool_module._SPARE_BYTES
 
 
 @pytest.mark.parametrize(
@@ -96,11 +94,11 @@ def test_a_disk_that_stands_still_changes_nothing(pool: Buffers) -> None:
     """Nothing comes then, for as long as the budget is spent."""
     with closing(Provision(SIZE, BUDGET)) as provision:
         comes(provision, 1e12, looks=3)
-        there, thread = dict(pool._there), provision._thread
+        given, thread = dict(pool._given), provision._thread
         comes(provision, 0, looks=10 * module._LOOKS)
         comes(provision, 1e12)
         assert provision._thread is thread
-        assert pool._there == there
+        assert pool._given == given
 
 
 @pytest.mark.usefixtures("pool")
@@ -127,71 +125,89 @@ def test_no_chunk_takes_much_of_the_budget() -> None:
         assert provision.chunk_size == SIZE
 
 
-def test_chunk_sizes_that_share_their_buffers(pool: Buffers) -> None:
-    """Buffers have a least size."""
-    with closing(Provision(SIZE // 4, BUDGET)) as provision:
+@pytest.mark.usefixtures("pool")
+def test_no_chunk_becomes_larger_than_a_slab(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is at hand could not serve for it."""
+    monkeypatch.setattr(module, "_AHEAD_S", 0)
+    with closing(Provision(SLAB // 2, 1 << 40)) as provision:
         comes(provision, 1e12)
-        assert provision.chunk_size == SIZE
-        assert pool._there == {SIZE: BUDGET // 2 // SIZE}
+        assert provision.chunk_size == SLAB
+    with closing(Provision(2 * SLAB, 1 << 30)) as provision:
+        comes(provision, 1e12)
+        assert provision.chunk_size == 2 * SLAB
 
 
 def test_where_there_is_no_memory_it_is_asked_for_once(
     pool: Buffers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
-    new = pool_module._new
+    with closing(Provision(SIZE, BUDGET)) as provision:
+        asked = []
 
-    def refuse(size: int) -> mmap.mmap:
-        if size > SIZE:
+        def refuse(size: int) -> mmap.mmap:
             asked.append(size)
             raise OSError(errno.ENOMEM, "no memory")
-        return new(size)
 
-    monkeypatch.setattr(pool_module, "_new", refuse)
-    with closing(Provision(SIZE, BUDGET)) as provision:
-        there = pool._there[SIZE]
+        monkeypatch.setattr(pool_module, "_new", refuse)
         comes(provision, 1e12, looks=10)
-        assert asked == [4 * SIZE]
-        assert provision.chunk_size == SIZE
-        assert pool._there[SIZE] > there  # of what there is, more is got
+        assert asked == [SLAB]
         assert pool.take(SIZE).size == SIZE
+        # What is there does for large chunks as well.
+        assert provision.next_chunk_size() == 4 * SIZE
 
 
 def test_who_closes_does_not_wait_for_all_of_it(
     pool: Buffers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_PAUSE", 1e9)
-    with closing(Provision(SIZE, BUDGET)) as provision:
+    with closing(Provision(SIZE, 16 * SLAB)) as provision:
+        given = pool._given[SLAB]
         provision.look(1e12)
         provision.look(1e12)
-        wait_for(lambda: pool._there[4 * SIZE] == 1)
+        wait_for(lambda: provision._thread is not None)
     assert provision._thread is not None
     assert not provision._thread.is_alive()
-    assert pool._there[4 * SIZE] == 1
+    assert given <= pool._given[SLAB] <= given + SLAB
 
 
-def test_memory_is_short_when_less_than_the_reserve_is_spare(pool: Buffers) -> None:
-    with closing(Provision(SIZE, BUDGET)) as provision:
-        there = pool._there[SIZE]
-        held = [pool.take(SIZE) for _ in range(int(there * (1 - module._RESERVE)))]
+def test_what_waits_leaves_memory_to_chunks_and_large_chunks_leave_some_to_messages(
+    pool: Buffers,
+) -> None:
+    with closing(Provision(SIZE, 4 * BUDGET)) as provision:
+        comes(provision, 1e12)
+        there = pool._given[SLAB] // SIZE
+        held = [pool.take(SIZE) for _ in range(int(there * (1 - module._FOR_CHUNKS)))]
         assert not provision.is_short()
         held.append(pool.take(SIZE))
         assert provision.is_short()
+        while len(held) < there * (1 - module._FOR_SMALL):
+            assert provision.next_chunk_size() == 4 * SIZE
+            held.append(pool.take(SIZE))
+        assert provision.next_chunk_size() == 4 * SIZE
+        held.append(pool.take(SIZE))
+        assert provision.next_chunk_size() == SIZE
         held.clear()
         assert not provision.is_short()
+        assert provision.next_chunk_size() == 4 * SIZE
 
 
-def test_memory_of_either_size_may_be_short_while_chunks_become_larger(pool: Buffers) -> None:
+def test_no_large_chunk_asks_for_memory(pool: Buffers) -> None:
+    """Much may be spare, but nowhere enough at one place."""
     with closing(Provision(SIZE, BUDGET)) as provision:
-        held = [pool.take(SIZE) for _ in range(pool._there[SIZE])]
-        assert provision.is_short()
         comes(provision, 1e12)
-        assert provision.chunk_size == 4 * SIZE
-        assert provision.is_short()  # somebody may still take small ones
-        comes(provision, 1e12, looks=1)
-        assert not provision.is_short()
-        held += [pool.take(4 * SIZE) for _ in range(pool._there[4 * SIZE])]
+        held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
+        del held[1::2]
+        assert provision.next_chunk_size() == SIZE
         assert provision.is_short()
+        del held[:]
+        assert provision.next_chunk_size() == 4 * SIZE
+
+
+def test_usual_chunks_need_nothing(pool: Buffers) -> None:
+    with closing(Provision(SIZE, BUDGET)) as provision:
+        held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
+        assert provision.is_short()
+        assert provision.next_chunk_size() == SIZE
+        assert held
 
 
 def test_a_recording_of_much_has_larger_chunks(
@@ -209,7 +225,7 @@ def test_a_recording_of_much_has_larger_chunks(
 
         def speak(one: Channel) -> None:
             n = 0
-            while (writer.chunk_size == SIZE and time.monotonic() < until) or n % 20:
+            while (writer.next_chunk_size() == SIZE and time.monotonic() < until) or n % 20:
                 written[one].append(text(bytes([n % 251]) * sizes[n % len(sizes)]))
                 recording.write(one, written[one][-1], log_time=n)
                 n += 1
@@ -220,8 +236,7 @@ def test_a_recording_of_much_has_larger_chunks(
             thread.start()
         for thread in threads:
             thread.join()
-        assert writer.chunk_size == 4 * SIZE
-        assert pool._there[4 * SIZE]
+        assert writer.next_chunk_size() == 4 * SIZE
     for one in own:
         assert [m.raw for m in store.topic(one.topic)] == written[one]
     assert store.verify().findings == []

@@ -28,7 +28,7 @@ from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording, provision
 from hybridlog.live import recording as live
 from hybridlog_storage import append_file, chunk_builder
-from hybridlog_storage.buffers import Buffers
+from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
@@ -416,12 +416,11 @@ def test_few_chunks_wait_for_the_index_where_memory_is_short(
     pool = Buffers()
     monkeypatch.setattr(provision, "buffers", pool)
     monkeypatch.setattr(chunk_builder, "buffers", pool)
-    monkeypatch.setattr(provision, "_RESERVE", 0.5)
     monkeypatch.setattr(provision.Provision, "look", lambda *_: None)
     settings = SegmentSettings(chunk_size=size)
     with store.start("talk", settings=settings, budget_bytes=8 * 40 * size) as recording:
         totals = recording._capture.writer.totals
-        assert pool._there[size] == 40
+        assert pool._given == {SLAB: 40 * size}
 
         def speak() -> None:  # not on the main thread, where a message waits for a tick
             for number, payload in enumerate(payloads):
@@ -432,7 +431,7 @@ def test_few_chunks_wait_for_the_index_where_memory_is_short(
         thread.start()
         thread.join()
         wait_for(lambda: totals.chunks == 64)
-        assert pool._there[size] == 40
+        assert pool._given == {SLAB: 40 * size}
         go_on.set()
         wait_for(lambda: recording.lag == 0)
         # Of those that were there half waited in memory, but for what was being written.

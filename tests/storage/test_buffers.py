@@ -5,12 +5,17 @@ from __future__ import annotations
 import mmap
 import resource
 import threading
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from hybridlog_storage import buffers as module
-from hybridlog_storage.buffers import Buffers
+from hybridlog_storage.buffers import SLAB, Buffers
 
 SIZE = 1 << 20
 
@@ -31,15 +36,56 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_what_was_prepared_is_taken(made: list[int]) -> None:
     pool = Buffers()
-    pool.prepare(SIZE - 5, 4 * SIZE)
-    assert made == [SIZE] * 4
-    held = [pool.take(SIZE - 5) for _ in range(4)]
-    assert made == [SIZE] * 4
+    pool.prepare(SIZE - 5, 2 * SLAB)
+    assert made == [SLAB] * 2
+    held = [pool.take(SIZE - 5) for _ in range(16)]
+    assert made == [SLAB] * 2
     held.append(pool.take(SIZE))
-    assert made == [SIZE] * 5
-    starts = {array.ctypes.data for array in held}
-    assert len(starts) == 5
+    assert made == [SLAB] * 3
+    starts = sorted(array.ctypes.data for array in held)
+    assert all(after - before >= SIZE for before, after in pairwise(starts))
     assert not any(start % mmap.PAGESIZE for start in starts)
+
+
+def test_no_more_is_prepared_than_was_said(made: list[int]) -> None:
+    pool = Buffers()
+    pool.prepare(SIZE, 3 * SIZE + 7)
+    assert (made, pool._given) == ([SLAB], {SLAB: 3 * SIZE})
+    pool.prepare(SIZE, 3 * SIZE)
+    pool.prepare(4 * SIZE, 4 * SIZE + 7)  # no buffer more than there is
+    assert (made, pool._given) == ([SLAB], {SLAB: 3 * SIZE})
+    held = [pool.take(SIZE) for _ in range(3)]
+    assert pool._given == {SLAB: 3 * SIZE}
+    held.append(pool.take(SIZE))
+    assert (made, pool._given) == ([SLAB], {SLAB: 4 * SIZE})
+
+
+def test_preparing_ends_when_somebody_settles_meanwhile(made: list[int]) -> None:
+    class Enough(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            pool.settle()
+            return False
+
+    pool = Buffers()
+    pool.prepare(SIZE, 2 * module._SPARE_BYTES, enough=Enough())
+    assert len(made) == 2 * module._SPARE_BYTES // SLAB
+    assert pool._given == {SLAB: module._SPARE_BYTES}
+
+
+def test_what_is_begun_is_prepared_first_and_taken_last(made: list[int]) -> None:
+    pool = Buffers()
+    pool.prepare(SIZE, 3 * SIZE)
+    pool.prepare(SIZE, 5 * SIZE)
+    assert (made, pool._given) == ([SLAB], {SLAB: 5 * SIZE})
+    pool.prepare(SIZE, SLAB + 5 * SIZE)
+    assert (made, pool._given) == ([SLAB] * 2, {SLAB: SLAB + 5 * SIZE})
+    held = [pool.take(SIZE) for _ in range(13)]
+    assert pool._given == {SLAB: SLAB + 5 * SIZE}
+    del held[0]
+    held.append(pool.take(SIZE))
+    assert pool._given == {SLAB: SLAB + 5 * SIZE}
+    held.append(pool.take(SIZE))
+    assert (made, pool._given) == ([SLAB] * 2, {SLAB: SLAB + 6 * SIZE})
 
 
 def test_nothing_is_prepared_where_one_is_too_much(made: list[int]) -> None:
@@ -49,79 +95,95 @@ def test_nothing_is_prepared_where_one_is_too_much(made: list[int]) -> None:
 
 def test_a_buffer_is_not_taken_again_while_something_lies_over_it(made: list[int]) -> None:
     pool = Buffers()
-    first = pool.take(SIZE)
+    first = pool.take(SLAB)
     first[:] = 7
     view = memoryview(first)[10:20]
     del first
-    pool.take(SIZE)[:] = 9
+    pool.take(SLAB)[:] = 9
     assert bytes(view) == bytes([7] * 10)
     view.release()
-    kept = [pool.take(SIZE), pool.take(SIZE)]
+    kept = [pool.take(SLAB), pool.take(SLAB)]
     assert len(made) == 2
     assert {int(np.max(array)) for array in kept} == {7, 9}
 
 
+def test_memory_of_small_buffers_serves_for_large_ones_when_none_is_taken(
+    made: list[int],
+) -> None:
+    pool = Buffers()
+    held = [pool.take(SIZE) for _ in range(16)]
+    assert made == [SLAB] * 2
+    del held[1:]  # the first one is of the first slab
+    large = pool.take(4 * SIZE)
+    small = [pool.take(SIZE) for _ in range(7)]
+    assert made == [SLAB] * 2
+    del held, large, small
+    assert len({pool.take(SLAB).ctypes.data for _ in range(3)}) == 1
+    held = [pool.take(SLAB) for _ in range(2)]
+    assert made == [SLAB] * 2
+    del held
+
+
+def test_buffers_beyond_a_slab_have_their_own(made: list[int]) -> None:
+    pool = Buffers()
+    held = [pool.take(SLAB + 1)]
+    assert made == [2 * SLAB]
+    del held
+    held = [pool.take(SIZE), pool.take(2 * SLAB)]
+    assert made == [2 * SLAB, SLAB]
+    pool.prepare(2 * SLAB, 4 * SLAB)
+    assert made == [2 * SLAB, SLAB, 2 * SLAB]
+    del held
+
+
 def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
     pool = Buffers()
-    most = module._SPARE_BYTES // SIZE
-    held = [pool.take(SIZE) for _ in range(most + 3)]
+    most = module._SPARE_BYTES // SLAB
+    held = [pool.take(SIZE) for _ in range((most + 3) * SLAB // SIZE)]
     del held
+    assert pool._given == {SLAB: most * SLAB}
     del made[:]
-    held = [pool.take(SIZE) for _ in range(most + 3)]
+    held = [pool.take(SLAB) for _ in range(most + 3)]
     assert len(made) == 3
     del held
 
 
 def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
     pool = Buffers()
-    usual = module._SPARE_BYTES // SIZE
-    pool.prepare(SIZE, (usual + 5) * SIZE)
+    usual = module._SPARE_BYTES // SLAB
+    pool.prepare(SIZE, (usual + 5) * SLAB)
     assert len(made) == usual + 5
-    held = [pool.take(SIZE) for _ in range(usual + 5)]
+    held = [pool.take(SLAB) for _ in range(usual + 5)]
     del held
     # Those that are taken count: nothing is made on top of them.
     held = [pool.take(SIZE) for _ in range(10)]
-    pool.prepare(SIZE, (usual + 5) * SIZE)
+    pool.prepare(SIZE, (usual + 5) * SLAB)
     assert len(made) == usual + 5
     del held
     pool.settle()
-    held = [pool.take(SIZE) for _ in range(usual + 5)]
+    assert pool._given == {SLAB: usual * SLAB}
+    held = [pool.take(SLAB) for _ in range(usual + 5)]
     assert len(made) == usual + 10
-    pool.prepare(SIZE, (usual + 7) * SIZE)
+    pool.prepare(SIZE, (usual + 7) * SLAB)
     assert len(made) == usual + 12
     del held
 
 
-def test_what_is_spare_of_another_size_is_not_in_the_way(made: list[int]) -> None:
+def test_what_is_spare_of_another_kind_is_not_in_the_way(made: list[int]) -> None:
     pool = Buffers()
-    held = [pool.take(SIZE) for _ in range(module._SPARE_BYTES // SIZE)]
+    held = [pool.take(SLAB) for _ in range(module._SPARE_BYTES // SLAB)]
     del held
-    del made[:]
-    pool.prepare(2 * SIZE, 6 * SIZE)
-    assert made == [2 * SIZE] * 3
-    held = [pool.take(2 * SIZE) for _ in range(3)]
-    assert len(made) == 3
+    pool.prepare(2 * SLAB, 6 * SLAB)
+    assert made[-3:] == [2 * SLAB] * 3
+    held = [pool.take(2 * SLAB) for _ in range(3)]
+    assert made[-4:] == [SLAB] + [2 * SLAB] * 3
     del held
 
 
-def test_spare_buffers_of_one_size_are_given_back(made: list[int]) -> None:
+def test_whether_little_memory_is_spare() -> None:
     pool = Buffers()
-    held = [pool.take(SIZE) for _ in range(4)]
-    pool.prepare(2 * SIZE, 4 * SIZE)
-    del held[1:]
-    pool.release(SIZE, keep=SIZE - 5)
-    assert dict(pool._there) == {SIZE: 4, 2 * SIZE: 2}
-    pool.release(SIZE, keep=2 * SIZE)
-    assert dict(pool._there) == {SIZE: 1, 2 * SIZE: 2}
-    assert pool._spare_bytes == 4 * SIZE
-    del made[:]
-    held += [pool.take(SIZE), pool.take(2 * SIZE)]
-    assert made == [SIZE]
-
-
-def test_whether_few_buffers_are_spare() -> None:
-    pool = Buffers()
-    assert not pool.is_short(SIZE, 0.5)
+    assert pool.is_short(SIZE, 0)
+    pool.prepare(SIZE, 4 * SIZE)
     held = [pool.take(SIZE) for _ in range(4)]
     assert pool.is_short(SIZE, 0.5)
     held.pop()
@@ -129,6 +191,74 @@ def test_whether_few_buffers_are_spare() -> None:
     held.pop()
     assert not pool.is_short(SIZE, 0.5)
     assert pool.is_short(SIZE - 5, 0.51)
+    assert pool.is_short(2 * SIZE, 0)  # spare, but not at one place
+    del held
+    assert not pool.is_short(2 * SIZE, 1)
+    assert pool.is_short(SLAB, 0)  # the system has not given so much
+    assert pool.is_short(2 * SLAB, 0)
+
+
+def test_a_buffer_that_is_given_back_in_the_middle_of_something(made: list[int]) -> None:
+    """The collector runs where it likes, on a thread that may have the lock."""
+    pool = Buffers()
+    held = pool.take(SLAB)
+    with pool._lock:
+        del held
+    assert pool.take(SLAB).size == SLAB
+    assert len(made) == 1
+
+
+class Taking(RuleBasedStateMachine):
+    """No two buffers share a byte, and all memory is accounted for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pool = Buffers()
+        self.held: list[tuple[np.ndarray[Any, np.dtype[np.uint8]], int]] = []
+        self.number = 0
+
+    @rule(size=st.sampled_from([1 << 18, 300_000, SIZE, 2 * SIZE, SLAB // 2 + 1, SLAB + 1]))
+    def take(self, size: int) -> None:
+        array = self.pool.take(size)
+        assert len(array) >= size
+        self.number = (self.number + 1) % 251
+        array[:: mmap.PAGESIZE] = self.number
+        self.held.append((array, self.number))
+
+    @rule(which=st.integers(0, 1 << 20))
+    def drop(self, which: int) -> None:
+        if self.held:
+            array, number = self.held.pop(which % len(self.held))
+            assert (array[:: mmap.PAGESIZE] == number).all()
+
+    @rule(size=st.sampled_from([1 << 18, 4 * SIZE]), total=st.integers(0, 4 * SLAB))
+    def prepare(self, size: int, total: int) -> None:
+        self.pool.prepare(size, total)
+        assert self.pool._given[SLAB] > total - module._rounded(size)
+
+    @rule()
+    def settle(self) -> None:
+        self.pool.settle()
+
+    @invariant()
+    def adds_up(self) -> None:
+        pool = self.pool
+        for kind in (SLAB, 2 * SLAB):
+            taken = sum(len(array) for array, _ in self.held if max(len(array), SLAB) == kind)
+            assert pool._taken[kind] == taken
+            assert pool._given[kind] >= taken
+        whole = sum(slab.size for slabs in pool._whole.values() for slab in slabs)
+        assert whole == pool._whole_bytes <= pool._most_whole
+        if not self.held:
+            assert not any(pool._cut.values())
+
+    def teardown(self) -> None:
+        while self.held:
+            self.drop(0)
+
+
+TestTaking = Taking.TestCase
+TestTaking.settings = settings(max_examples=30, stateful_step_count=40, deadline=None)
 
 
 def test_memory_is_got_with_pauses_and_ended_in_one(
@@ -155,14 +285,14 @@ def test_memory_is_got_with_pauses_and_ended_in_one(
 
     monkeypatch.setattr(module, "time", Time())
     pool = Buffers()
-    pool.prepare(8 << 20, 80 << 20, pause=3, enough=Enough())
+    pool.prepare(SLAB, 10 * SLAB, pause=3, enough=Enough())
     assert waited == [3.0] * 6
-    assert made == [8 << 20] * 2
-    # The one that was begun can be taken, too.
-    held = [pool.take(8 << 20) for _ in range(2)]
-    assert made == [8 << 20] * 2
-    held.append(pool.take(8 << 20))
-    assert made == [8 << 20] * 3
+    assert made == [SLAB] * 2
+    # What was begun can be taken, too.
+    held = [pool.take(SLAB) for _ in range(2)]
+    assert made == [SLAB] * 2
+    held.append(pool.take(SLAB))
+    assert made == [SLAB] * 3
 
 
 def test_new_memory_is_there_when_it_is_taken() -> None:

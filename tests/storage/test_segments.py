@@ -9,6 +9,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -176,7 +177,7 @@ def test_the_chunk_size_may_change_while_messages_come(
     payloads: list[bytes] = []
     opened_with: list[int] = []  # the bound when each message came
     for chunk_size, sizes, by_batch in steps:
-        writer.chunk_size = chunk_size
+        writer.next_chunk_size = partial(int, chunk_size)
         first = len(payloads)
         payloads += [bytes([first + n + 1]) * size for n, size in enumerate(sizes)]
         opened_with += [chunk_size] * len(sizes)
@@ -222,7 +223,7 @@ def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
                 writer.place_one(topic, bytes(5000), n, n, n)
 
     speak(30)
-    writer.chunk_size = 400_000
+    writer.next_chunk_size = lambda: 400_000
     speak(250)
     writer.close()
     of_topic: dict[int, list[int]] = {}
@@ -253,7 +254,7 @@ def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path:
 
     assert place(5000) == 2 << 20
     writer.flush()
-    writer.chunk_size = 8 << 20
+    writer.next_chunk_size = lambda: 8 << 20
     assert place(5000) < 100_000
     assert place(*[5000] * 100) < 2_000_000
     # What is copied outside of the lock needs a place that stays.
