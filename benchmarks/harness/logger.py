@@ -156,7 +156,7 @@ def _run(system: Backend, load: Load, publishing: Publishing, values: Values, pa
     if not said and not failure:
         raise RuntimeError("the publisher did not come to its end")
     meter.note(values, json.loads(said) if said else {})
-    values["peak_rss_mapped"] = usage.mapped_rss(load.payloads.resolve())
+    values["peak_rss_payloads"] = subscribers.payload_rss()
     if failure:
         raise BackendFailedError(failure)
 

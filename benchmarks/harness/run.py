@@ -80,7 +80,7 @@ def run(
     first until the last message should be published), `publish_s` (until it was),
     `wall_s` (from the first publication until `finish` had returned), `depth_*` and
     `late_ms_*` (percentiles), `cpu_s` of the logger, `publisher_cpu_s`, `server_cpu_s`,
-    `server_peak_rss`, `peak_rss` (without the payload file), `disk_bytes`, `steal_s` and
+    `server_peak_rss`, `peak_rss` (without the payloads), `disk_bytes`, `steal_s` and
     `other_cpu_s` of the machine (the kernel's writing threads are among the others),
     `spin_ms`.
 
@@ -125,7 +125,7 @@ def run(
         values = {"status": "failed", "reason": str(error)}
     status, reason = values.pop("status"), values.pop("reason")
     if "peak_rss" in values:
-        values["peak_rss"] -= values.pop("peak_rss_mapped", 0)
+        values["peak_rss"] -= values.pop("peak_rss_payloads", 0)
     if status == "missing" or not counters.is_file():
         return Outcome(status, {}, reason)
     values["due_s"] = load.duration_s / setting.speed

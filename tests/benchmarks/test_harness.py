@@ -24,6 +24,7 @@ from benchmarks.harness import usage
 from benchmarks.harness.child import MARK
 from benchmarks.harness.counters import Counters
 from benchmarks.harness.run import Outcome, Setting, run
+from benchmarks.harness.subscribers import Subscribers
 from benchmarks.loads.base import PAYLOADS, Load
 from hybridlog_storage.messages import Channel
 from tests.imports import ROOT
@@ -261,6 +262,22 @@ def test_values_of_a_good_run(tmp_path: Path, start: Runner) -> None:
     assert 1 < values["spin_ms"] < 2000
     assert values["other_cpu_s"] >= 0
     assert values["steal_s"] >= 0
+
+
+@pytest.mark.parametrize("more", [0, 128 << 20])
+def test_payloads_lie_in_memory_or_are_mapped_where_they_are_too_many(
+    tmp_path: Path, more: int
+) -> None:
+    load = make_load(tmp_path / "load")
+    expected = load.payloads.read_bytes()
+    os.truncate(load.payloads, len(expected) + more)
+    counters = Counters(tmp_path / "counters", len(load.channels))
+    subscribers = Subscribers(load, Nothing(tmp_path), counters)
+    assert bytes(subscribers._payloads[: len(expected)]) == expected
+    assert len(subscribers._payloads) == len(expected) + more
+    held = subscribers.payload_rss()
+    assert held == usage.mapped_rss(load.payloads.resolve()) if more else held == len(expected)
+    assert held >= len(expected)
 
 
 def test_a_full_queue_drops_and_only_its_own_messages(tmp_path: Path, start: Runner) -> None:
