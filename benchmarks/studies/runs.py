@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -29,6 +30,8 @@ SERVER_OVERHEAD_S = 5.0
 """About what a server adds: it is started and ended twice."""
 
 _PART = "part-"
+_DIGESTED_S = 500e6  # bytes a second of what a run has kept that the machine is done with,
+_DIGESTING_S = 12.0  # and seconds after which it is done with all
 
 
 @dataclass
@@ -45,6 +48,8 @@ class Context:
         speed: Times as fast as the loads say.
         timeout_s: A run is ended after it; None to let it depend on its duration.
         missing: Why backends are missing that were found so: they are not tried again.
+        quiet_at: When the machine will be done with what the last run left, seconds of
+            `time.monotonic`.
     """
 
     work: Path
@@ -56,6 +61,7 @@ class Context:
     speed: float = 1.0
     timeout_s: float | None = None
     missing: dict[str, str] = field(default_factory=dict)
+    quiet_at: float = 0.0
 
     def load(self, name: str, settings: Mapping[str, Any], make: Callable[[Path], Load]) -> Load:
         """A load that is made once.
@@ -132,8 +138,11 @@ class Context:
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
         backend = self.backends[wanted.backend]
         setting = Setting(speed=speed, intake=backend.intake, timeout_s=self.timeout_s)
+        if not self.quick:
+            time.sleep(max(self.quiet_at - time.monotonic(), 0))
         with run_directory(self.work) as directory:
             outcome = run_load(load, backend, directory, setting)
+        self.quiet_at = time.monotonic() + digesting_s(outcome.values)
         damage = {DAMAGE: load.damage} if load.damage else {}
         return _filled(wanted, outcome.status, {**outcome.values, **damage}, outcome.reason)
 
@@ -170,6 +179,20 @@ def overhead_s(backend: type[Backend]) -> float:
     """About what a run of a backend takes besides publishing, seconds."""
     has_server = backend.kind in {"database", "hybrid"}
     return RUN_OVERHEAD_S + (SERVER_OVERHEAD_S if has_server else 0.0)
+
+
+def digesting_s(values: Mapping[str, Any]) -> float:
+    """Seconds for which a machine may be busy with what a run has left behind.
+
+    A virtual machine returns freed memory to its host bit by bit, every two seconds. The
+    host then loses sight of the pages that are in use, too, and who touches them next pays
+    for it: 100 to 300 ms of a run's first seconds, when the one before had kept gigabytes.
+
+    Args:
+        values: Of the run.
+    """
+    kept: float = values.get("persisted_bytes", 0)
+    return min(kept / _DIGESTED_S, _DIGESTING_S)
 
 
 @contextmanager

@@ -137,6 +137,38 @@ def test_what_is_done_is_not_done_again(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_machine_is_left_alone_after_a_run_that_kept_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: bool
+) -> None:
+    class Time:
+        now = 100.0
+        slept: list[float] = []  # noqa: RUF012 - of this test
+
+        def monotonic(self) -> float:
+            return self.now
+
+        def sleep(self, seconds: float) -> None:
+            self.slept.append(seconds)
+            self.now += seconds
+
+    clock = Time()
+    kept = iter([10**9, 10**12, 0, 0])
+
+    def run(*_: Any) -> Outcome:
+        clock.now += 1
+        values = {"steal_s": 0.0, "wall_s": 1.0, "persisted_bytes": next(kept)}
+        return Outcome("ok", values)
+
+    monkeypatch.setattr(runs, "time", clock)
+    monkeypatch.setattr(runs, "run_load", run)
+    where = context(tmp_path, quick=quick)
+    for number in range(4):
+        wanted = Sample("throughput", {"size": 1}, "nothing", number)
+        where.run(wanted, lambda: make_load(tmp_path / f"load{number}"), seconds=1)  # noqa: B023
+    assert clock.slept == ([] if quick else [0, 2, 12, 0])
+
+
 def test_a_failure_is_noted_and_tried_again(tmp_path: Path) -> None:
     settings = throughput.Settings(
         sizes=(200,), rates=(500.0,), messages=100, topics=2, repetitions=1
