@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from benchmarks.report.book import MB, Book
 from benchmarks.report.look import OURS, databases, ordered, title
@@ -11,6 +12,9 @@ from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Va
 from benchmarks.report.numbers import counted, listed, number, size, times, with_spread
 from benchmarks.studies.ceiling import HARNESS, STUDY, Ceiling
 from benchmarks.studies.ceiling import ceilings as found_in
+
+if TYPE_CHECKING:
+    from benchmarks.samples import Sample
 
 _NOTE = (
     "≥: the ceiling is above; the harness could offer no more (harness), or no higher rate was "
@@ -105,6 +109,7 @@ def findings(book: Book) -> list[str]:
             f"{with_spread(ours.offered)} MB/s{marked}, "
             f"{times(ours.offered.median / best.offered.median)} what the best database does "
             f"({title(best.backend)}, {with_spread(best.offered)} MB/s)."
+            f"{_in_same_runs(book, ours, best)}"
         )
     short = [one for one in ceilings if one.backend == OURS and one.limit == "harness"]
     if short:
@@ -116,9 +121,36 @@ def findings(book: Book) -> list[str]:
     return found
 
 
+def _in_same_runs(book: Book, ours: _Found, best: _Found) -> str:
+    """The two where they took turns, if not always: a machine is faster on one day."""
+    groups = [
+        [
+            s
+            for s in book.all
+            if s.study == STUDY and s.backend == found.backend and s.case["size"] == found.size
+        ]
+        for found in (ours, best)
+    ]
+    both = book.in_same_runs(*groups)
+    if both is None or [len(of) for of in both] == [len(of) for of in groups]:
+        return ""
+    pair = _pair(_found_in(sample for of in both for sample in of))
+    if pair is None:
+        return ""
+    mine, other = (one.offered for one in pair)
+    return (
+        f" In the runs of both: {with_spread(mine)} and {with_spread(other)} MB/s, "
+        f"{times(mine.median / other.median)}."
+    )
+
+
 def _ceilings(book: Book) -> list[_Found]:
+    return _found_in(one for one in book.all if one.status != "missing")
+
+
+def _found_in(samples: Iterable[Sample]) -> list[_Found]:
     searches: dict[tuple[str, int], list[Ceiling]] = {}
-    for one in found_in(one for one in book.all if one.status != "missing"):
+    for one in found_in(samples):
         searches.setdefault((one.backend, one.size), []).append(one)
     return [_Found(backend, bytes_, of) for (backend, bytes_), of in searches.items()]
 

@@ -323,6 +323,26 @@ def test_speeds_of_several_searches_have_a_spread(tmp_path: Path) -> None:
     }
 
 
+def test_ceilings_are_compared_in_runs_of_both_too(tmp_path: Path) -> None:
+    def search(backend: str, kept: int, repetition: int) -> list[Sample]:
+        return [
+            ceiling_trial(backend, kept, 1.0, repetition),
+            ceiling_trial(backend, 2 * kept, 0.5, repetition),
+        ]
+
+    def told() -> str:
+        found = report(Journal(tmp_path)).findings
+        (one,) = (text for text in found if "keeps everything up to" in text)
+        return one
+
+    journal(tmp_path, *search("hybridlog", 400, 0), *search("sqlite_udf", 200, 0))
+    assert "2 times what the best database does" in told()
+    assert "In the runs of both" not in told()
+    journal(tmp_path, *search("sqlite_udf", 400, 1), *search("sqlite_udf", 400, 2), cpu="fast")
+    assert "1 times what the best database does" in told()
+    assert told().endswith(" In the runs of both: 40 and 20 MB/s, 2 times.")
+
+
 def test_ceilings_of_several_searches_have_a_spread(tmp_path: Path) -> None:
     trial = ceiling_trial
     found = report(
