@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 import threading
 import time
@@ -14,13 +13,13 @@ import numpy as np
 from benchmarks.backends.base import Backend, BackendFailedError
 from benchmarks.harness import usage
 from benchmarks.harness.publisher import TOKEN
+from hybridlog_storage.buffers import new_memory
 
 if TYPE_CHECKING:
     from benchmarks.harness.counters import Counters
     from benchmarks.loads.base import Load
 
 _HELD = 128 << 20  # bytes of payloads up to which they are held in memory
-_HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 _QUEUE_READ = 16 * TOKEN
 _INTAKE_READ = 8192 * TOKEN
 
@@ -49,7 +48,7 @@ class Subscribers:
         self._load = load
         self._backend = backend
         self._counters = counters
-        self._payloads, self._held = _at_hand(load)
+        self._payloads = _at_hand(load)
         self._threads: list[threading.Thread] = []
 
     def start(self, pipes: Sequence[int], *, single: bool) -> None:
@@ -69,7 +68,8 @@ class Subscribers:
 
     def payload_rss(self) -> int:
         """Bytes of memory that the payloads take, of which no backend can know."""
-        return self._held or usage.mapped_rss(self._load.payloads.resolve())
+        size = len(self._payloads)
+        return size if size <= _HELD else usage.mapped_rss(self._load.payloads.resolve())
 
     def join(self, timeout_s: float) -> bool:
         """Wait until all is taken.
@@ -168,8 +168,8 @@ class Subscribers:
             self.first_error = f"{type(error).__name__}: {error}"[:500]
 
 
-def _at_hand(load: Load) -> tuple[memoryview, int]:
-    """The payloads, and the bytes of memory that hold them; 0 where they are only mapped.
+def _at_hand(load: Load) -> memoryview:
+    """The payloads, in memory unless they are too many.
 
     To take a message shall cost a copy, as when it came from a socket a moment ago. The small
     pages of a mapped file cost more on a virtual machine whose host lost sight of them: 20 to
@@ -180,11 +180,9 @@ def _at_hand(load: Load) -> tuple[memoryview, int]:
         mapped = load.map()
         # Every page is looked at once, so that no subscriber waits for it to be mapped.
         np.frombuffer(mapped, np.uint8)[::4096].max(initial=0)
-        return mapped, 0
-    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    if _HUGE is not None:
-        memory.madvise(_HUGE)
+        return mapped
+    memory = new_memory(size)
     with load.payloads.open("rb") as stream:
         if stream.readinto(memory) != size:
             raise OSError(f"{load.payloads} was cut short.")
-    return memoryview(memory).toreadonly(), size
+    return memoryview(memory).toreadonly()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
-from benchmarks.report.book import MB, Book
+from benchmarks.report.book import MB, Book, by_backend
 from benchmarks.report.look import OURS, databases, ordered, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import counted, listed, number, size, times, with_spread
@@ -65,7 +66,7 @@ _Text = Callable[[_Found], str | None]
 
 def section(book: Book) -> Section | None:
     """Ceilings in MB/s and messages/s, and ours over the best database's."""
-    ceilings = _ceilings(book)
+    ceilings = _ceilings(book.all)
     if not ceilings:
         return None
     text = (
@@ -95,7 +96,7 @@ def section(book: Book) -> Section | None:
 
 def findings(book: Book) -> list[str]:
     """Our ceiling against the best database's, at every size."""
-    ceilings = _ceilings(book)
+    ceilings = _ceilings(book.all)
     found = []
     for bytes_ in sorted({one.size for one in ceilings}):
         of_size = [one for one in ceilings if one.size == bytes_]
@@ -123,18 +124,13 @@ def findings(book: Book) -> list[str]:
 
 def _in_same_runs(book: Book, ours: _Found, best: _Found) -> str:
     """The two where they took turns, if not always: a machine is faster on one day."""
-    groups = [
-        [
-            s
-            for s in book.all
-            if s.study == STUDY and s.backend == found.backend and s.case["size"] == found.size
-        ]
-        for found in (ours, best)
-    ]
+    of_size = (s for s in book.all if s.study == STUDY and s.case["size"] == ours.size)
+    known = by_backend(of_size)
+    groups = known[ours.backend], known[best.backend]
     both = book.in_same_runs(*groups)
-    if both is None or [len(of) for of in both] == [len(of) for of in groups]:
+    if both is None or list(map(len, both)) == list(map(len, groups)):
         return ""
-    pair = _pair(_found_in(sample for of in both for sample in of))
+    pair = _pair(_ceilings(chain(*both)))
     if pair is None:
         return ""
     mine, other = (one.offered for one in pair)
@@ -144,11 +140,7 @@ def _in_same_runs(book: Book, ours: _Found, best: _Found) -> str:
     )
 
 
-def _ceilings(book: Book) -> list[_Found]:
-    return _found_in(one for one in book.all if one.status != "missing")
-
-
-def _found_in(samples: Iterable[Sample]) -> list[_Found]:
+def _ceilings(samples: Iterable[Sample]) -> list[_Found]:
     searches: dict[tuple[str, int], list[Ceiling]] = {}
     for one in found_in(samples):
         searches.setdefault((one.backend, one.size), []).append(one)

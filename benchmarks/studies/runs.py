@@ -142,7 +142,7 @@ class Context:
             time.sleep(max(self.quiet_at - time.monotonic(), 0))
         with run_directory(self.work) as directory:
             outcome = run_load(load, backend, directory, setting)
-        self.quiet_at = time.monotonic() + digesting_s(outcome.values)
+        self.quiet_at = time.monotonic() + _digesting_s(outcome.values)
         damage = {DAMAGE: load.damage} if load.damage else {}
         return _filled(wanted, outcome.status, {**outcome.values, **damage}, outcome.reason)
 
@@ -181,7 +181,7 @@ def overhead_s(backend: type[Backend]) -> float:
     return RUN_OVERHEAD_S + (SERVER_OVERHEAD_S if has_server else 0.0)
 
 
-def digesting_s(values: Mapping[str, Any]) -> float:
+def _digesting_s(values: Mapping[str, Any]) -> float:
     """Seconds for which a machine may be busy with what a run has left behind.
 
     A virtual machine returns freed memory to its host bit by bit, every two seconds. The

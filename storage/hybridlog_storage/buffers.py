@@ -46,7 +46,6 @@ class Buffers:
         # thread that has the lock already.
         self._returned: deque[tuple[_Slab, int]] = deque()
         self._whole: dict[int, list[_Slab]] = {}  # of which nothing is taken, by their size
-        self._whole_bytes = 0
         self._most_whole = _SPARE_BYTES
         # Of which something is taken and something is not, by the size of their buffers.
         self._cut: dict[int, dict[_Slab, None]] = {}
@@ -63,10 +62,17 @@ class Buffers:
         if size < _LEAST and not whole_pages:
             return np.empty(size, np.uint8)
         size = _rounded(size)
-        taken = self._take(size)
-        while taken is None:  # to make one may take long, and others shall not wait for it
-            taken = self._take(size, _Slab(_slab_size(size)))
-        slab, start, missing = taken
+        with self._lock:
+            self._sort_in()
+            slab = self._find(size)
+            if slab is not None:
+                if not slab.cut:
+                    self._unkeep(slab)
+                start, missing = self._cut_off(slab, size)
+        if slab is None:
+            slab = _Slab(_slab_size(size))  # that may take long, and others shall not wait for it
+            with self._lock:
+                start, missing = self._cut_off(slab, size)
         # Other threads go on meanwhile, as they could not when messages are laid there.
         for part in missing:
             part.fill(0)
@@ -139,37 +145,26 @@ class Buffers:
                 if self._whole_bytes > self._most_whole:
                     self._given[slab.size] -= self._unkeep(slab).given
 
-    def _take(
-        self, size: int, slab: _Slab | None = None
-    ) -> tuple[_Slab, int, Iterator[NDArray[np.uint8]]] | None:
-        """A slab, where in it a buffer starts, and the memory that it has not; None for none.
+    def _cut_off(self, slab: _Slab, size: int) -> tuple[int, Iterator[NDArray[np.uint8]]]:
+        """Where a buffer starts, and memory that it has not yet; by who has the lock."""
+        if not slab.cut:
+            slab.cut_into(size)
+        cut = self._cut.setdefault(size, {})
+        start = slab.spare.pop()
+        if slab.spare:
+            cut[slab] = None
+        else:
+            cut.pop(slab, None)
+        missing: Iterator[NDArray[np.uint8]] = iter(())
+        if slab.given < start + size:
+            self._given[slab.size] += start + size - slab.given
+            missing = slab.give(start + size, _FILLED)
+        self._taken[slab.size] += size
+        return start, missing
 
-        Args:
-            size: Bytes.
-            slab: The one to cut it from, when there was none.
-        """
-        with self._lock:
-            self._sort_in()
-            if slab is None:
-                slab = self._find(size)
-                if slab is None:
-                    return None
-                if not slab.cut:
-                    self._unkeep(slab)
-            if not slab.cut:
-                slab.cut_into(size)
-            cut = self._cut.setdefault(size, {})
-            start = slab.spare.pop()
-            if slab.spare:
-                cut[slab] = None
-            else:
-                cut.pop(slab, None)
-            missing: Iterator[NDArray[np.uint8]] = iter(())
-            if slab.given < start + size:
-                self._given[slab.size] += start + size - slab.given
-                missing = slab.give(start + size, _FILLED)
-            self._taken[slab.size] += size
-            return slab, start, missing
+    @property
+    def _whole_bytes(self) -> int:
+        return sum(size * len(whole) for size, whole in self._whole.items())
 
     def _find(self, size: int) -> _Slab | None:
         """The slab to cut a buffer from; by who has the lock.
@@ -211,12 +206,10 @@ class Buffers:
         # The last one is taken first.
         whole = self._whole.setdefault(slab.size, [])
         whole.insert(len(whole) if slab.given == slab.size else 0, slab)
-        self._whole_bytes += slab.size
 
     def _unkeep(self, slab: _Slab) -> _Slab:
         """Have a whole slab spare no more; by who has the lock."""
         self._whole[slab.size].remove(slab)
-        self._whole_bytes -= slab.size
         return slab
 
 
@@ -224,7 +217,7 @@ class _Slab:
     """Memory that is cut into buffers of one size."""
 
     def __init__(self, size: int) -> None:
-        self.memory = _new(size)
+        self.memory = new_memory(size)
         self.size = size
         self.given = 0  # bytes from its start that the system has given
         self.cut = 0  # bytes of a buffer; 0 while it is whole
@@ -263,7 +256,12 @@ def _rounded(size: int) -> int:
     return 1 << (max(size, _LEAST) - 1).bit_length()
 
 
-def _new(size: int) -> mmap.mmap:
+def new_memory(size: int) -> mmap.mmap:
+    """Memory of this process alone that the system gives when it is written to, in huge pages.
+
+    Args:
+        size: Bytes.
+    """
     memory = mmap.mmap(-1, size, flags=_PRIVATE)
     if _HUGE is not None:
         memory.madvise(_HUGE)

@@ -147,7 +147,7 @@ def test_where_there_is_no_memory_it_is_asked_for_once(
             asked.append(size)
             raise OSError(errno.ENOMEM, "no memory")
 
-        monkeypatch.setattr(pool_module, "_new", refuse)
+        monkeypatch.setattr(pool_module, "new_memory", refuse)
         comes(provision, 1e12, looks=10)
         assert asked == [SLAB]
         assert pool.take(SIZE).size == SIZE

@@ -24,13 +24,13 @@ SIZE = 1 << 20
 def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Bytes of each buffer that the system was asked for."""
     asked: list[int] = []
-    new = module._new
+    new = module.new_memory
 
     def count(size: int) -> mmap.mmap:
         asked.append(size)
         return new(size)
 
-    monkeypatch.setattr(module, "_new", count)
+    monkeypatch.setattr(module, "new_memory", count)
     return asked
 
 
