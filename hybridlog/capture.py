@@ -11,11 +11,12 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.entries import build_entry, new_key, recording_metadata
-from hybridlog.index_writer import BACKLOG, IndexWriter, Lag
+from hybridlog.index_writer import IndexWriter, Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
@@ -28,6 +29,30 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
 
 
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """What whoever cannot wait asks of segments and index.
+
+    Attributes:
+        hurry: Says whether there is more than can be handed over. Only chunks that shrink to
+            little are compressed then.
+        behind: Says whether there is so much more that the index waits, falls behind, and
+            reads back later from the segments what is no longer in memory.
+        has_room: Says whether so many bytes of chunks may wait for the index in memory.
+        next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
+        on_written: Called, on another thread, when less waits for the disk. Whoever appends
+            never waits, and looks at `writer.waiting` instead.
+        renew: Gives another connection to the index when one has failed.
+    """
+
+    hurry: Callable[[], bool]
+    behind: Callable[[], bool]
+    has_room: Callable[[int], bool]
+    next_chunk_size: Callable[[], int]
+    on_written: Callable[[], None]
+    renew: Callable[[], Database]
+
+
 class Capture:
     """Takes the messages of one new recording.
 
@@ -38,17 +63,7 @@ class Capture:
         tags: Kept with it.
         source: What its messages come from, as the catalog shows it.
         settings: How segments are cut and packed.
-        hurry: Says whether whoever appends has more than it can hand over. Chunks are
-            then not compressed. None when whoever appends may wait for compression.
-        behind: Says whether it has so much more that the index waits, falls behind, and
-            reads back later from the segments what is no longer in memory. None when
-            whoever appends may wait for the index.
-        backlog: Most chunks that wait for the index in memory,
-        backlog_bytes: and most bytes of more than the usual number of them.
-        short: Says whether memory is so short that no more than that number should wait.
-        renew: With `behind`: another connection to the index when one has failed.
-        on_written: Called, on another thread, when less waits for the disk. With it whoever
-            appends never waits, and looks at `writer.waiting` instead.
+        pace: Of whoever appends, if it cannot wait for compression, disk and index.
         check: Called with the catalog before anything is made, while nobody else can
             start a recording; raises to refuse.
 
@@ -67,13 +82,7 @@ class Capture:
         tags: Mapping[str, str],
         source: Mapping[str, Any],
         settings: SegmentSettings,
-        hurry: Callable[[], bool] | None = None,
-        behind: Callable[[], bool] | None = None,
-        backlog: int = BACKLOG,
-        backlog_bytes: int = 0,
-        short: Callable[[], bool] = lambda: False,
-        renew: Callable[[], Database] | None = None,
-        on_written: Callable[[], None] | None = None,
+        pace: Pace | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = Catalog(database)
@@ -87,27 +96,18 @@ class Capture:
             self._held = self._held.pop_all()
         self.indexer = ChunkIndexer(self.entry.id, self.entry.key)
         recording = directory.recording(self.entry.id)
-        lag = None
-        if behind is not None and renew is not None:
-            lag = Lag(recording, behind, renew)
+        lag = Lag(recording, pace.behind, pace.has_room, pace.renew) if pace else None
         self._gatherer = FieldGatherer(recording)
-        self.index = IndexWriter(
-            self.indexer,
-            database,
-            backlog=backlog,
-            backlog_bytes=backlog_bytes,
-            short=short,
-            lag=lag,
-            gatherer=self._gatherer,
-        )
+        self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
             recording_metadata(self.entry),
             self.index.submit,
             settings,
-            hurry=hurry,
-            on_written=on_written,
+            hurry=pace and pace.hurry,
+            next_chunk_size=pace and pace.next_chunk_size,
+            on_written=pace and pace.on_written,
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:

@@ -38,8 +38,10 @@ _LAG_PAUSE_S = 0.002
 _RETRY_S = 2.0  # after the database has failed
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
-BACKLOG = 8
-"""Chunks that may wait for the index in memory, if nobody says."""
+_BACKLOG = 8  # chunks in memory, waiting or under way
+# The same with a lag, where there is room for them. Topics of one rate and size close theirs
+# at one time, and what finds no room then must be read again.
+_MOST_BACKLOG = 96
 _FEW = 32  # messages, and
 _FEW_BYTES = 1 << 20  # bytes of a chunk up to which it is not worth documents of its own
 _FEW_CHUNKS = 512  # that wait for others, at most
@@ -156,13 +158,20 @@ class Lag:
     Args:
         recording: The recording's directory.
         behind: Says whether the recorder has more than it can write.
+        has_room: Says whether so many bytes of chunks may wait in memory, where they are more
+            than a few.
         renew: Another connection to the index, after one has failed; starts the embedded
             MongoDB again if that has ended. Raises `DatabaseError`.
     """
 
     def __init__(
-        self, recording: Path, behind: Callable[[], bool], renew: Callable[[], Database]
+        self,
+        recording: Path,
+        behind: Callable[[], bool],
+        has_room: Callable[[int], bool],
+        renew: Callable[[], Database],
     ) -> None:
+        self.has_room = has_room
         self.renew = renew
         self._recording = recording
         self._behind = behind
@@ -241,10 +250,7 @@ class IndexWriter:
     Args:
         indexer: Makes the documents.
         database: Where they go.
-        backlog: Most chunks in memory, waiting or under way, before `submit` waits.
-        backlog_bytes: With a lag, most bytes of these, where they are more than `BACKLOG`.
-        short: With a lag, says whether memory is too short for more than `BACKLOG` of them.
-        lag: With it `submit` never waits: chunks beyond the backlog are read back.
+        lag: With it `submit` never waits: chunks that find no room in memory are read back.
         gatherer: Gets each chunk of which documents are made, once.
     """
 
@@ -253,9 +259,6 @@ class IndexWriter:
         indexer: ChunkIndexer,
         database: Database,
         *,
-        backlog: int = BACKLOG,
-        backlog_bytes: int = 0,
-        short: Callable[[], bool] = lambda: False,
         lag: Lag | None = None,
         gatherer: FieldGatherer | None = None,
     ) -> None:
@@ -274,8 +277,7 @@ class IndexWriter:
         self._catalog = Catalog(database)
         self._collections: set[str] = set()
         self._lock = threading.Lock()
-        self._room = threading.BoundedSemaphore(backlog)
-        self._backlog_bytes, self._short = backlog_bytes, short
+        self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
         self._in_memory = 0  # chunks that wait or are under way
         self._bytes_in_memory = 0
         self._is_asked = False  # for the next forgotten chunk
@@ -327,13 +329,12 @@ class IndexWriter:
 
     def _find_room(self, size: int) -> bool:
         """Have a chunk wait in memory; without a lag once there is room, else only if there is."""
-        if self._lag is not None:
-            with self._lock:
-                is_usual = self._in_memory < BACKLOG
-                is_much = self._bytes_in_memory + size > self._backlog_bytes
-            if not is_usual and (is_much or self._short()):
-                return False
-        return self._room.acquire(blocking=self._lag is None)
+        if self._lag is None:
+            return self._room.acquire()
+        with self._lock:
+            is_usual = self._in_memory < _BACKLOG
+            size += self._bytes_in_memory
+        return (is_usual or self._lag.has_room(size)) and self._room.acquire(blocking=False)
 
     def prepare(self, channel: Channel) -> None:
         """Do now what a channel's first message would have to wait for."""

@@ -13,6 +13,7 @@ _AHEAD_S = 0.75  # and afterwards as many as come in this time: disks stand stil
 _PAUSE = 1.0  # times as long as it takes to get one: it holds up who records meanwhile
 _FOR_SMALL = 0.25  # of them, which large chunks leave to the others
 _FOR_CHUNKS = 0.5  # and which what waits leaves to all of these
+_WAITING = 8  # that part of the budget may wait for the index
 _LOOKS = 16  # of which the highest rate counts: sources pause, and disks stand still
 _STEADY = 1.25  # times as much: of a rate that rises more one cannot tell yet; less is no matter
 _CHUNKS = 100  # a second: of more than that each chunk's price is too much, so they are larger
@@ -76,9 +77,10 @@ class Provision:
         is_dear = self.chunk_size > self._usual and buffers.is_short(self.chunk_size, _FOR_SMALL)
         return self._usual if is_dear else self.chunk_size
 
-    def is_short(self) -> bool:
-        """Whether so little memory is left that none should be held without need."""
-        return buffers.is_short(self.chunk_size, _FOR_CHUNKS)
+    def has_room(self, size: int) -> bool:
+        """Whether so many bytes of chunks may wait in memory until they are indexed."""
+        is_much = size > self._budget // _WAITING
+        return not (is_much or buffers.is_short(self.chunk_size, _FOR_CHUNKS))
 
     def close(self) -> None:
         """End what is being done, and give back what is too much."""

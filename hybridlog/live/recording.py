@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog.capture import Capture
+from hybridlog.capture import Capture, Pace
 from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
 from hybridlog.live.collector import spared_objects
 from hybridlog.live.policy import SMALL
@@ -54,7 +54,7 @@ _PATIENCE = 4  # flush intervals for which chunks of few messages wait to be ind
 _PATIENCE_S = 4.0  # and seconds at most
 _LARGE_AT_WORK = 3  # large chunks on their way without anything being late: two packed, one written
 _MAKING_S = 2.0  # that packing, writing, making documents and sending them may take
-_HURRY = 8 << 20  # bytes that wait from which nothing is compressed any more
+_HURRY = 8 << 20  # bytes that wait from which only what shrinks to little is compressed
 _BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
 _COPYING = 2  # threads that copy large messages at the same time
 _NO_TURN = nullcontext()
@@ -62,9 +62,6 @@ _CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the 
 _LATE_S = 0.01  # a large message that waits so long to be laid down is late: both happen, too,
 _LATE_TIMES = 20  # for so many times as long as it has waited
 _LOOK_S = 0.25  # how often one looks how much comes
-# Chunks that wait for the index in memory, where the budget allows it. Topics of one rate and
-# size close theirs at one time, and what finds no room then must be read again.
-_MOST_BACKLOG = 96
 _MOST_NS = 1 << 63
 
 
@@ -186,16 +183,16 @@ class LiveRecording:
                 tags=options.tags,
                 source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
-                hurry=lambda: self._is_under(self._hurry),
-                behind=lambda: self._is_under(self._behind),
-                backlog=_MOST_BACKLOG,
-                backlog_bytes=options.budget_bytes // 8,
-                short=self._provision.is_short,
-                renew=renew,
-                on_written=self._make_room,
+                pace=Pace(
+                    hurry=lambda: self._is_under(self._hurry),
+                    behind=lambda: self._is_under(self._behind),
+                    has_room=self._provision.has_room,
+                    next_chunk_size=self._provision.next_chunk_size,
+                    on_written=self._make_room,
+                    renew=renew,
+                ),
             )
             self._held = self._held.pop_all()
-        self._capture.writer.next_chunk_size = self._provision.next_chunk_size
         self.id = self._capture.entry.id
         """Recording id."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)

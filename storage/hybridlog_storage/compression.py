@@ -28,6 +28,8 @@ _MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _RATIO_SLACK = 1 << 17
 
 _PIECE = 1 << 18
+# Of its size; to write the rest takes longer than to make that of it, so nobody is too busy.
+_WORTH_IT = 0.2
 
 _per_thread = threading.local()
 
@@ -200,25 +202,28 @@ class Compressor:
         self._keep_above = 1.0 - min_gain
         self._own = threading.local()  # a ZstdCompressor must not be shared by threads
 
-    def compress(self, data: Buffer) -> tuple[str, Buffer]:
+    def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
         """Compress a chunk if that is worth it.
 
         Args:
             data: Content of the chunk.
+            hurried: Whether there is time only for what shrinks to a fifth or less, as its
+                samples say.
 
         Returns:
             MCAP name of the codec and the compressed bytes, or the empty name and `data`
             itself.
         """
-        if self.name == "none" or len(data) == 0 or not self._promising(data):
+        bound = _WORTH_IT if hurried else self._keep_above
+        if self.name == "none" or len(data) == 0 or not self._promising(data, bound):
             return "", data
         packed = self._pack(data, self.level)
         if len(packed) > len(data) * self._keep_above:
             return "", data
         return self.name, packed
 
-    def _promising(self, data: Buffer) -> bool:
-        """Whether samples shrink; always for data hardly larger than the samples."""
+    def _promising(self, data: Buffer, bound: float) -> bool:
+        """Whether samples shrink to a share; always for data hardly larger than the samples."""
         tried = self._sample_size * self._samples
         if len(data) < 4 * tried:
             return True
@@ -227,7 +232,7 @@ class Compressor:
         sample = b"".join(
             view[i * step : i * step + self._sample_size] for i in range(self._samples)
         )
-        return len(self._pack(sample, 1)) <= len(sample) * self._keep_above
+        return len(self._pack(sample, 1)) <= len(sample) * bound
 
     def _pack(self, data: Buffer, level: int) -> bytes:
         if self.name == "lz4":

@@ -469,9 +469,11 @@ class PackedChunk:
     arrivals: bytes
 
 
-def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int) -> PackedChunk:
+def pack(
+    compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int, *, hurried: bool
+) -> PackedChunk:
     """Compress a chunk and build its message indexes; runs on a worker thread."""
-    compression, data = compressor.compress(batch.buffer)
+    compression, data = compressor.compress(batch.buffer, hurried=hurried)
     return PackedChunk(
         batch,
         seq,
@@ -484,9 +486,6 @@ def pack(compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int
         message_indexes(batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize),
         pack_arrivals(seq),
     )
-
-
-_AS_IT_IS = Compressor("none")
 
 
 @dataclass(slots=True)
@@ -516,7 +515,10 @@ class RecordingWriter:
         on_chunk: Called, on a thread of the writer's and in file order, with every chunk
             that is in the file.
         settings: How to cut and pack.
-        hurry: Says whether there is no time to compress; None when there always is.
+        hurry: Says whether there is no time to compress what does not shrink to little; None
+            when there always is.
+        next_chunk_size: Gives the bytes at which a chunk closes that is opened now; without,
+            as the settings say.
         on_written: Called, on a thread of the writer's, when there is less that waits. With
             it nothing that is appended waits for the disk: whoever appends looks at
             `waiting`. Without it `append` waits while the disk is slow.
@@ -530,12 +532,10 @@ class RecordingWriter:
         settings: SegmentSettings | None = None,
         *,
         hurry: Callable[[], bool] | None = None,
+        next_chunk_size: Callable[[], int] | None = None,
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
-        chunk_size = self.settings.chunk_size
-        self.next_chunk_size: Callable[[], int] = lambda: chunk_size
-        """Gives the bytes at which a chunk closes that is opened now; may be replaced."""
         self.totals = RecordingTotals()
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
@@ -552,6 +552,8 @@ class RecordingWriter:
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
         self._hurry = hurry
+        chunk_size = self.settings.chunk_size
+        self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
         self._closed_bytes = 0
         self._stored_bytes = 0
@@ -743,7 +745,7 @@ class RecordingWriter:
         """The open chunk of a cluster."""
         builder = self._clusters.get(key)
         if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self.next_chunk_size())
+            builder = self._clusters[key] = ChunkBuilder(self._next_chunk_size())
         elif not len(builder):
             builder.capacity = self._next_capacity(key, builder.capacity)
         return builder
@@ -755,7 +757,7 @@ class RecordingWriter:
         chunks are large. So when they become twice as large or more, each cluster begins with
         another size between half of it and all.
         """
-        size = self.next_chunk_size()
+        size = self._next_chunk_size()
         return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
     def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
@@ -826,7 +828,7 @@ class RecordingWriter:
         # Only now: topics of one rate close their chunks at one time, and nobody is in a
         # hurry before most of these wait here.
         hurried = self._hurry is not None and self._hurry()
-        return pack(_AS_IT_IS if hurried else self._compressor, batch, seq, size)
+        return pack(self._compressor, batch, seq, size, hurried=hurried)
 
     # What follows runs on the thread that writes, and on no other.
 

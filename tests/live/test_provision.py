@@ -176,9 +176,9 @@ def test_what_waits_leaves_memory_to_chunks_and_large_chunks_leave_some_to_messa
         comes(provision, 1e12)
         there = pool._given[SLAB] // SIZE
         held = [pool.take(SIZE) for _ in range(int(there * (1 - module._FOR_CHUNKS)))]
-        assert not provision.is_short()
+        assert provision.has_room(0)
         held.append(pool.take(SIZE))
-        assert provision.is_short()
+        assert not provision.has_room(0)
         while len(held) < there * (1 - module._FOR_SMALL):
             assert provision.next_chunk_size() == 4 * SIZE
             held.append(pool.take(SIZE))
@@ -186,7 +186,7 @@ def test_what_waits_leaves_memory_to_chunks_and_large_chunks_leave_some_to_messa
         held.append(pool.take(SIZE))
         assert provision.next_chunk_size() == SIZE
         held.clear()
-        assert not provision.is_short()
+        assert provision.has_room(0)
         assert provision.next_chunk_size() == 4 * SIZE
 
 
@@ -197,7 +197,7 @@ def test_no_large_chunk_asks_for_memory(pool: Buffers) -> None:
         held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
         del held[1::2]
         assert provision.next_chunk_size() == SIZE
-        assert provision.is_short()
+        assert not provision.has_room(0)
         del held[:]
         assert provision.next_chunk_size() == 4 * SIZE
 
@@ -205,7 +205,7 @@ def test_no_large_chunk_asks_for_memory(pool: Buffers) -> None:
 def test_usual_chunks_need_nothing(pool: Buffers) -> None:
     with closing(Provision(SIZE, BUDGET)) as provision:
         held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
-        assert provision.is_short()
+        assert not provision.has_room(0)
         assert provision.next_chunk_size() == SIZE
         assert held
 
@@ -221,11 +221,11 @@ def test_a_recording_of_much_has_larger_chunks(
     settings = SegmentSettings(chunk_size=SIZE)
     until = time.monotonic() + 30
     with store.start("talk", budget_bytes=1 << 28, settings=settings) as recording:
-        writer = recording._capture.writer
+        provision = recording._provision
 
         def speak(one: Channel) -> None:
             n = 0
-            while (writer.next_chunk_size() == SIZE and time.monotonic() < until) or n % 20:
+            while (provision.next_chunk_size() == SIZE and time.monotonic() < until) or n % 20:
                 written[one].append(text(bytes([n % 251]) * sizes[n % len(sizes)]))
                 recording.write(one, written[one][-1], log_time=n)
                 n += 1
@@ -236,7 +236,7 @@ def test_a_recording_of_much_has_larger_chunks(
             thread.start()
         for thread in threads:
             thread.join()
-        assert writer.next_chunk_size() == 4 * SIZE
+        assert provision.next_chunk_size() == 4 * SIZE
     for one in own:
         assert [m.raw for m in store.topic(one.topic)] == written[one]
     assert store.verify().findings == []

@@ -309,7 +309,7 @@ def test_what_was_let_go_does_not_keep_others_waiting(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chunks in memory come first, or those behind them would have to be let go as well."""
-    monkeypatch.setattr(live, "_MOST_BACKLOG", 2)
+    monkeypatch.setattr(index_writer, "_MOST_BACKLOG", 2)
     made: list[int] = []
     began, go_on = threading.Event(), threading.Event()
     real_documents = ChunkIndexer.documents_of

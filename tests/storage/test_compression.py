@@ -74,6 +74,22 @@ def test_what_gains_less_than_the_minimum_is_kept() -> None:
     assert Compressor(min_gain=0.01).compress(data)[0] == "zstd"
 
 
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+def test_in_a_hurry_only_what_shrinks_to_little_is_compressed(name: str) -> None:
+    def made(noise: int) -> bytes:
+        return b"".join(NOISE[n * noise : (n + 1) * noise].ljust(1000, b"a") for n in range(500))
+
+    compressor = Compressor(name)  # type: ignore[arg-type]
+    for noise in (300, 100):
+        data = made(noise)
+        compression, out = compressor.compress(data)
+        assert compression == name
+        assert len(out) < len(data) / 2
+        assert compressor.compress(data, hurried=True) == (
+            (name, out) if noise == 100 else ("", data)
+        )
+
+
 def test_none_stores_everything_as_it_is() -> None:
     assert Compressor("none").compress(TEXT) == ("", TEXT)
 
