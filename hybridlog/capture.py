@@ -105,9 +105,9 @@ class Capture:
             recording_metadata(self.entry),
             self.index.submit,
             settings,
-            hurry=pace and pace.hurry,
-            next_chunk_size=pace and pace.next_chunk_size,
-            on_written=pace and pace.on_written,
+            hurry=pace.hurry if pace else None,
+            next_chunk_size=pace.next_chunk_size if pace else None,
+            on_written=pace.on_written if pace else None,
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:

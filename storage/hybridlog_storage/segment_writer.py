@@ -71,6 +71,7 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
+_MOST_CHUNKS = 1 << 14  # of a segment: its summary is in memory until it is sealed, 1 kB a chunk
 AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
 _MAX_CHANNELS = 65535
@@ -98,7 +99,8 @@ class SegmentSettings:
         large_payload: Mean payload bytes from which a channel gets chunks of its own.
         compression: Codec of chunks that can be compressed.
         level: zstd level.
-        segment_size: Bytes of file at which the next segment starts.
+        segment_size: Bytes of file at which the next segment starts, if it has not after
+            16,384 chunks.
         segment_span_s: Seconds after which the next segment starts; None for no such bound.
         sync: When to force data to the disk: at every chunk, when a segment is sealed,
             or never (the operating system decides).
@@ -205,6 +207,11 @@ class SegmentFile:
     def position(self) -> int:
         """Bytes in the file."""
         return self._file.position
+
+    @property
+    def chunks(self) -> int:
+        """Chunks in the file."""
+        return len(self._chunk_indexes)
 
     @property
     def direct(self) -> bool:
@@ -888,7 +895,8 @@ class RecordingWriter:
             self._tell(chunk, place)
         span = self.settings.segment_span_s
         is_old = span is not None and time.monotonic() - self._opened >= span
-        if is_old or segment.position >= self.settings.segment_size:
+        is_full = segment.position >= self.settings.segment_size or segment.chunks >= _MOST_CHUNKS
+        if is_old or is_full:
             self._seal()
 
     def _tell(self, chunk: PackedChunk, stored: StoredChunk) -> None:

@@ -19,6 +19,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
+from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
@@ -28,6 +29,7 @@ from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_format import END_METADATA, json_metadata
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import (
+    AT_WORK,
     PackedChunk,
     RecordingWriter,
     SegmentFile,
@@ -305,6 +307,28 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     shrunk = [chunk.compressed_size < len(payloads[0]) / 2 for chunk in chunks]
     assert shrunk == [True] * 4 + [noise < 0.2] * 4
     assert [data for _, _, data in messages_in(path)] == payloads
+
+
+def test_a_segment_has_no_more_chunks_than_a_summary_should(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However well they shrink."""
+    monkeypatch.setattr(segment_writer, "_MOST_CHUNKS", 10)
+    writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None, SegmentSettings(chunk_size=2000))
+    payloads = [bytes([n]) * 1500 for n in range(200)]
+    for n, payload in enumerate(payloads):
+        writer.append(batch_of([(0, payload, n, n, n)]), CHANNELS)
+    paths = writer.close()
+    assert [data for path in paths for _, _, data in messages_in(path)] == payloads
+    chunks = []
+    for path in paths:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        chunks.append(len(summary.chunk_indexes))
+    # Those that wait together are written together, eight of them at most.
+    assert sum(chunks) == 200
+    assert all(10 <= count < 10 + AT_WORK for count in chunks[:-1])
 
 
 def test_chunks_that_wait_are_written_together(
