@@ -28,8 +28,9 @@ _MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _RATIO_SLACK = 1 << 17
 
 _PIECE = 1 << 18
-# Of its size; to write the rest takes longer than to make that of it, so nobody is too busy.
+# In a hurry: what shrinks to this share is compressed sooner than it is written whole,
 _WORTH_IT = 0.2
+_FAST = 1  # at this level of either codec, which samples are tried with, too.
 
 _per_thread = threading.local()
 
@@ -208,7 +209,7 @@ class Compressor:
         Args:
             data: Content of the chunk.
             hurried: Whether there is time only for what shrinks to a fifth or less, as its
-                samples say.
+                samples say, and for no level above 1.
 
         Returns:
             MCAP name of the codec and the compressed bytes, or the empty name and `data`
@@ -217,7 +218,7 @@ class Compressor:
         bound = _WORTH_IT if hurried else self._keep_above
         if self.name == "none" or len(data) == 0 or not self._promising(data, bound):
             return "", data
-        packed = self._pack(data, self.level)
+        packed = self._pack(data, min(self.level, _FAST) if hurried else self.level)
         if len(packed) > len(data) * self._keep_above:
             return "", data
         return self.name, packed
@@ -232,7 +233,7 @@ class Compressor:
         sample = b"".join(
             view[i * step : i * step + self._sample_size] for i in range(self._samples)
         )
-        return len(self._pack(sample, 1)) <= len(sample) * bound
+        return len(self._pack(sample, _FAST)) <= len(sample) * bound
 
     def _pack(self, data: Buffer, level: int) -> bytes:
         if self.name == "lz4":

@@ -90,6 +90,16 @@ def test_in_a_hurry_only_what_shrinks_to_little_is_compressed(name: str) -> None
         )
 
 
+def test_in_a_hurry_no_high_level_is_used() -> None:
+    quick = Compressor("zstd", 1).compress(TEXT)
+    small = TEXT[:1000]
+    assert Compressor("zstd", 19).compress(TEXT) != quick
+    for data in (TEXT[:10_000] * 100, small):
+        hurried = Compressor("zstd", 19).compress(data, hurried=True)
+        assert hurried == Compressor("zstd", 1).compress(data)
+        assert hurried[0] == "zstd"
+
+
 def test_none_stores_everything_as_it_is() -> None:
     assert Compressor("none").compress(TEXT) == ("", TEXT)
 
