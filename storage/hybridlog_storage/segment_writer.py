@@ -477,7 +477,12 @@ class PackedChunk:
 
 
 def pack(
-    compressor: Compressor, batch: Batch, seq: NDArray[np.int64], size: int, *, hurried: bool
+    compressor: Compressor,
+    batch: Batch,
+    seq: NDArray[np.int64],
+    size: int,
+    *,
+    hurried: bool = False,
 ) -> PackedChunk:
     """Compress a chunk and build its message indexes; runs on a worker thread."""
     compression, data = compressor.compress(batch.buffer, hurried=hurried)
