@@ -89,7 +89,7 @@ def section(book: Book) -> Section | None:
             _table(ceilings, "Ceiling: offered load of which all was kept, MB/s", _megabytes),
             _table(ceilings, "The same in messages/s, all topics together", _messages(book)),
             _table(ceilings, "Stored at that load, MB/s, all work included", _kept, ""),
-            *_ratios(ceilings),
+            *_ratios(book, ceilings),
         ),
     )
 
@@ -105,12 +105,19 @@ def findings(book: Book) -> list[str]:
             continue
         ours, best = pair
         marked = " or more" if ours.limit != "backend" else ""
+        turns = ""
+        if (both := _in_same_runs(book, ours, best)) is not None:
+            mine, other = both
+            turns = (
+                f" In the runs of both: {with_spread(mine)} and {with_spread(other)} MB/s, "
+                f"{times(mine.median / other.median)}."
+            )
         found.append(
             f"With {size(bytes_)} messages, hybridlog keeps everything up to "
             f"{with_spread(ours.offered)} MB/s{marked}, "
             f"{times(ours.offered.median / best.offered.median)} what the best database does "
             f"({title(best.backend)}, {with_spread(best.offered)} MB/s)."
-            f"{_in_same_runs(book, ours, best)}"
+            f"{turns}"
         )
     short = [one for one in ceilings if one.backend == OURS and one.limit == "harness"]
     if short:
@@ -122,22 +129,16 @@ def findings(book: Book) -> list[str]:
     return found
 
 
-def _in_same_runs(book: Book, ours: _Found, best: _Found) -> str:
-    """The two where they took turns, if not always: a machine is faster on one day."""
+def _in_same_runs(book: Book, ours: _Found, best: _Found) -> tuple[Value, Value] | None:
+    """MB/s of the two where they took turns, if not always: a machine is faster on one day."""
     of_size = (s for s in book.all if s.study == STUDY and s.case["size"] == ours.size)
     known = by_backend(of_size)
     groups = known[ours.backend], known[best.backend]
     both = book.in_same_runs(*groups)
     if both is None or list(map(len, both)) == list(map(len, groups)):
-        return ""
+        return None
     pair = _pair(_ceilings(chain(*both)))
-    if pair is None:
-        return ""
-    mine, other = (one.offered for one in pair)
-    return (
-        f" In the runs of both: {with_spread(mine)} and {with_spread(other)} MB/s, "
-        f"{times(mine.median / other.median)}."
-    )
+    return None if pair is None else (pair[0].offered, pair[1].offered)
 
 
 def _ceilings(samples: Iterable[Sample]) -> list[_Found]:
@@ -235,22 +236,22 @@ def _messages(book: Book) -> _Text:
     return text
 
 
-def _ratios(ceilings: Sequence[_Found]) -> list[Table]:
+def _ratios(book: Book, ceilings: Sequence[_Found]) -> list[Table]:
+    """Of all searches, and of those in which the two took turns, where these are others."""
     sizes = sorted({one.size for one in ceilings})
-    cells: list[Cell] = []
-    names: list[Cell] = []
-    for bytes_ in sizes:
-        pair = _pair([one for one in ceilings if one.size == bytes_])
-        cells.append(
-            None if pair is None else number(pair[0].offered.median / pair[1].offered.median)
-        )
-        names.append(None if pair is None else title(pair[1].backend))
-    if all(cell is None for cell in cells):
+    pairs = [_pair([one for one in ceilings if one.size == bytes_]) for bytes_ in sizes]
+    if not any(pairs):
         return []
+    offered = [pair and (pair[0].offered, pair[1].offered) for pair in pairs]
+    both = [pair and _in_same_runs(book, *pair) for pair in pairs]
+    rows: list[tuple[Cell, ...]] = [("ratio", *map(_ratio, offered))]
+    if any(both):
+        rows.append(("in the runs of both", *map(_ratio, both)))
+    rows.append(("best database", *(pair and title(pair[1].backend) for pair in pairs)))
     return [
-        Table(
-            "hybridlog's ceiling over the best database's",
-            ("", *map(size, sizes)),
-            (("ratio", *cells), ("best database", *names)),
-        )
+        Table("hybridlog's ceiling over the best database's", ("", *map(size, sizes)), tuple(rows))
     ]
+
+
+def _ratio(pair: tuple[Value, Value] | None) -> str | None:
+    return None if pair is None else number(pair[0].median / pair[1].median)

@@ -50,6 +50,8 @@ PADDING_OPCODE: Final = 0x91
 """Record of zeros, so that the content of the chunk behind it starts at a block."""
 
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
+_CHUNK_INDEX_HEAD = struct.Struct("<BQQQQQI")
+_INDEX_PLACE = struct.Struct("<HQ")
 PADDING_HEAD: Final = struct.Struct("<BQ")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
@@ -148,6 +150,45 @@ def chunk_head(
             struct.pack("<Q", compressed_size),
         )
     )
+
+
+def chunk_index_record(
+    *,
+    first: int,
+    last: int,
+    offset: int,
+    length: int,
+    indexes: Mapping[int, int],
+    compression: str,
+    compressed_size: int,
+    uncompressed_size: int,
+) -> bytes:
+    """What the summary says of a chunk, whose message indexes follow it at once.
+
+    Args:
+        first: Log time of its first message, ns.
+        last: Of its last.
+        offset: Byte of the file at which it starts.
+        length: Bytes of the chunk record.
+        indexes: Bytes of each channel's message index record, in their order in the file.
+        compression: MCAP name of the codec.
+        compressed_size: Bytes of compressed content.
+        uncompressed_size: Bytes of content.
+    """
+    name = compression.encode()
+    places = index_offsets(indexes, offset + length)
+    table = b"".join(map(_INDEX_PLACE.pack, places.keys(), places.values()))
+    tail = struct.pack(
+        f"<QI{len(name)}sQQ",
+        sum(indexes.values()),
+        len(name),
+        name,
+        compressed_size,
+        uncompressed_size,
+    )
+    body = _CHUNK_INDEX_HEAD.size - PADDING_HEAD.size + len(table) + len(tail)
+    head = _CHUNK_INDEX_HEAD.pack(Opcode.CHUNK_INDEX, body, first, last, offset, length, len(table))
+    return head + table + tail
 
 
 def padding_record(size: int) -> bytes:

@@ -20,12 +20,10 @@ from threading import Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -54,8 +52,8 @@ from hybridlog_storage.segment_format import (
     arrival_record,
     channel_record,
     chunk_head,
+    chunk_index_record,
     entries_of,
-    index_offsets,
     json_metadata,
     message_indexes,
     pack_arrivals,
@@ -71,7 +69,7 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
-_MOST_CHUNKS = 1 << 14  # of a segment: its summary is in memory until it is sealed, 1 kB a chunk
+_MOST_CHUNKS = 1 << 14  # of a segment: whoever reads its summary has a kilobyte of each in memory
 AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
 _MAX_CHANNELS = 65535
@@ -159,7 +157,9 @@ class SegmentFile:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, tuple[int, Channel]] = {}
         self._file = file
-        self._chunk_indexes: list[ChunkIndex] = []
+        self.chunks = 0
+        """Chunks in the file."""
+        self._chunk_indexes = bytearray()  # as records: of a long segment there are many
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
@@ -207,11 +207,6 @@ class SegmentFile:
     def position(self) -> int:
         """Bytes in the file."""
         return self._file.position
-
-    @property
-    def chunks(self) -> int:
-        """Chunks in the file."""
-        return len(self._chunk_indexes)
 
     @property
     def direct(self) -> bool:
@@ -346,18 +341,16 @@ class SegmentFile:
             uncompressed_size: Bytes of content.
         """
         first, last = span
-        self._chunk_indexes.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=offset,
-                compression=compression,
-                compressed_size=compressed_size,
-                message_end_time=last,
-                message_index_length=sum(indexes.values()),
-                message_index_offsets=index_offsets(indexes, offset + length),
-                message_start_time=first,
-                uncompressed_size=uncompressed_size,
-            )
+        self.chunks += 1
+        self._chunk_indexes += chunk_index_record(
+            first=first,
+            last=last,
+            offset=offset,
+            length=length,
+            indexes=indexes,
+            compression=compression,
+            compressed_size=compressed_size,
+            uncompressed_size=uncompressed_size,
         )
         for channel, count in counts.items():
             self._counts[channel] = self._counts.get(channel, 0) + count
@@ -411,36 +404,27 @@ class SegmentFile:
             raise durability.explain(error, self.path, "writing") from error
 
     def _summary(self, start: int) -> bytes:
-        builder = RecordBuilder()
-        offsets: list[SummaryOffset] = []
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, [schema_record(i, s) for i, s in self.schemas.items()]),
+        groups: list[tuple[Opcode, bytes]] = [
+            (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
             (
                 Opcode.CHANNEL,
-                [channel_record(i, sid, channel) for i, (sid, channel) in self.channels.items()],
+                _joined(channel_record(i, sid, c) for i, (sid, c) in self.channels.items()),
             ),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, list(self._chunk_indexes)),
-            (Opcode.ATTACHMENT_INDEX, list(self._attachment_indexes)),
-            (Opcode.METADATA_INDEX, list(self._metadata_indexes)),
+            (Opcode.STATISTICS, record_bytes(self._statistics())),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
         ]
+        offsets: list[SummaryOffset] = []
+        at = start
         for opcode, records in groups:
-            group_start = builder.count
-            for record in records:
-                record.write(builder)
             if records:
                 offsets.append(
-                    SummaryOffset(
-                        group_opcode=opcode,
-                        group_start=start + group_start,
-                        group_length=builder.count - group_start,
-                    )
+                    SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(records))
                 )
-        offset_start = start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        summary: bytes = builder.end()  # type: ignore[no-untyped-call]
-        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0)
+            at += len(records)
+        summary = b"".join((*(records for _, records in groups), _joined(offsets)))
+        footer = Footer(summary_start=start, summary_offset_start=at, summary_crc=0)
         # The footer's checksum covers the summary and the footer up to the checksum itself.
         covered = record_bytes(footer)[:-4]
         footer.summary_crc = crc32(covered, crc32(summary))
@@ -451,13 +435,17 @@ class SegmentFile:
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
             channel_message_counts=dict(sorted(self._counts.items())),
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self.chunks,
             message_count=sum(self._counts.values()),
             message_end_time=self._last,
             message_start_time=self._first or 0,
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self.schemas),
         )
+
+
+def _joined(records: Iterable[McapRecord]) -> bytes:
+    return b"".join(map(record_bytes, records))
 
 
 @dataclass(frozen=True, slots=True)
@@ -827,9 +815,11 @@ class RecordingWriter:
         self._drain(limit if self._on_written is None else len(self._storing))
 
     def _drain(self, limit: int) -> None:
-        """Wait until at most `limit` chunks are still being packed and written."""
+        """Wait until at most `limit` chunks are still being packed and written; tell a failure."""
         while self._storing and (len(self._storing) > limit or self._storing[0].done()):
             self._storing.popleft().result()
+        if self._broken is not None:
+            raise self._broken
 
     def _pack(
         self, copying: Sequence[Lock], batch: Batch, seq: NDArray[np.int64], size: int
@@ -847,7 +837,7 @@ class RecordingWriter:
     def _store(self, packed: Future[PackedChunk]) -> None:
         """See a closed chunk written, with those behind it that can be; none after a failure."""
         if self._broken is not None:
-            raise self._broken
+            return  # whoever appends hears of it
         if not self._packed or packed is not self._packed[0]:
             return  # it was written with one before it
         try:

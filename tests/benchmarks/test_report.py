@@ -335,12 +335,17 @@ def test_ceilings_are_compared_in_runs_of_both_too(tmp_path: Path) -> None:
         (one,) = (text for text in found if "keeps everything up to" in text)
         return one
 
+    def ratios() -> tuple[tuple[object, ...], ...]:
+        return table(report(Journal(tmp_path)), "over the best database's").rows
+
     journal(tmp_path, *search("hybridlog", 400, 0), *search("sqlite_udf", 200, 0))
+    assert ratios() == (("ratio", "2"), ("best database", "SQLite (Python functions)"))
     assert "2 times what the best database does" in told()
     assert "In the runs of both" not in told()
     journal(tmp_path, *search("sqlite_udf", 400, 1), *search("sqlite_udf", 400, 2), cpu="fast")
     assert "1 times what the best database does" in told()
     assert told().endswith(" In the runs of both: 40 and 20 MB/s, 2 times.")
+    assert ratios()[:2] == (("ratio", "1"), ("in the runs of both", "2"))
 
 
 def test_ceilings_of_several_searches_have_a_spread(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage import segment_writer
@@ -26,7 +27,12 @@ from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_format import END_METADATA, json_metadata
+from hybridlog_storage.segment_format import (
+    END_METADATA,
+    chunk_index_record,
+    json_metadata,
+    record_bytes,
+)
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import (
     AT_WORK,
@@ -377,7 +383,10 @@ def test_chunks_that_wait_are_written_together(
 
 
 def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = threading.Event()
+
     def full(*_: object) -> None:
+        failing.wait()
         raise DiskFullError("There is no room.")
 
     monkeypatch.setattr(SegmentFile, "append_chunks", full)
@@ -388,16 +397,55 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.Mo
         SegmentSettings(chunk_size=100_000),
         on_written=lambda: None,
     )
-
-    def until_refused() -> None:
-        while True:
-            writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
-
+    for _ in range(50):
+        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
+    failing.set()
+    with pytest.raises(DiskFullError) as caught:
+        writer.flush()
+    # It is told of once, not once a chunk that waited, and again to who goes on.
+    assert len(caught.traceback) < 20
     with pytest.raises(DiskFullError):
-        until_refused()
+        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
     # Nobody waits for a payload that nobody copies any more.
     writer.abort()
     assert writer.written.total() == 0
+
+
+@given(
+    numbers=st.lists(st.integers(0, 2**62), min_size=6, max_size=6),
+    indexes=st.dictionaries(st.integers(1, 65535), st.integers(0, 2**32), max_size=40),
+    compression=st.sampled_from(["", "lz4", "zstd"]),
+)
+def test_the_record_of_a_chunk_index_is_that_of_the_mcap_package(
+    numbers: list[int], indexes: dict[int, int], compression: str
+) -> None:
+    first, last, offset, length, compressed_size, uncompressed_size = numbers
+    found = chunk_index_record(
+        first=first,
+        last=last,
+        offset=offset,
+        length=length,
+        indexes=indexes,
+        compression=compression,
+        compressed_size=compressed_size,
+        uncompressed_size=uncompressed_size,
+    )
+    at, places = offset + length, {}
+    for channel, size in indexes.items():
+        places[channel], at = at, at + size
+    assert found == record_bytes(
+        ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression=compression,
+            compressed_size=compressed_size,
+            message_end_time=last,
+            message_index_length=sum(indexes.values()),
+            message_index_offsets=places,
+            message_start_time=first,
+            uncompressed_size=uncompressed_size,
+        )
+    )
 
 
 def expected(batches: Sequence[Sequence[Row]]) -> list[tuple[str, bytes, int, int, int]]:
