@@ -13,7 +13,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hybridlog.reader import Message, Query
+    from hybridlog.message import Message
+    from hybridlog.reader import Query
     from hybridlog.recorder import RecordOptions
     from hybridlog.store import Store
     from hybridlog.store import open_store as open  # noqa: A004
@@ -23,7 +24,7 @@ __all__ = ["Message", "Query", "RecordOptions", "Store", "__version__", "open"]
 __version__ = "0.1.0"
 
 _PLACES = {
-    "Message": ("hybridlog.reader", "Message"),
+    "Message": ("hybridlog.message", "Message"),
     "Query": ("hybridlog.reader", "Query"),
     "RecordOptions": ("hybridlog.recorder", "RecordOptions"),
     "Store": ("hybridlog.store", "Store"),

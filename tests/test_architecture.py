@@ -25,7 +25,8 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 ALLOWED = {
     "PIL": ("hybridlog.arrays",),
     "bson": (
-        "hybridlog.reader",  # whole index documents, for people
+        "hybridlog.message",  # whole index documents, for people,
+        "hybridlog.reader",  # and those as MongoDB has them
         "hybridlog.schema.json_codec",
         "hybridlog.schema.object_rows",
         "hybridlog.schema.protobuf_codec",

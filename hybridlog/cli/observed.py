@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from hybridlog.reader import Message
+    from hybridlog.message import Message
 
 SAMPLE = 100
 """Messages that are looked at."""

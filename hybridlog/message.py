@@ -1,0 +1,187 @@
+"""A message of an answer: what is known of it at once, and what it takes a look to know."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.query.times import format_time
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.plan import Lane, Piece
+    from hybridlog_storage.messages import Batch
+
+
+class Message:
+    """One message of an answer. Its payload is decoded only when it is looked at.
+
+    Attributes:
+        topic: Its topic.
+        type: Its type, as the source spells it.
+        log_time_ns: When the recorder received it, nanoseconds since the epoch.
+        publish_time_ns: When it was sent, by the sender's clock; None when unknown.
+        sequence: The sender's sequence number, 0 when there is none.
+        seq: Arrival number in its recording.
+        recording: Id of its recording.
+    """
+
+    __slots__ = (
+        "_codec",
+        "_documents",
+        "_is_reduced",
+        "_row",
+        "_view",
+        "log_time_ns",
+        "publish_time_ns",
+        "recording",
+        "seq",
+        "sequence",
+        "topic",
+        "type",
+    )
+
+    def __init__(
+        self,
+        lane: Lane,
+        *,
+        log_time: int,
+        publish_time: int,
+        sequence: int,
+        seq: int,
+        view: memoryview,
+        documents: Documents,
+        row: int,
+    ) -> None:
+        channel = lane.channel
+        self.topic = channel.topic
+        self.type = channel.schema.name if channel.schema is not None else ""
+        self.log_time_ns = log_time
+        self.publish_time_ns = publish_time if channel.has_publish_time else None
+        self.sequence = sequence
+        self.seq = seq
+        self.recording = lane.recording.id
+        self._view = view
+        self._codec = lane.codec
+        self._is_reduced = lane.is_reduced
+        self._documents = documents
+        self._row = row
+
+    def __repr__(self) -> str:
+        return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
+
+    @property
+    def raw(self) -> bytes:
+        """The serialized message, byte for byte as it came.
+
+        Raises:
+            PayloadError: it was given up under pressure.
+        """
+        return bytes(self.payload)
+
+    @property
+    def payload(self) -> memoryview:
+        """The same without a copy."""
+        if self.is_reduced:
+            self._codec.decode(self._view)
+        return self._view
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the payload was given up under pressure, and only `fields` are there."""
+        return self._is_reduced
+
+    @property
+    def fields(self) -> dict[str, object]:
+        """Its fields as the index holds them: long arrays are summaries."""
+        return self._documents.fields(self._row)
+
+    @property
+    def header_stamp_ns(self) -> int | None:
+        """The header stamp, nanoseconds; None without a header."""
+        header = self.fields.get("header")
+        stamp = header.get("stamp") if isinstance(header, dict) else None
+        return stamp if isinstance(stamp, int) else None
+
+    def decode(self) -> Any:
+        """The whole message as an object, its attributes named as its fields.
+
+        Raises:
+            PayloadError: the payload does not fit its definition.
+            DefinitionError: there is no usable definition.
+        """
+        return self._codec.decode(self._view)
+
+    def to_numpy(self) -> NDArray[Any]:
+        """Image, CompressedImage, LaserScan or PointCloud2 as an array.
+
+        Raises:
+            PayloadError: it is none of these, or its sizes lie.
+        """
+        from hybridlog.arrays import to_numpy
+
+        return to_numpy(self.type, self.decode())
+
+
+class Documents:
+    """The index documents of some messages, made for all its messages when one is asked for.
+
+    Args:
+        lanes: By what `batch.channel` holds.
+        batch: The messages.
+    """
+
+    def __init__(self, lanes: Sequence[Lane] | Mapping[int, Lane], batch: Batch) -> None:
+        self._lanes = lanes
+        self._batch = batch
+        self._bodies: dict[int, bytes] = {}
+
+    def fields(self, row: int) -> dict[str, object]:
+        """Those of a message, as its index document holds them."""
+        import bson
+
+        if row not in self._bodies:
+            self._make(int(self._batch.channel[row]))
+        body = self._bodies[row]
+        document = struct.pack("<i", len(body) + 5) + body + b"\x00"
+        return bson.decode(document)
+
+    def _make(self, lane: int) -> None:
+        rows = np.flatnonzero(self._batch.channel == lane)
+        part = self._batch.take(rows)
+        for group in self._lanes[lane].codec.bodies(part.buffer, part.offset, part.length):
+            for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
+                self._bodies[row] = body.tobytes()
+
+
+def messages_in(lanes: Sequence[Lane], piece: Piece) -> Iterator[Message]:
+    """The messages of a piece, in its order; `piece.batch.channel` indexes the lanes."""
+    batch = piece.batch
+    documents = Documents(lanes, batch)
+    view = memoryview(batch.buffer)
+    # Columns become lists at once: one number at a time is the slow way out of an array.
+    columns = (
+        batch.channel,
+        batch.log_time,
+        batch.publish_time,
+        batch.sequence,
+        piece.seq,
+        batch.offset,
+        batch.length,
+    )
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    for row, (lane, log_time, publish_time, sequence, seq, start, size) in enumerate(rows):
+        yield Message(
+            lanes[lane],
+            log_time=log_time,
+            publish_time=publish_time,
+            sequence=sequence,
+            seq=seq,
+            view=view[start : start + size],
+            documents=documents,
+            row=row,
+        )
