@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
-_CHUNK_INDEX = struct.Struct("<QQQQI")  # as far as its map of message indexes
+CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # as far as its map of message indexes,
+INDEX_PLACE = struct.Struct("<HQ")  # of which this is an entry
 
 MESSAGE_HEAD = np.dtype(
     [
@@ -293,9 +294,9 @@ def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
 
 def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
     """As the mcap package does, which takes five times as long; a summary has thousands."""
-    first, last, start, length, offsets_size = _CHUNK_INDEX.unpack_from(content)
-    at = _CHUNK_INDEX.size + offsets_size
-    offsets = content[_CHUNK_INDEX.size : at]
+    first, last, start, length, offsets_size = CHUNK_INDEX_HEAD.unpack_from(content)
+    at = CHUNK_INDEX_HEAD.size + offsets_size
+    offsets = content[CHUNK_INDEX_HEAD.size : at]
     index_length, name_size = struct.unpack_from("<QI", content, at)
     name = content[at + 12 : at + 12 + name_size]
     compressed, uncompressed = struct.unpack_from("<QQ", content, at + 12 + name_size)
@@ -304,7 +305,7 @@ def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
         message_end_time=last,
         chunk_start_offset=start,
         chunk_length=length,
-        message_index_offsets=dict(struct.iter_unpack("<HQ", offsets)),
+        message_index_offsets=dict(INDEX_PLACE.iter_unpack(offsets)),
         message_index_length=index_length,
         compression=str(name, "utf-8"),
         compressed_size=compressed,

@@ -27,7 +27,12 @@ from mcap.records import Schema as SchemaRecord
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.copying import windows
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
+from hybridlog_storage.mcap_content import (
+    CHUNK_INDEX_HEAD,
+    INDEX_PLACE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+)
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.runs import run_starts
 
@@ -50,9 +55,6 @@ PADDING_OPCODE: Final = 0x91
 """Record of zeros, so that the content of the chunk behind it starts at a block."""
 
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
-_CHUNK_INDEX_HEAD = struct.Struct("<BQQQQQI")
-_INDEX_PLACE = struct.Struct("<HQ")
-PADDING_HEAD: Final = struct.Struct("<BQ")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
 
@@ -177,7 +179,7 @@ def chunk_index_record(
     """
     name = compression.encode()
     places = index_offsets(indexes, offset + length)
-    table = b"".join(map(_INDEX_PLACE.pack, places.keys(), places.values()))
+    table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
     tail = struct.pack(
         f"<QI{len(name)}sQQ",
         sum(indexes.values()),
@@ -186,16 +188,14 @@ def chunk_index_record(
         compressed_size,
         uncompressed_size,
     )
-    body = _CHUNK_INDEX_HEAD.size - PADDING_HEAD.size + len(table) + len(tail)
-    head = _CHUNK_INDEX_HEAD.pack(Opcode.CHUNK_INDEX, body, first, last, offset, length, len(table))
-    return head + table + tail
+    body = CHUNK_INDEX_HEAD.pack(first, last, offset, length, len(table)) + table + tail
+    return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
 
 
 def padding_record(size: int) -> bytes:
     """A record of zeros, of so many bytes with its head."""
-    return PADDING_HEAD.pack(PADDING_OPCODE, size - PADDING_HEAD.size) + bytes(
-        size - PADDING_HEAD.size
-    )
+    length = size - RECORD_HEAD.size
+    return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
 
 
 def message_indexes(

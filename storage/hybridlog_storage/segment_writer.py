@@ -40,13 +40,12 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.segment_format import (
     FORMAT_VERSION,
     LIBRARY,
     MAGIC,
-    PADDING_HEAD,
     PROFILE,
     RECORDING_METADATA,
     arrival_record,
@@ -394,7 +393,7 @@ class SegmentFile:
         """What must stand before a chunk record at a byte for its content to start at a block."""
         if not self._file.room_before(content, at + head):
             return b""
-        least = PADDING_HEAD.size
+        least = RECORD_HEAD.size
         return padding_record(least + self._file.room_before(content, at + least + head))
 
     def _write(self, parts: Sequence[Buffer]) -> None:
