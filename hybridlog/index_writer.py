@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog_storage.catalog import Catalog, ChannelTotals, ChunkEntry
+from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
-from hybridlog_storage.segment_writer import OPEN_SUFFIX, SEALED_SUFFIX, StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,11 +15,11 @@ import numpy as np
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import header_stamps
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
+from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.runs import run_lengths, run_starts
-from hybridlog_storage.segment_writer import StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

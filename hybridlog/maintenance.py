@@ -35,11 +35,11 @@ from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel, Schema
     from hybridlog_storage.segment_reader import SegmentSummary
-    from hybridlog_storage.segment_writer import StoredChunk
 
 Progress = Callable[[str, int, int], None]
 """Called with the recording's id, bytes done and bytes in all."""

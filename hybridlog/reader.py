@@ -65,8 +65,8 @@ if TYPE_CHECKING:
     from hybridlog.query.intervals import Intervals
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segment_writer import StoredChunk
 
 _BATCH = 10_000  # index documents that come at a time
 _FEW = 50

@@ -46,6 +46,7 @@ ALLOWED = {
         "hybridlog_storage.mcap_scan",
         "hybridlog_storage.recovery",
         "hybridlog_storage.segment_check",
+        "hybridlog_storage.segment_file",
         "hybridlog_storage.segment_format",
         "hybridlog_storage.segment_reader",
         "hybridlog_storage.segment_writer",

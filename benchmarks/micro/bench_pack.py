@@ -24,7 +24,7 @@ def bench_pack(case: str, bags: Path, benchmark: Any) -> None:
     name, topic, count = CASES[case]
     batch: Any = read(bags / name, topic, count).batches(count)[0]
     compressor = need("hybridlog_storage.compression", "Compressor").Compressor()
-    pack = need("hybridlog_storage.segment_writer", "pack").pack
+    pack = need("hybridlog_storage.chunk", "pack").pack
     builder = need("hybridlog_storage.chunk_builder", "ChunkBuilder").ChunkBuilder(2 << 20)
     builder.append(batch, np.arange(count))
     content, seq, size = builder.take()

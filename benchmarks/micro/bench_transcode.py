@@ -75,7 +75,7 @@ def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:
 
 def _chunk(batch: Any) -> Any:
     """A chunk of these messages."""
-    return need("hybridlog_storage.segment_writer", "StoredChunk").StoredChunk(
+    return need("hybridlog_storage.chunk", "StoredChunk").StoredChunk(
         segment=1,
         offset=4096,
         length=len(batch.buffer),

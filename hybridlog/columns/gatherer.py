@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
     from hybridlog.query.column_filter import Single
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Buffer, Channel
-    from hybridlog_storage.segment_writer import StoredChunk
 
 _ARENA = 2 << 20  # bytes of payloads that are put together to be decoded; caches hold no more
 _ENOUGH = 1 << 20  # a chunk of so many is decoded where it is

@@ -10,8 +10,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segment_writer import StoredChunk
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,11 +22,11 @@ from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.codec import codec_for
 from hybridlog.schema.column import header_stamps
+from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
 from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -26,7 +26,7 @@ from typing import Final
 
 from hybridlog_storage import durability
 from hybridlog_storage.errors import StoreError, UsageError
-from hybridlog_storage.segment_writer import OPEN_SUFFIX, SEALED_SUFFIX
+from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 
 FORMAT: Final = 1
 _SETTINGS: Final = "hybridlog.toml"

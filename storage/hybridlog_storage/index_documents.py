@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segment_writer import StoredChunk
 
 KEY_BYTES: Final = 20
 _HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES

@@ -29,6 +29,7 @@ from hybridlog_storage.mcap_scan import (
     scan,
 )
 from hybridlog_storage.messages import Batch, Schema
+from hybridlog_storage.segment_file import OPEN_SUFFIX, SegmentFile
 from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
     END_METADATA,
@@ -42,7 +43,6 @@ from hybridlog_storage.segment_format import (
     pack_arrivals,
 )
 from hybridlog_storage.segment_reader import check_format
-from hybridlog_storage.segment_writer import OPEN_SUFFIX, SegmentFile
 
 
 @dataclass(slots=True)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from mcap.summary import Summary
 
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.mcap_content import Record
-    from hybridlog_storage.segment_writer import StoredChunk
 
 _HEAD = RECORD_HEAD.size
 _DATA_END_SIZE = _HEAD + 4

@@ -24,6 +24,7 @@ from mcap.records import ChunkIndex, Metadata, MetadataIndex
 from hybridlog_storage.append_file import BLOCK, DIRECT
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
+from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_scan import (
@@ -46,7 +47,6 @@ from hybridlog_storage.segment_format import (
     message_times,
     messages_at,
 )
-from hybridlog_storage.segment_writer import StoredChunk
 
 if TYPE_CHECKING:
     import numpy as np

@@ -30,19 +30,14 @@ from hybridlog.live import recording as live
 from hybridlog_storage import append_file, chunk_builder
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
+from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema
-from hybridlog_storage.segment_writer import (
-    AT_WORK,
-    PackedChunk,
-    RecordingWriter,
-    SegmentFile,
-    SegmentSettings,
-    StoredChunk,
-)
+from hybridlog_storage.segment_file import SegmentFile
+from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from tests.test_faults import kill_mongod, wait_for
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.index_documents import (
     DocumentAssembler,
     Origin,
@@ -21,7 +22,6 @@ from hybridlog_storage.index_documents import (
     recording_key,
 )
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.segment_writer import StoredChunk
 
 TIMES = st.integers(0, 2**63 - 1)
 ORIGIN = Origin("run-1", 0xFEDCBA98, "/a topic/ä", has_publish_time=True)

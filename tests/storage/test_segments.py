@@ -22,11 +22,13 @@ from mcap.stream_reader import StreamReader
 
 from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
+from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_format import (
     END_METADATA,
     chunk_index_record,
@@ -34,14 +36,7 @@ from hybridlog_storage.segment_format import (
     record_bytes,
 )
 from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import (
-    AT_WORK,
-    PackedChunk,
-    RecordingWriter,
-    SegmentFile,
-    SegmentSettings,
-    StoredChunk,
-)
+from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 
 RECORDING = {
     "id": "r",
