@@ -22,7 +22,7 @@ from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segment_writer import PACKERS, RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
@@ -40,6 +40,7 @@ class Pace:
             reads back later from the segments what is no longer in memory.
         has_room: Says whether so many bytes of chunks may wait for the index in memory.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
+        compressing: How many threads may compress at one time where there is no hurry.
         on_written: Called, on another thread, when less waits for the disk. Whoever appends
             never waits, and looks at `writer.waiting` instead.
         renew: Gives another connection to the index when one has failed.
@@ -49,6 +50,7 @@ class Pace:
     behind: Callable[[], bool]
     has_room: Callable[[int], bool]
     next_chunk_size: Callable[[], int]
+    compressing: int
     on_written: Callable[[], None]
     renew: Callable[[], Database]
 
@@ -107,6 +109,7 @@ class Capture:
             settings,
             hurry=pace.hurry if pace else None,
             next_chunk_size=pace.next_chunk_size if pace else None,
+            compressing=pace.compressing if pace else PACKERS,
             on_written=pace.on_written if pace else None,
         )
 

@@ -10,6 +10,7 @@ the budget: when that is spent, `write` waits.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -34,7 +35,7 @@ from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import AT_WORK, SegmentSettings
+from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -188,6 +189,7 @@ class LiveRecording:
                     behind=lambda: self._is_under(self._behind),
                     has_room=self._provision.has_room,
                     next_chunk_size=self._provision.next_chunk_size,
+                    compressing=_compressing(),
                     on_written=self._make_room,
                     renew=renew,
                 ),
@@ -550,6 +552,13 @@ class LiveRecording:
             message.publish_time,
             message.sequence,
         )
+
+
+def _compressing() -> int:
+    """Threads that compress: a processor is left to those that bring messages, if it can be."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not every system has it
+    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return min(PACKERS, max(processors - 1, 1))
 
 
 def _check_payload(payload: object) -> None:

@@ -13,9 +13,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
+from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     _Count = TypeVar("_Count", int, NDArray[np.int64])
 
 _MOST_CHUNKS = 1 << 14  # of a segment: whoever reads its summary has a kilobyte of each in memory
+PACKERS = 2
+"""Threads that pack chunks."""
 AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
 _MAX_CHANNELS = 65535
@@ -122,6 +125,8 @@ class RecordingWriter:
             when there always is.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now; without,
             as the settings say.
+        compressing: How many of the threads that pack may compress at one time, where there
+            is no hurry.
         on_written: Called, on a thread of the writer's, when there is less that waits. With
             it nothing that is appended waits for the disk: whoever appends looks at
             `waiting`. Without it `append` waits while the disk is slow.
@@ -136,6 +141,7 @@ class RecordingWriter:
         *,
         hurry: Callable[[], bool] | None = None,
         next_chunk_size: Callable[[], int] | None = None,
+        compressing: int = PACKERS,
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -152,9 +158,10 @@ class RecordingWriter:
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, ChunkBuilder] = {}
         self._compressor = Compressor(self.settings.compression, self.settings.level)
-        self._pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-pack")
+        self._pool = ThreadPoolExecutor(PACKERS, thread_name_prefix="hybridlog-pack")
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
-        self._hurry = hurry
+        self._hurry = hurry or (lambda: False)
+        self._compressing = BoundedSemaphore(compressing)
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
@@ -431,9 +438,11 @@ class RecordingWriter:
         for lock in copying:
             lock.acquire()
         # Only now: topics of one rate close their chunks at one time, and nobody is in a
-        # hurry before most of these wait here.
-        hurried = self._hurry is not None and self._hurry()
-        return pack(self._compressor, batch, seq, size, hurried=hurried)
+        # hurry before most of these wait here, or for their turn.
+        hurried = self._hurry()
+        with nullcontext() if hurried else self._compressing:
+            hurried = hurried or self._hurry()
+            return pack(self._compressor, batch, seq, size, hurried=hurried)
 
     # What follows runs on the thread that writes, and on no other.
 

@@ -527,6 +527,17 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         assert again.recordings()[0].status == "recovered"
 
 
+@pytest.mark.parametrize(("processors", "compressing"), [(1, 1), (2, 1), (3, 2), (16, 2)])
+def test_a_processor_is_left_to_who_brings_messages(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, processors: int, compressing: int
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)), raising=False)
+    with store.start("talk") as recording:
+        turns = recording._capture.writer._compressing
+        assert [turns.acquire(blocking=False) for _ in range(3)].count(True) == compressing
+        turns.release(compressing)
+
+
 def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError

@@ -24,6 +24,7 @@ from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
@@ -239,6 +240,41 @@ def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
     assert all(set(sizes[3:-1]) == {full} for sizes in of_topic.values())
     assert all(full // 2 <= size <= full for size in begun)
     assert len(set(begun)) > 12
+
+
+@pytest.mark.parametrize(("compressing", "hurried"), [(1, False), (1, True), (2, False)])
+def test_no_more_threads_compress_than_may_but_in_a_hurry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressing: int, hurried: bool
+) -> None:
+    is_alone = compressing == 1 and not hurried
+    side_by_side = threading.Barrier(2)
+    met = []
+
+    def compress(_: object, data: Buffer, *, hurried: bool) -> tuple[str, Buffer]:
+        try:
+            side_by_side.wait(0.1 if is_alone else 30)
+        except threading.BrokenBarrierError:
+            side_by_side.reset()
+        else:
+            met.append(hurried)
+        return "", bytes(data)
+
+    monkeypatch.setattr(Compressor, "compress", compress)
+    writer = RecordingWriter(
+        tmp_path,
+        RECORDING,
+        lambda *_: None,
+        SegmentSettings(chunk_size=1 << 10),
+        hurry=lambda: hurried,
+        compressing=compressing,
+        on_written=lambda: None,
+    )
+    payloads = [bytes([n]) * 1024 for n in range(4)]
+    for n, payload in enumerate(payloads):
+        writer.place_one(CHANNELS[0], payload, n, n, n)()
+    (path,) = writer.close()
+    assert [data for _, _, data in messages_in(path)] == payloads
+    assert met == ([] if is_alone else [hurried] * 4)
 
 
 def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
