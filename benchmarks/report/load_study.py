@@ -97,8 +97,9 @@ def _bound(samples: Sequence[Sample]) -> str:
     found = Value.of(speed for speed, _ in searches)
     if found is None:
         return "none tried"
-    if not found.high:
-        return f"below {number(min(one.case[SPEED] for one in samples))}x"
+    if not found.low:
+        below = f"below {number(min(one.case[SPEED] for one in samples))}x"
+        return f"{below} to {number(found.high)}x" if found.high else below
     text = f"{number(found.median)}x"
     if found.low != found.high:
         text += f" ({number(found.low)}…{number(found.high)})"
