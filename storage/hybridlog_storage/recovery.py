@@ -34,6 +34,7 @@ from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
     END_METADATA,
     RECORDING_METADATA,
+    ChunkSummary,
     arrival_record,
     arrivals_of,
     channel_of,
@@ -172,9 +173,9 @@ class _Rebuilder:
         self.messages += len(pending.batch)
         log_time = pending.batch.log_time
         ids, counts = np.unique(pending.batch.channel, return_counts=True)
-        self.segment.note_chunk(
-            (int(log_time.min()), int(log_time.max())),
-            dict(zip(ids.tolist(), counts.tolist(), strict=True)),
+        summary = ChunkSummary(
+            first=int(log_time.min()),
+            last=int(log_time.max()),
             offset=chunk.offset,
             length=chunk.length,
             indexes=pending.indexes,
@@ -182,6 +183,7 @@ class _Rebuilder:
             compressed_size=len(chunk.data),
             uncompressed_size=chunk.uncompressed_size,
         )
+        self.segment.note_chunk(summary, dict(zip(ids.tolist(), counts.tolist(), strict=True)))
 
 
 def recover_segment(path: Path) -> Recovered:

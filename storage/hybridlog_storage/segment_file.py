@@ -32,6 +32,7 @@ from hybridlog_storage.segment_format import (
     MAGIC,
     PROFILE,
     RECORDING_METADATA,
+    ChunkSummary,
     arrival_record,
     channel_record,
     chunk_head,
@@ -202,9 +203,9 @@ class SegmentFile:
             )
         self._write(parts)
         for chunk, place in zip(chunks, stored, strict=False):
-            self.note_chunk(
-                (chunk.first, chunk.last),
-                {channel: entries_of(data) for channel, data in chunk.indexes.items()},
+            summary = ChunkSummary(
+                first=chunk.first,
+                last=chunk.last,
                 offset=place.offset,
                 length=place.length,
                 indexes={channel: len(data) for channel, data in chunk.indexes.items()},
@@ -212,52 +213,22 @@ class SegmentFile:
                 compressed_size=place.compressed_size,
                 uncompressed_size=chunk.uncompressed_size,
             )
+            counts = {channel: entries_of(data) for channel, data in chunk.indexes.items()}
+            self.note_chunk(summary, counts)
         return stored
 
     def append_trailer(self, indexes: Mapping[int, bytes], arrivals: bytes) -> None:
         """Give a chunk the indexes and arrival numbers that a crash has cost it."""
         self._write([*indexes.values(), arrivals])
 
-    def note_chunk(
-        self,
-        span: tuple[int, int],
-        counts: Mapping[int, int],
-        *,
-        offset: int,
-        length: int,
-        indexes: Mapping[int, int],
-        compression: str,
-        compressed_size: int,
-        uncompressed_size: int,
-    ) -> None:
-        """List a chunk that is in the file.
-
-        Args:
-            span: Log time of its first and its last message, ns.
-            counts: Messages of each channel.
-            offset: Byte at which it starts.
-            length: Bytes of the chunk record.
-            indexes: Bytes of each channel's message index record.
-            compression: MCAP name of the codec.
-            compressed_size: Bytes of compressed content.
-            uncompressed_size: Bytes of content.
-        """
-        first, last = span
+    def note_chunk(self, chunk: ChunkSummary, counts: Mapping[int, int]) -> None:
+        """List a chunk that is in the file, with the messages of each channel in it."""
         self.chunks += 1
-        self._chunk_indexes += chunk_index_record(
-            first=first,
-            last=last,
-            offset=offset,
-            length=length,
-            indexes=indexes,
-            compression=compression,
-            compressed_size=compressed_size,
-            uncompressed_size=uncompressed_size,
-        )
+        self._chunk_indexes += chunk_index_record(chunk)
         for channel, count in counts.items():
             self._counts[channel] = self._counts.get(channel, 0) + count
-        self._first = first if self._first is None else min(self._first, first)
-        self._last = max(self._last, last)
+        self._first = chunk.first if self._first is None else min(self._first, chunk.first)
+        self._last = max(self._last, chunk.last)
 
     def cut(self, position: int) -> None:
         """Drop everything from a position on; the next record is written there."""

@@ -14,7 +14,7 @@ import struct
 import threading
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import zstandard
@@ -154,20 +154,10 @@ def chunk_head(
     )
 
 
-def chunk_index_record(
-    *,
-    first: int,
-    last: int,
-    offset: int,
-    length: int,
-    indexes: Mapping[int, int],
-    compression: str,
-    compressed_size: int,
-    uncompressed_size: int,
-) -> bytes:
-    """What the summary says of a chunk, whose message indexes follow it at once.
+class ChunkSummary(NamedTuple):
+    """What the summary of a segment says of a chunk, whose message indexes follow it at once.
 
-    Args:
+    Attributes:
         first: Log time of its first message, ns.
         last: Of its last.
         offset: Byte of the file at which it starts.
@@ -177,18 +167,32 @@ def chunk_index_record(
         compressed_size: Bytes of compressed content.
         uncompressed_size: Bytes of content.
     """
-    name = compression.encode()
-    places = index_offsets(indexes, offset + length)
+
+    first: int
+    last: int
+    offset: int
+    length: int
+    indexes: Mapping[int, int]
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+
+
+def chunk_index_record(chunk: ChunkSummary) -> bytes:
+    """The record that says so."""
+    name = chunk.compression.encode()
+    places = index_offsets(chunk.indexes, chunk.offset + chunk.length)
     table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
     tail = struct.pack(
         f"<QI{len(name)}sQQ",
-        sum(indexes.values()),
+        sum(chunk.indexes.values()),
         len(name),
         name,
-        compressed_size,
-        uncompressed_size,
+        chunk.compressed_size,
+        chunk.uncompressed_size,
     )
-    body = CHUNK_INDEX_HEAD.pack(first, last, offset, length, len(table)) + table + tail
+    head = CHUNK_INDEX_HEAD.pack(chunk.first, chunk.last, chunk.offset, chunk.length, len(table))
+    body = head + table + tail
     return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
 
 

@@ -32,6 +32,7 @@ from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_format import (
     END_METADATA,
+    ChunkSummary,
     chunk_index_record,
     json_metadata,
     record_bytes,
@@ -451,7 +452,7 @@ def test_the_record_of_a_chunk_index_is_that_of_the_mcap_package(
     numbers: list[int], indexes: dict[int, int], compression: str
 ) -> None:
     first, last, offset, length, compressed_size, uncompressed_size = numbers
-    found = chunk_index_record(
+    chunk = ChunkSummary(
         first=first,
         last=last,
         offset=offset,
@@ -461,6 +462,7 @@ def test_the_record_of_a_chunk_index_is_that_of_the_mcap_package(
         compressed_size=compressed_size,
         uncompressed_size=uncompressed_size,
     )
+    found = chunk_index_record(chunk)
     at, places = offset + length, {}
     for channel, size in indexes.items():
         places[channel], at = at, at + size
