@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
@@ -31,9 +31,10 @@ from hybridlog.live.provision import Provision
 from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
 from hybridlog.recorder import RecordReport
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.messages import Channel, LooseBatch
+from hybridlog_storage.runs import run_starts
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 
@@ -45,8 +46,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 _LARGE = 1 << 17  # bytes from which a payload is laid down at once
-_MEDIUM = 1 << 13  # and from which by itself: to join it to others first would copy it twice
-_MOST_JOINED = 8 << 20  # bytes of smaller payloads that make one batch
+_MOST_LAID = 8 << 20  # bytes that are laid down together: then whoever waits for room hears of it
 _ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
 _TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
 _FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
@@ -152,7 +152,7 @@ class LiveRecording:
         self._ids: dict[Channel, int] = {}
         self._channels: list[Channel] = []
         self._taken: list[int] = []  # messages, by index of the channel
-        self._inbox: deque[_Message] = deque()
+        self._inbox: list[_Message] = []
         self._inbox_bytes = 0
         self._worth_waking = min(_ENOUGH, options.budget_bytes // 4)
         self._taken_bytes = 0  # taken, and not laid into a chunk yet
@@ -524,13 +524,15 @@ class LiveRecording:
     def _take(self) -> None:
         """Lay what was put down into chunks; by who holds `_laying`."""
         with self._lock:
-            inbox, self._inbox, self._inbox_bytes = self._inbox, deque(), 0
-        while inbox:
-            self._make_room(self._lay_down(_next_group(inbox)))
+            inbox, size = self._inbox, self._inbox_bytes
+            self._inbox, self._inbox_bytes = [], 0
+        if inbox:
+            for group in [inbox] if size <= _MOST_LAID else _groups(inbox):
+                self._make_room(self._lay_down(group))
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
         """Give some messages to the writer; returns the bytes of their payloads."""
-        if len(group[0].payload) < _MEDIUM and len(group) >= _FEW * self._count_chunks(group):
+        if len(group) >= _FEW * self._count_chunks(group):
             batch = _batch(group)
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
@@ -582,24 +584,18 @@ def indexed_within_s(flush_interval_s: float) -> float:
     return flush_interval_s + _patience(flush_interval_s) + _MAKING_S
 
 
-def _next_group(inbox: deque[_Message]) -> Sequence[_Message]:
-    """Take the first messages: as many small ones as make a batch, or as many others."""
-    group = [inbox.popleft()]
-    size = len(group[0].payload)
-    is_small = size < _MEDIUM
-    while inbox and size < _MOST_JOINED and (len(inbox[0].payload) < _MEDIUM) == is_small:
-        group.append(inbox.popleft())
-        size += len(group[-1].payload)
-    return group
+def _groups(inbox: Sequence[_Message]) -> Iterator[Sequence[_Message]]:
+    """Messages that are laid down together, in their order."""
+    sizes = np.fromiter((len(message.payload) for message in inbox), np.int64, len(inbox))
+    bounds = run_starts(np.cumsum(sizes) // _MOST_LAID).tolist()
+    return (inbox[start:stop] for start, stop in zip(bounds, [*bounds[1:], None], strict=True))
 
 
-def _batch(messages: Sequence[_Message]) -> Batch:
+def _batch(messages: Sequence[_Message]) -> LooseBatch:
     channel, log_time, publish_time, sequence, payloads = zip(*messages, strict=True)
-    length = np.fromiter(map(len, payloads), np.int64, len(payloads))
-    return Batch(
-        payloads[0] if len(payloads) == 1 else b"".join(payloads),
-        np.cumsum(length) - length,
-        length,
+    return LooseBatch(
+        np.fromiter(payloads, np.object_, len(payloads)),
+        np.fromiter(map(len, payloads), np.int64, len(payloads)),
         np.array(channel, np.int32),
         np.array(log_time, np.int64),
         np.array(publish_time, np.int64),

@@ -12,9 +12,9 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.copying import copy_payloads, windows
+from hybridlog_storage.copying import COPIED_AT_ONCE, copy_payloads, windows
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import Batch, Buffer
+from hybridlog_storage.messages import Batch, Buffer, LooseBatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,13 +23,6 @@ if TYPE_CHECKING:
 
 _HEAD = MESSAGE_HEAD.itemsize
 _ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
-COPIED_AT_ONCE = 1 << 20
-"""Bytes below which a payload is copied without giving up the interpreter.
-
-That takes a tenth of a millisecond, or two. When others have the interpreter meanwhile, it
-comes back after each of them, and where one computes, five milliseconds later.
-"""
-
 _GROWTH = 4  # times as much as one chunk the next one may hold, before it is moved
 _LARGE_SHARE = 8  # so many times a payload fills a chunk, where payloads are large
 
@@ -62,7 +55,7 @@ class ChunkBuilder:
         """Bytes laid down so far."""
         return self._used
 
-    def append(self, batch: Batch, seq: NDArray[np.int64]) -> None:
+    def append(self, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
         """Copy the messages of a batch in; `batch.channel` holds the segment's channel ids.
 
         Args:
@@ -225,7 +218,7 @@ class ChunkBuilder:
         larger[: self._used] = self._buffer[: self._used]
         self._buffer = larger
 
-    def _lay_heads(self, batch: Batch, starts: NDArray[np.int64]) -> None:
+    def _lay_heads(self, batch: Batch | LooseBatch, starts: NDArray[np.int64]) -> None:
         heads = np.empty(len(batch), MESSAGE_HEAD)
         heads["opcode"] = int(Opcode.MESSAGE)
         heads["length"] = batch.length + (_HEAD - 9)

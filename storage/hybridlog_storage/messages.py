@@ -2,7 +2,8 @@
 
 Messages never travel one by one. A `Batch` is a buffer and a table of numpy columns
 that say where each message's payload lies in it, so that copying, indexing and
-decoding are a few array operations for thousands of messages.
+decoding are a few array operations for thousands of messages. Those that have just come
+are a `LooseBatch` until they lie in a chunk.
 """
 
 from __future__ import annotations
@@ -108,6 +109,45 @@ class Batch:
         """The payload of one message, without a copy."""
         start = int(self.offset[row])
         return memoryview(self.buffer)[start : start + int(self.length[row])]
+
+    @property
+    def payload_bytes(self) -> int:
+        """Sum of all payload lengths."""
+        return int(self.length.sum())
+
+
+@dataclass(slots=True)
+class LooseBatch:
+    """Messages that lie each where it came from, to be copied once. All columns have length n.
+
+    Rows are in arrival order.
+
+    Attributes:
+        payloads: object[n], the buffer of each payload.
+        length: As of a `Batch`, and so are the others.
+    """
+
+    payloads: NDArray[np.object_]
+    length: NDArray[np.int64]
+    channel: NDArray[np.int32]
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    sequence: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.length)
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> LooseBatch:
+        """The chosen rows."""
+        return LooseBatch(
+            self.payloads[rows],
+            self.length[rows],
+            self.channel[rows],
+            self.log_time[rows],
+            self.publish_time[rows],
+            self.sequence[rows],
+        )
 
     @property
     def payload_bytes(self) -> int:

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -27,7 +27,7 @@ from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
+from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_format import entries_of
 
@@ -184,7 +184,7 @@ class RecordingWriter:
         """Bytes of content of closed chunks that are not in the file yet."""
         return self._closed_bytes - self._stored_bytes
 
-    def append(self, batch: Batch, channels: Sequence[Channel]) -> None:
+    def append(self, batch: Batch | LooseBatch, channels: Sequence[Channel]) -> None:
         """Take a batch; `batch.channel` indexes `channels`.
 
         Raises:
@@ -202,15 +202,7 @@ class RecordingWriter:
                 channel, float(batch.length[batch.channel == index].mean())
             )
             ids[index], cluster[index] = known.channel_id, known.cluster
-        own = Batch(
-            batch.buffer,
-            batch.offset,
-            batch.length,
-            ids[batch.channel],
-            batch.log_time,
-            batch.publish_time,
-            batch.sequence,
-        )
+        own = replace(batch, channel=ids[batch.channel])
         clusters = sorted({int(cluster[index]) for index in present})
         if len(clusters) == 1:
             self._fill(clusters[0], own, seq)
@@ -370,7 +362,7 @@ class RecordingWriter:
         size = self._next_chunk_size()
         return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
-    def _fill(self, key: int, batch: Batch, seq: NDArray[np.int64]) -> None:
+    def _fill(self, key: int, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
         """Lay messages into a cluster's chunk, closing chunks at their bounds."""
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
         start, total = 0, len(batch)
@@ -396,7 +388,7 @@ class RecordingWriter:
         little = self.settings.span_size * (1 + (_LITTLE - 1) * (messages < _FEW))
         return self.settings.chunk_span_ns * (1 + (_SPARSE - 1) * (held < little))
 
-    def _span_end(self, builder: ChunkBuilder, batch: Batch, start: int) -> int:
+    def _span_end(self, builder: ChunkBuilder, batch: Batch | LooseBatch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
         log_time = batch.log_time[start:]
         first = builder.first_log_time if len(builder) else int(log_time[0])

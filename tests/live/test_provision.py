@@ -15,7 +15,7 @@ from hybridlog.live import provision as module
 from hybridlog.live.provision import Provision
 from hybridlog_storage import buffers as pool_module
 from hybridlog_storage.buffers import SLAB, Buffers
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
+from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.live.test_recording import channel, text

@@ -31,8 +31,8 @@ from hybridlog_storage import append_file, chunk_builder
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema

@@ -23,8 +23,8 @@ from mcap.stream_reader import StreamReader
 from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.chunk_builder import COPIED_AT_ONCE
 from hybridlog_storage.compression import Compressor
+from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.recovery import recover_segment
