@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.machine import cores
+from hybridlog.processors import processors
 
 TAKEN_SHARE = 0.05
 """A host that takes more of the processors' time away than this disturbs a run."""
@@ -22,7 +22,7 @@ def share_taken(values: Mapping[str, Any]) -> float:
     taken, wall = values.get("steal_s"), values.get("wall_s")
     if not isinstance(taken, int | float) or not isinstance(wall, int | float) or wall <= 0:
         return 0.0
-    return taken / (wall * cores())
+    return taken / (wall * processors())
 
 
 def is_disturbed(values: Mapping[str, Any]) -> bool:

@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from hybridlog.processors import processors
+
 _PACKAGES = (
     "hybridlog",
     "matplotlib",
@@ -37,7 +39,7 @@ def describe(work: Path | None = None) -> dict[str, object]:
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "cpu": _cpu(),
-        "cores": cores(),
+        "cores": processors(),
         "memory_gib": round(_memory_bytes() / 2**30, 1),
         "disk": _disk(work or Path(tempfile.gettempdir())),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -49,13 +51,6 @@ def describe(work: Path | None = None) -> dict[str, object]:
         "revision": _revision(),
         "load_1min": round(os.getloadavg()[0], 2),
     }
-
-
-def cores() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _cpu() -> str:

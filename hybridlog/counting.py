@@ -10,7 +10,6 @@ afterwards.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ import numpy as np
 
 from hybridlog.columns.answers import judged
 from hybridlog.columns.kept import cost_s
+from hybridlog.processors import processors
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.catalog import RECORDINGS
@@ -201,7 +201,7 @@ def _counted(
 ) -> int:
     """What a filter finds: with an index in one go, else in parts side by side."""
     collection = collection_of(topic)
-    parts = min(_messages(topic, recordings) // _PART, _MOST_PARTS, os.cpu_count() or 1)
+    parts = min(_messages(topic, recordings) // _PART, _MOST_PARTS, processors())
     if parts < 2 or _is_served(database, collection, asked):
         return database.count(collection, asked)
     filters = [{"$and": [part, dict(asked)]} for part in _key_ranges(topic, recordings, parts)]

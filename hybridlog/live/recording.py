@@ -10,10 +10,9 @@ the budget: when that is spent, `write` waits.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
@@ -30,11 +29,11 @@ from hybridlog.live.policy import SMALL
 from hybridlog.live.provision import Provision
 from hybridlog.live.turns import Turns
 from hybridlog.losses import Cause, Ledger
+from hybridlog.processors import processors
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel, LooseBatch
-from hybridlog_storage.runs import run_starts
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 
@@ -152,7 +151,7 @@ class LiveRecording:
         self._ids: dict[Channel, int] = {}
         self._channels: list[Channel] = []
         self._taken: list[int] = []  # messages, by index of the channel
-        self._inbox: list[_Message] = []
+        self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
         self._worth_waking = min(_ENOUGH, options.budget_bytes // 4)
         self._taken_bytes = 0  # taken, and not laid into a chunk yet
@@ -525,7 +524,7 @@ class LiveRecording:
         """Lay what was put down into chunks; by who holds `_laying`."""
         with self._lock:
             inbox, size = self._inbox, self._inbox_bytes
-            self._inbox, self._inbox_bytes = [], 0
+            self._inbox, self._inbox_bytes = deque(), 0
         if inbox:
             for group in [inbox] if size <= _MOST_LAID else _groups(inbox):
                 self._make_room(self._lay_down(group))
@@ -558,9 +557,7 @@ class LiveRecording:
 
 def _compressing() -> int:
     """Threads that compress: a processor is left to those that bring messages, if it can be."""
-    affinity = getattr(os, "sched_getaffinity", None)  # not every system has it
-    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return min(PACKERS, max(processors - 1, 1))
+    return min(PACKERS, max(processors() - 1, 1))
 
 
 def _check_payload(payload: object) -> None:
@@ -584,11 +581,15 @@ def indexed_within_s(flush_interval_s: float) -> float:
     return flush_interval_s + _patience(flush_interval_s) + _MAKING_S
 
 
-def _groups(inbox: Sequence[_Message]) -> Iterator[Sequence[_Message]]:
-    """Messages that are laid down together, in their order."""
-    sizes = np.fromiter((len(message.payload) for message in inbox), np.int64, len(inbox))
-    bounds = run_starts(np.cumsum(sizes) // _MOST_LAID).tolist()
-    return (inbox[start:stop] for start, stop in zip(bounds, [*bounds[1:], None], strict=True))
+def _groups(inbox: deque[_Message]) -> Iterator[Sequence[_Message]]:
+    """Take messages that are laid down together; those before them are forgotten."""
+    while inbox:
+        group = [inbox.popleft()]
+        size = len(group[0].payload)
+        while inbox and size < _MOST_LAID:
+            group.append(inbox.popleft())
+            size += len(group[-1].payload)
+        yield group
 
 
 def _batch(messages: Sequence[_Message]) -> LooseBatch:

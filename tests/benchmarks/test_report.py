@@ -18,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.backends.registry import BACKENDS
-from benchmarks.machine import cores
 from benchmarks.questions.askers import ASKERS
 from benchmarks.report import figures, numbers
 from benchmarks.report.book import Book
@@ -30,6 +29,7 @@ from benchmarks.report.page import page
 from benchmarks.report.terminal import show
 from benchmarks.report.write import write
 from benchmarks.samples import DAMAGE, Journal, Sample
+from hybridlog.processors import processors
 
 HEADER = {
     "quick": False,
@@ -474,7 +474,7 @@ def test_quick_runs_are_marked_everywhere(tmp_path: Path) -> None:
 
 
 def test_a_share_that_the_machine_may_have_cost_is_marked(tmp_path: Path) -> None:
-    taken = 5.0 * cores()  # half of the processors' time
+    taken = 5.0 * processors()  # half of the processors' time
     found = report(
         journal(
             tmp_path,

@@ -35,7 +35,7 @@ from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from tests.test_faults import kill_mongod, wait_for
@@ -171,7 +171,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
 INTERRUPTED = """
 import signal, sys
 import hybridlog as hl
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 sizes = [10, 140_000, 10, 100, 3000]
@@ -234,7 +234,14 @@ def test_what_is_written_can_be_asked_for_while_it_goes_on(store: hl.Store) -> N
 
 @pytest.mark.parametrize(
     ("size", "topics", "messages", "batches"),
-    [(10, 30, 3, 1), (10, 30, 1, 1), (2000, 3, 30, 1), (2000, 30, 3, 0), (10, 1, 5, 0)],
+    [
+        (10, 30, 3, 1),
+        (10, 30, 1, 1),
+        (2000, 3, 30, 1),
+        (2000, 30, 3, 0),
+        (10, 1, 5, 0),
+        (20_000, 3, 30, 1),
+    ],
 )
 def test_a_batch_is_for_chunks_that_get_many_messages(
     store: hl.Store,
@@ -248,7 +255,9 @@ def test_a_batch_is_for_chunks_that_get_many_messages(
     appended = Counter[str]()
     append, place = RecordingWriter.append, RecordingWriter.place_one
 
-    def counted_append(self: RecordingWriter, batch: Batch, channels: Sequence[Channel]) -> None:
+    def counted_append(
+        self: RecordingWriter, batch: LooseBatch, channels: Sequence[Channel]
+    ) -> None:
         appended["batches"] += 1
         append(self, batch, channels)
 
@@ -270,6 +279,31 @@ def test_a_batch_is_for_chunks_that_get_many_messages(
     assert appended == ({"batches": 1} if batches else {"single": len(payloads)})
     for n, one in enumerate(own):
         assert [m.raw for m in store.topic(one.topic)][1:] == payloads[n::topics]
+
+
+def test_what_is_laid_down_together_keeps_its_order(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of all topics, whatever the sizes are, and however much comes at one time."""
+    sizes = [0, 10, 30_000, 200, 300_000, 10, COPIED_AT_ONCE]
+    own = [channel(f"/talk{n}") for n in range(3)]
+    batches: list[int] = []
+    append = RecordingWriter.append
+
+    def counted(self: RecordingWriter, batch: LooseBatch, channels: Sequence[Channel]) -> None:
+        batches.append(batch.payload_bytes)
+        append(self, batch, channels)
+
+    monkeypatch.setattr(live, "_MOST_LAID", 9_000_000)
+    monkeypatch.setattr(RecordingWriter, "append", counted)
+    payloads = [text(b"%5d" % n + bytes(sizes[n % 7])) for n in range(210)]
+    with store.start("talk") as recording, recording._laying:
+        for n, payload in enumerate(payloads):
+            recording.write(own[n % 2 if n % 5 else 2], payload, log_time=5, sequence=n)
+    # What is left behind them are too few for a batch.
+    assert len(batches) == 4
+    assert sum(batches) == sum(map(len, payloads[:196]))
+    assert [m.raw for m in store.query([one.topic for one in own])] == payloads
 
 
 def test_the_index_falls_behind_and_catches_up(
@@ -559,7 +593,7 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.Monke
 KILLED = """
 import sys, time
 import hybridlog as hl
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 with hl.open(sys.argv[1], create=True) as store:

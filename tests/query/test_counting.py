@@ -42,7 +42,7 @@ def many(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let few messages count as many."""
     monkeypatch.setattr(counting, "_MANY", 1)
     monkeypatch.setattr(counting, "_PART", 1)
-    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    monkeypatch.setattr(counting, "processors", lambda: 3)
 
 
 def asked(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
@@ -86,7 +86,7 @@ def test_a_count_is_what_a_loop_counts(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(counting, "_MANY", 1 if is_many else 10**6)
         patch.setattr(counting, "_PART", 2)
-        patch.setattr("os.cpu_count", lambda: 3)
+        patch.setattr(counting, "processors", lambda: 3)
         query = store.topic("/state").in_recording(*has).where("s >= 1")
         assert query.count() == sum(m.value["s"] >= 1 for name in has for m in model.of(name))
         query = query.where("x > 1")

@@ -26,7 +26,7 @@ from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
-from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
+from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_file import SegmentFile
@@ -72,6 +72,20 @@ def batch_of(rows: Sequence[Row]) -> Batch:
         np.array([r[2] for r in rows], np.int64),
         np.array([r[3] for r in rows], np.int64),
         np.array([r[4] for r in rows], np.uint32),
+    )
+
+
+def loose(rows: Sequence[Row]) -> LooseBatch:
+    """The same, each payload in a buffer of its own, of any kind."""
+    kinds = (bytes, bytearray, memoryview)
+    channel, payloads, log_time, publish_time, sequence = zip(*rows, strict=True)
+    return LooseBatch(
+        np.fromiter((kinds[n % 3](p) for n, p in enumerate(payloads)), np.object_, len(rows)),
+        np.array([len(payload) for payload in payloads], np.int64),
+        np.array(channel, np.int32),
+        np.array(log_time, np.int64),
+        np.array(publish_time, np.int64),
+        np.array(sequence, np.uint32),
     )
 
 
@@ -161,13 +175,13 @@ def test_payloads_that_are_copied_at_once_and_those_that_are_not_share_chunks(
         st.tuples(
             st.sampled_from([1 << 20, 2 << 20, 8 << 20]),
             st.lists(st.sampled_from([0, 10, 30_000, 700_000, 1_200_000, 3_000_000]), max_size=9),
-            st.booleans(),
+            st.sampled_from(["a batch", "loose", "one by one"]),
         ),
         max_size=5,
     )
 )
 def test_the_chunk_size_may_change_while_messages_come(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, list[int], bool]]
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, list[int], str]]
 ) -> None:
     """No chunk exceeds the bound of when it was opened; nothing is lost or out of order."""
     chunks: list[StoredChunk] = []
@@ -181,13 +195,15 @@ def test_the_chunk_size_may_change_while_messages_come(
     )
     payloads: list[bytes] = []
     opened_with: list[int] = []  # the bound when each message came
-    for chunk_size, sizes, by_batch in steps:
+    for chunk_size, sizes, way in steps:
         first = len(payloads)
         payloads += [bytes([first + n + 1]) * size for n, size in enumerate(sizes)]
         opened_with += [chunk_size] * len(sizes)
-        if by_batch:
-            rows = [(0, payloads[n], n, n, n) for n in range(first, len(payloads))]
+        rows = [(0, payloads[n], n, n, n) for n in range(first, len(payloads))]
+        if way == "a batch":
             writer.append(batch_of(rows), CHANNELS)
+        elif way == "loose" and rows:
+            writer.append(loose(rows), CHANNELS)
         else:
             copies = [
                 writer.place_one(CHANNELS[0], payloads[n], n, n, n)
