@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import PACKERS, RecordingWriter, SegmentSettings
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
@@ -40,7 +40,8 @@ class Pace:
             reads back later from the segments what is no longer in memory.
         has_room: Says whether so many bytes of chunks may wait for the index in memory.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
-        compressing: How many threads may compress at one time where there is no hurry.
+        spare: Held by what can wait while it takes a processor: to compress a chunk, where
+            there is no hurry, and to make documents and columns of one.
         on_written: Called, on another thread, when less waits for the disk. Whoever appends
             never waits, and looks at `writer.waiting` instead.
         renew: Gives another connection to the index when one has failed.
@@ -50,7 +51,7 @@ class Pace:
     behind: Callable[[], bool]
     has_room: Callable[[int], bool]
     next_chunk_size: Callable[[], int]
-    compressing: int
+    spare: AbstractContextManager[object]
     on_written: Callable[[], None]
     renew: Callable[[], Database]
 
@@ -98,7 +99,7 @@ class Capture:
             self._held = self._held.pop_all()
         self.indexer = ChunkIndexer(self.entry.id, self.entry.key)
         recording = directory.recording(self.entry.id)
-        lag = Lag(recording, pace.behind, pace.has_room, pace.renew) if pace else None
+        lag = Lag(recording, pace.behind, pace.has_room, pace.renew, pace.spare) if pace else None
         self._gatherer = FieldGatherer(recording)
         self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
         self._held.callback(self.index.release)
@@ -109,7 +110,7 @@ class Capture:
             settings,
             hurry=pace.hurry if pace else None,
             next_chunk_size=pace.next_chunk_size if pace else None,
-            compressing=pace.compressing if pace else PACKERS,
+            spare=pace.spare if pace else None,
             on_written=pace.on_written if pace else None,
         )
 

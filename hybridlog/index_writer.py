@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -161,6 +161,7 @@ class Lag:
         behind: Says whether the recorder has more than it can write.
         has_room: Says whether so many bytes of chunks may wait in memory, where they are more
             than a few.
+        spare: Held while documents or columns are made.
         renew: Another connection to the index, after one has failed; starts the embedded
             MongoDB again if that has ended. Raises `DatabaseError`.
     """
@@ -171,9 +172,11 @@ class Lag:
         behind: Callable[[], bool],
         has_room: Callable[[int], bool],
         renew: Callable[[], Database],
+        spare: AbstractContextManager[object],
     ) -> None:
         self.has_room = has_room
         self.renew = renew
+        self.spare = spare
         self._recording = recording
         self._behind = behind
         self._reader: SegmentReader | None = None
@@ -273,6 +276,7 @@ class IndexWriter:
         self._indexer = indexer
         self._lag = lag
         self._gatherer = gatherer
+        self._spare = lag.spare if lag else nullcontext()
         self._forgotten: deque[_Forgotten] = deque()
         self._database = database
         self._catalog = Catalog(database)
@@ -520,10 +524,12 @@ class IndexWriter:
         """Make columns of chunks."""
         if self._gatherer is not None:
             for chunk in chunks:
-                self._gatherer.add(chunk, channels)
+                with self._spare:
+                    self._gatherer.add(chunk, channels)
 
     def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
-        self._parcel.add(*self._indexer.documents_of(chunks, channels))
+        with self._spare:
+            self._parcel.add(*self._indexer.documents_of(chunks, channels))
         parcel = self._parcel
         if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:
             self._dispatch(wait=parcel.size >= _PARCEL_BYTES)

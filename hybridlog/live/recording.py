@@ -188,7 +188,7 @@ class LiveRecording:
                     behind=lambda: self._is_under(self._behind),
                     has_room=self._provision.has_room,
                     next_chunk_size=self._provision.next_chunk_size,
-                    compressing=_compressing(),
+                    spare=threading.BoundedSemaphore(_spare_processors()),
                     on_written=self._make_room,
                     renew=renew,
                 ),
@@ -555,9 +555,9 @@ class LiveRecording:
         )
 
 
-def _compressing() -> int:
-    """Threads that compress: a processor is left to those that bring messages, if it can be."""
-    return min(PACKERS, max(processors() - 1, 1))
+def _spare_processors() -> int:
+    """For what can wait: one is left to those that bring messages, if it can be."""
+    return min(PACKERS + 1, max(processors() - 1, 1))
 
 
 def _check_payload(payload: object) -> None:

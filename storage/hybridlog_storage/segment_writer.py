@@ -13,10 +13,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import BoundedSemaphore, Lock
+from threading import Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
@@ -125,8 +125,7 @@ class RecordingWriter:
             when there always is.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now; without,
             as the settings say.
-        compressing: How many of the threads that pack may compress at one time, where there
-            is no hurry.
+        spare: Held while a chunk is packed, where there is no hurry.
         on_written: Called, on a thread of the writer's, when there is less that waits. With
             it nothing that is appended waits for the disk: whoever appends looks at
             `waiting`. Without it `append` waits while the disk is slow.
@@ -141,7 +140,7 @@ class RecordingWriter:
         *,
         hurry: Callable[[], bool] | None = None,
         next_chunk_size: Callable[[], int] | None = None,
-        compressing: int = PACKERS,
+        spare: AbstractContextManager[object] | None = None,
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -161,7 +160,7 @@ class RecordingWriter:
         self._pool = ThreadPoolExecutor(PACKERS, thread_name_prefix="hybridlog-pack")
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
         self._hurry = hurry or (lambda: False)
-        self._compressing = BoundedSemaphore(compressing)
+        self._spare = spare or nullcontext()
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
@@ -432,7 +431,7 @@ class RecordingWriter:
         # Only now: topics of one rate close their chunks at one time, and nobody is in a
         # hurry before most of these wait here, or for their turn.
         hurried = self._hurry()
-        with nullcontext() if hurried else self._compressing:
+        with nullcontext() if hurried else self._spare:
             hurried = hurried or self._hurry()
             return pack(self._compressor, batch, seq, size, hurried=hurried)
 

@@ -27,7 +27,7 @@ from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording, provision
 from hybridlog.live import recording as live
-from hybridlog_storage import append_file, chunk_builder
+from hybridlog_storage import append_file, chunk_builder, segment_writer
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
@@ -561,15 +561,42 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         assert again.recordings()[0].status == "recovered"
 
 
-@pytest.mark.parametrize(("processors", "compressing"), [(1, 1), (2, 1), (3, 2), (16, 2)])
+@pytest.mark.parametrize(("processors", "side_by_side"), [(1, 1), (2, 1), (3, 2), (16, 3)])
 def test_a_processor_is_left_to_who_brings_messages(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, processors: int, compressing: int
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, processors: int, side_by_side: int
 ) -> None:
+    """By packing, which two threads do, and by making documents and columns together."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)), raising=False)
-    with store.start("talk") as recording:
-        turns = recording._capture.writer._compressing
-        assert [turns.acquire(blocking=False) for _ in range(3)].count(True) == compressing
-        turns.release(compressing)
+    lock = threading.Lock()
+    at_work, most, done = 0, 0, Counter[str]()
+
+    def slowly(of: object, name: str) -> None:
+        work = getattr(of, name)
+
+        def watched(*arguments: Any, **options: Any) -> Any:
+            nonlocal at_work, most
+            with lock:
+                at_work += 1
+                most = max(most, at_work)
+                done[name] += 1
+            time.sleep(0.02)
+            with lock:
+                at_work -= 1
+            return work(*arguments, **options)
+
+        monkeypatch.setattr(of, name, watched)
+
+    slowly(segment_writer, "pack")
+    slowly(ChunkIndexer, "documents_of")
+    slowly(FieldGatherer, "add")
+    payloads = [text(bytes([n]) * 2000) for n in range(30)]
+    with store.start("talk", settings=SegmentSettings(chunk_size=2000)) as recording:
+        monkeypatch.setattr(index_writer, "_FEW", 0)
+        for payload in payloads:
+            recording.write(channel("/talk"), payload)
+    assert most == side_by_side
+    assert done == {"pack": 30, "documents_of": 30, "add": 30}
+    assert [m.raw for m in store.topic("/talk")] == payloads
 
 
 def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:

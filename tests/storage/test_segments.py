@@ -259,11 +259,11 @@ def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
     assert len(set(begun)) > 12
 
 
-@pytest.mark.parametrize(("compressing", "hurried"), [(1, False), (1, True), (2, False)])
-def test_no_more_threads_compress_than_may_but_in_a_hurry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressing: int, hurried: bool
+@pytest.mark.parametrize(("spare", "hurried"), [(1, False), (1, True), (2, False)])
+def test_no_more_threads_pack_than_may_but_in_a_hurry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int, hurried: bool
 ) -> None:
-    is_alone = compressing == 1 and not hurried
+    is_alone = spare == 1 and not hurried
     side_by_side = threading.Barrier(2)
     met = []
 
@@ -283,7 +283,7 @@ def test_no_more_threads_compress_than_may_but_in_a_hurry(
         lambda *_: None,
         SegmentSettings(chunk_size=1 << 10),
         hurry=lambda: hurried,
-        compressing=compressing,
+        spare=threading.BoundedSemaphore(spare),
         on_written=lambda: None,
     )
     payloads = [bytes([n]) * 1024 for n in range(4)]
