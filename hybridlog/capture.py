@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.gatherer import FieldGatherer
@@ -40,8 +41,8 @@ class Pace:
             reads back later from the segments what is no longer in memory.
         has_room: Says whether so many bytes of chunks may wait for the index in memory.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
-        spare: Held by what can wait while it takes a processor: to compress a chunk, where
-            there is no hurry, and to make documents and columns of one.
+        spare: Processors for what can wait: to pack a chunk, where there is no hurry, and to
+            make documents and columns of one.
         on_written: Called, on another thread, when less waits for the disk. Whoever appends
             never waits, and looks at `writer.waiting` instead.
         renew: Gives another connection to the index when one has failed.
@@ -51,7 +52,7 @@ class Pace:
     behind: Callable[[], bool]
     has_room: Callable[[int], bool]
     next_chunk_size: Callable[[], int]
-    spare: AbstractContextManager[object]
+    spare: BoundedSemaphore
     on_written: Callable[[], None]
     renew: Callable[[], Database]
 

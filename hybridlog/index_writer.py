@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -161,7 +161,7 @@ class Lag:
         behind: Says whether the recorder has more than it can write.
         has_room: Says whether so many bytes of chunks may wait in memory, where they are more
             than a few.
-        spare: Held while documents or columns are made.
+        spare: Processors for what can wait. One is held while documents or columns are made.
         renew: Another connection to the index, after one has failed; starts the embedded
             MongoDB again if that has ended. Raises `DatabaseError`.
     """
@@ -172,7 +172,7 @@ class Lag:
         behind: Callable[[], bool],
         has_room: Callable[[int], bool],
         renew: Callable[[], Database],
-        spare: AbstractContextManager[object],
+        spare: threading.BoundedSemaphore,
     ) -> None:
         self.has_room = has_room
         self.renew = renew

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
+from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
@@ -41,6 +41,7 @@ PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
+_TURN_S = 0.1
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
@@ -125,7 +126,8 @@ class RecordingWriter:
             when there always is.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now; without,
             as the settings say.
-        spare: Held while a chunk is packed, where there is no hurry.
+        spare: As many as there are processors for what can wait. One is taken to pack a
+            chunk where there is no hurry, unless none can be had for a tenth of a second.
         on_written: Called, on a thread of the writer's, when there is less that waits. With
             it nothing that is appended waits for the disk: whoever appends looks at
             `waiting`. Without it `append` waits while the disk is slow.
@@ -140,7 +142,7 @@ class RecordingWriter:
         *,
         hurry: Callable[[], bool] | None = None,
         next_chunk_size: Callable[[], int] | None = None,
-        spare: AbstractContextManager[object] | None = None,
+        spare: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -160,7 +162,7 @@ class RecordingWriter:
         self._pool = ThreadPoolExecutor(PACKERS, thread_name_prefix="hybridlog-pack")
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
         self._hurry = hurry or (lambda: False)
-        self._spare = spare or nullcontext()
+        self._spare = spare or BoundedSemaphore(PACKERS)
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
@@ -431,9 +433,19 @@ class RecordingWriter:
         # Only now: topics of one rate close their chunks at one time, and nobody is in a
         # hurry before most of these wait here, or for their turn.
         hurried = self._hurry()
-        with nullcontext() if hurried else self._spare:
+        with nullcontext() if hurried else self._turn():
             hurried = hurried or self._hurry()
             return pack(self._compressor, batch, seq, size, hurried=hurried)
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """A processor to spare, if one can be had soon; nothing waits long for who has it."""
+        has_one = self._spare.acquire(timeout=_TURN_S)
+        try:
+            yield
+        finally:
+            if has_one:
+                self._spare.release()
 
     # What follows runs on the thread that writes, and on no other.
 

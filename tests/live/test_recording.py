@@ -586,6 +586,7 @@ def test_a_processor_is_left_to_who_brings_messages(
 
         monkeypatch.setattr(of, name, watched)
 
+    monkeypatch.setattr(segment_writer, "_TURN_S", 30)
     slowly(segment_writer, "pack")
     slowly(ChunkIndexer, "documents_of")
     slowly(FieldGatherer, "add")

@@ -277,6 +277,7 @@ def test_no_more_threads_pack_than_may_but_in_a_hurry(
         return "", bytes(data)
 
     monkeypatch.setattr(Compressor, "compress", compress)
+    monkeypatch.setattr(segment_writer, "_TURN_S", 30)
     writer = RecordingWriter(
         tmp_path,
         RECORDING,
@@ -292,6 +293,25 @@ def test_no_more_threads_pack_than_may_but_in_a_hurry(
     (path,) = writer.close()
     assert [data for _, _, data in messages_in(path)] == payloads
     assert met == ([] if is_alone else [hurried] * 4)
+
+
+def test_packing_does_not_wait_for_who_keeps_all_processors(tmp_path: Path) -> None:
+    spare = threading.BoundedSemaphore(1)
+    with spare:  # as the index does, of which nobody knows how long it takes
+        writer = RecordingWriter(
+            tmp_path,
+            RECORDING,
+            lambda *_: None,
+            SegmentSettings(chunk_size=1 << 10),
+            spare=spare,
+            on_written=lambda: None,
+        )
+        for n in range(4):
+            writer.place_one(CHANNELS[0], bytes([n]) * 1024, n, n, n)()
+        (path,) = writer.close()
+    assert [data[0] for _, _, data in messages_in(path)] == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="released too many"):
+        spare.release()  # it was given back as often as it was taken
 
 
 def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
