@@ -41,7 +41,7 @@ PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
 """Closed chunks that may be on their way to the file without anything being late."""
-_TURN_S = 0.1
+_TURN_S = 0.1  # that a chunk waits for its turn to be packed, at most
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
