@@ -171,7 +171,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
 INTERRUPTED = """
 import signal, sys
 import hybridlog as hl
-from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 sizes = [10, 140_000, 10, 100, 3000]
@@ -621,7 +621,7 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.Monke
 KILLED = """
 import sys, time
 import hybridlog as hl
-from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
 with hl.open(sys.argv[1], create=True) as store:
