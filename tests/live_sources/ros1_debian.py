@@ -1,12 +1,13 @@
 """ROS 1 as Debian packs it: rosmaster, rospy, rosbag's recorder and player.
 
-Installed ones are used. Where there are none, the packages are fetched once into the cache
-and unpacked there, which needs apt but neither root nor an installation.
+Installed ones are used. Where they are not all there, the packages are fetched once into
+the cache and unpacked there, which needs apt but neither root nor an installation.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import textwrap
@@ -24,7 +25,8 @@ PACKAGES = (
     "python3-rosbag",
 )
 _SYSTEM = Path("/")
-_STATUS = "/var/lib/dpkg/status"
+_STATUS = Path("/var/lib/dpkg/status")
+_OF_ROS = re.compile("^Source: ros-", re.MULTILINE)
 _TIMEOUT_S = 200
 
 
@@ -117,6 +119,12 @@ def _failure(found: Ros1) -> str:
     return ""
 
 
+def _without_ros(status: str) -> str:
+    """What dpkg says of a system, as if that had nothing of ROS: a tree has all or nothing."""
+    packages = status.split("\n\n")
+    return "\n\n".join(package for package in packages if not _OF_ROS.search(package))
+
+
 def _fetch(place: Path) -> None:
     """Fetches the packages and all that they need, and unpacks them.
 
@@ -125,12 +133,14 @@ def _fetch(place: Path) -> None:
     """
     for folder in ("state/lists/partial", "cache/archives/partial", "tree"):
         (place / folder).mkdir(parents=True)
+    status = place / "state" / "status"
+    status.write_text(_without_ros(_STATUS.read_text()))
     settings = place / "apt.conf"
     settings.write_text(
         textwrap.dedent(
             f"""\
             Dir::State "{place}/state";
-            Dir::State::status "{_STATUS}";
+            Dir::State::status "{status}";
             Dir::Cache "{place}/cache";
             Debug::NoLocking "true";
             APT::Install-Recommends "false";
