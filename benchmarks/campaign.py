@@ -44,8 +44,12 @@ PARTS = {
         "benchmarks.studies.throughput", ("sizes", "rates", "messages", "topics", "repetitions")
     ),
     "ceilings": _Part("benchmarks.studies.ceiling", ("sizes", "topics", "seconds", "repetitions")),
-    "persistence": _Part("benchmarks.studies.persistence", ("logs", "made", "repetitions")),
-    "speed-up": _Part("benchmarks.studies.speed_up", ("logs", "made", "repetitions")),
+    "persistence": _Part(
+        "benchmarks.studies.persistence", ("logs", "made", "log_seconds", "repetitions")
+    ),
+    "speed-up": _Part(
+        "benchmarks.studies.speed_up", ("logs", "made", "log_seconds", "repetitions")
+    ),
     "queries": _Part("benchmarks.studies.queries", ("repetitions",)),
     "reading": _Part("benchmarks.studies.reading", ("repetitions",)),
 }
@@ -71,6 +75,7 @@ class Choices:
         seconds: Of a trial that looks for a ceiling.
         logs: Files to publish instead of the real logs beside the checkout.
         made: Whether to publish the logs that are made, too.
+        log_seconds: Most of each log that is published.
         speed: Times as fast as the logs were recorded.
         repetitions: Of every run.
         seed: Of all loads.
@@ -91,6 +96,7 @@ class Choices:
     seconds: float | None = None
     logs: Sequence[Path] = ()
     made: bool = True
+    log_seconds: float | None = None
     speed: float = 1.0
     repetitions: int | None = None
     seed: int = 1
@@ -227,6 +233,7 @@ def _plan(name: str, choices: Choices) -> _Planned:
         "seconds": choices.seconds,
         "logs": _existing(choices.logs),
         "made": None if choices.made else (),
+        "log_seconds": choices.log_seconds,
         "repetitions": choices.repetitions,
     }
     changed = {option: asked[option] for option in part.options if asked[option] is not None}

@@ -30,7 +30,7 @@ app = typer.Typer(
     name="benchmarks",
     help=(
         "Measure what databases, files and hybridlog keep of a robot's messages.\n\n"
-        "Three studies: what is kept of uniform streams, what is kept of whole logs, and how "
+        "Three studies: what is kept of uniform streams, what is kept of logs, and how "
         "fast questions are answered. Results go into a directory; a study that was stopped "
         "goes on when the same command is given again. Try `all --quick` first."
     ),
@@ -147,6 +147,15 @@ MadeOption = Annotated[
     bool,
     typer.Option("--made/--no-made", help="Publish the logs that are made like the paper's, too."),
 ]
+LogSecondsOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Most of each log that is published, from its beginning; without, 60, and 20 where "
+        "it is played faster.",
+        metavar="S",
+        min=0.1,
+    ),
+]
 CeilingsOption = Annotated[
     bool, typer.Option("--ceilings/--no-ceilings", help="Look for each backend's ceiling, too.")
 ]
@@ -226,6 +235,7 @@ def persistence(
     out: OutOption = Path("benchmark-results"),
     logs: LogsOption = None,
     made: MadeOption = True,
+    log_seconds: LogSecondsOption = None,
     speed: SpeedOption = 1.0,
     speed_up: SpeedUpOption = True,
     repetitions: RepetitionsOption = None,
@@ -235,7 +245,7 @@ def persistence(
     report: ReportOption = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Study 2: what is kept of whole logs.
+    """Study 2: what is kept of logs.
 
     Published as they were recorded, then faster until something is dropped: made ones like
     the paper's, and the real ones that lie beside the checkout, or those of --logs instead.
@@ -251,6 +261,7 @@ def persistence(
             backends=backends,
             logs=logs or (),
             made=made,
+            log_seconds=log_seconds,
             speed=speed,
             repetitions=repetitions,
             seed=seed,
@@ -322,6 +333,7 @@ def everything(
     seconds: SecondsOption = None,
     logs: LogsOption = None,
     made: MadeOption = True,
+    log_seconds: LogSecondsOption = None,
     speed: SpeedOption = 1.0,
     repetitions: RepetitionsOption = None,
     seed: SeedOption = 1,
@@ -354,6 +366,7 @@ def everything(
             seconds=seconds,
             logs=logs or (),
             made=made,
+            log_seconds=log_seconds,
             speed=speed,
             repetitions=repetitions,
             seed=seed,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Any, TypeVar
 
 from benchmarks.disturbance import is_disturbed
@@ -29,6 +30,7 @@ class Book:
     def __init__(self, journal: Journal) -> None:
         self.all = list(journal.samples.values())
         self._runs = journal.runs
+        self._headers = journal.headers
 
     def good(self, study: str) -> list[Sample]:
         """Samples of a study that went well."""
@@ -37,6 +39,16 @@ class Book:
     def bad(self, status: str) -> list[Sample]:
         """Samples that are `missing` or `failed`, of all studies."""
         return [one for one in self.all if one.status == status]
+
+    def settings(self, sample: Sample) -> Mapping[str, Any]:
+        """Those of the study of a sample, in the run in which it was taken."""
+        return _settings(self._headers[self._runs[sample.key]], sample.study)
+
+    def planned(self, study: str, name: str) -> set[Any]:
+        """All that the runs of a study were to measure of one setting, which is a list."""
+        found = (_settings(header, study).get(name) for header in self._headers)
+        lists = [values for values in found if isinstance(values, list)]
+        return {one for one in chain.from_iterable(lists) if isinstance(one, int | float | str)}
 
     def in_same_runs(
         self, one: Sequence[Sample], other: Sequence[Sample]
@@ -47,6 +59,12 @@ class Book:
             return None
         mine, theirs = ([s for s in of if self._runs[s.key] in runs] for of in (one, other))
         return mine, theirs
+
+
+def _settings(header: Mapping[str, Any], study: str) -> Mapping[str, Any]:
+    of_all = header.get("settings")
+    found = of_all.get(study) if isinstance(of_all, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:

@@ -19,9 +19,12 @@ if TYPE_CHECKING:
 
 _NOTE = (
     "≥: the ceiling is above; the harness could offer no more (harness), or no higher rate was "
-    "planned (plan), in one of the searches at least. none: something was dropped at every rate "
-    "that was tried."
+    "planned (plan), or the search was stopped before its end (stopped), in one of the searches "
+    "at least. none: something was dropped at every rate that was tried."
 )
+
+_LIMITS = ("stopped", "harness", "plan", "backend")
+"""What may end a search: that which says least of the backend comes first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +54,8 @@ class _Found:
     @property
     def limit(self) -> str:
         """What ended the searches; `backend` only if it ended all of them."""
-        others = [one.limit for one in self.searches if one.limit != "backend"]
-        return others[0] if others else "backend"
+        found = {one.limit for one in self.searches}
+        return next(limit for limit in _LIMITS if limit in found)
 
     def of(self, measure: Callable[[Ceiling], float]) -> Value:
         """One measure of the searches."""
@@ -66,7 +69,7 @@ _Text = Callable[[_Found], str | None]
 
 def section(book: Book) -> Section | None:
     """Ceilings in MB/s and messages/s, and ours over the best database's."""
-    ceilings = _ceilings(book.all)
+    ceilings = _ceilings(book, book.all)
     if not ceilings:
         return None
     text = (
@@ -96,7 +99,7 @@ def section(book: Book) -> Section | None:
 
 def findings(book: Book) -> list[str]:
     """Our ceiling against the best database's, at every size."""
-    ceilings = _ceilings(book.all)
+    ceilings = _ceilings(book, book.all)
     found = []
     for bytes_ in sorted({one.size for one in ceilings}):
         of_size = [one for one in ceilings if one.size == bytes_]
@@ -137,13 +140,13 @@ def _in_same_runs(book: Book, ours: _Found, best: _Found) -> tuple[Value, Value]
     both = book.in_same_runs(*groups)
     if both is None or list(map(len, both)) == list(map(len, groups)):
         return None
-    pair = _pair(_ceilings(chain(*both)))
+    pair = _pair(_ceilings(book, chain(*both)))
     return None if pair is None else (pair[0].offered, pair[1].offered)
 
 
-def _ceilings(samples: Iterable[Sample]) -> list[_Found]:
+def _ceilings(book: Book, samples: Iterable[Sample]) -> list[_Found]:
     searches: dict[tuple[str, int], list[Ceiling]] = {}
-    for one in found_in(samples):
+    for one in found_in(samples, book.settings):
         searches.setdefault((one.backend, one.size), []).append(one)
     return [_Found(backend, bytes_, of) for (backend, bytes_), of in searches.items()]
 
@@ -214,7 +217,7 @@ def _megabytes(one: _Found) -> str:
 
 def _bound(one: _Found, value: Value) -> str:
     if one.is_none:
-        return "none"
+        return "none so far (stopped)" if one.limit == "stopped" else "none"
     return with_spread(value) if one.limit == "backend" else f"≥ {with_spread(value)} ({one.limit})"
 
 

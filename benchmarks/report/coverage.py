@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 from benchmarks.backends.registry import BACKENDS
@@ -20,12 +21,15 @@ class _Study(NamedTuple):
     Attributes:
         title: For people.
         axes: Of a case; others, such as the rate of a search, are its own affair.
+        settings: Lists among those of a run that say which values of the axes it was to
+            measure; real logs, which are paths there, do not count.
         cases: What it calls them.
         backends: All that can take part.
     """
 
     title: str
     axes: tuple[str, ...]
+    settings: tuple[str, ...]
     cases: str
     backends: Sequence[str]
 
@@ -35,12 +39,14 @@ def _rows(of: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 
 STUDIES = {
-    "throughput": _Study("throughput", ("size", "rate"), "streams", list(BACKENDS)),
-    "ceiling": _Study("ceilings", ("size",), "sizes", list(BACKENDS)),
-    "persistence": _Study("whole logs", ("log",), "logs", list(BACKENDS)),
-    "speed-up": _Study("whole logs, faster", ("log",), "logs", list(BACKENDS)),
-    "queries": _Study("questions", ("question",), "questions", _rows(ASKERS)),
-    "reading": _Study("reading back", ("task",), "tasks", _rows(READERS)),
+    "throughput": _Study(
+        "throughput", ("size", "rate"), ("sizes", "rates"), "streams", list(BACKENDS)
+    ),
+    "ceiling": _Study("ceilings", ("size",), ("sizes",), "sizes", list(BACKENDS)),
+    "persistence": _Study("logs", ("log",), ("made",), "logs", list(BACKENDS)),
+    "speed-up": _Study("logs, faster", ("log",), ("made",), "logs", list(BACKENDS)),
+    "queries": _Study("questions", ("question",), (), "questions", _rows(ASKERS)),
+    "reading": _Study("reading back", ("task",), (), "tasks", _rows(READERS)),
 }
 """By the names that samples have for them."""
 
@@ -57,15 +63,21 @@ def table(book: Book) -> Table | None:
     rows = tuple(
         (study.title, text)
         for name, study in STUDIES.items()
-        if (text := _lacks(study, book.good(name)))
+        if (text := _lacks(study, book.good(name), _planned(study, book, name)))
     )
     return Table("What was not measured", ("study", "without"), rows) if rows else None
 
 
-def _lacks(study: _Study, good: Sequence[Sample]) -> str:
+def _planned(study: _Study, book: Book, name: str) -> set[tuple[object, ...]]:
+    """What the runs of a study were to measure, as far as they list it."""
+    lists = [book.planned(name, setting) for setting in study.settings]
+    return set(product(*lists)) if lists else set()
+
+
+def _lacks(study: _Study, good: Sequence[Sample], planned: set[tuple[object, ...]]) -> str:
     if not good:
         return "all of it"
-    whole, of = len(by_case(good, *study.axes)), by_backend(good)
+    whole, of = len(planned | by_case(good, *study.axes).keys()), by_backend(good)
     absent, parts = [], []
     for name in study.backends:
         done = len(by_case(of.get(name, ()), *study.axes))

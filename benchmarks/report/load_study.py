@@ -1,8 +1,9 @@
-"""Study 2 in a report: what is kept of whole logs, in real time (Figure 5) and faster."""
+"""Study 2 in a report: what is kept of logs, in real time (Figure 5) and faster."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from benchmarks.report.book import (
     Book,
@@ -23,7 +24,7 @@ from benchmarks.report.look import OURS, databases, title
 from benchmarks.report.model import Cell, Graph, Line, Panel, Section, Table, Value
 from benchmarks.report.numbers import listed, number
 from benchmarks.samples import DAMAGE, Sample
-from benchmarks.studies.search import Verdict, bracket, verdict
+from benchmarks.studies.search import Verdict, bracket, is_over, verdict
 
 STUDY = "persistence"
 FASTER = "speed-up"
@@ -43,9 +44,9 @@ def section(book: Book) -> Section | None:
     if not samples:
         return None
     text = (
-        "Whole logs, published at the pace at which they were recorded, each topic with its own "
-        "thread and its own queue of ten. Persisted is what the backend, closed and opened again, "
-        "counts, over what was published.",
+        f"Logs with all their topics{_beginning(samples)}, published at the pace at "
+        "which they were recorded, each topic with its own thread and its own queue of ten. "
+        "Persisted is what the backend, closed and opened again, counts, over what was published.",
         "`mit1`, `mit2`, `hcr1`, `hcr2` are made after what is published about the robots of the "
         "paper, whose recordings cannot be had here; the second of each pair is busier. All others "
         "are real logs.",
@@ -53,7 +54,7 @@ def section(book: Book) -> Section | None:
     tables = (_persisted(samples), _loads(samples))
     return Section(
         "persistence",
-        "Study 2: what is kept of whole logs",
+        "Study 2: what is kept of logs",
         text,
         tuple(_figure_5(samples)),
         tables,
@@ -74,13 +75,14 @@ def speed_up(book: Book) -> Section | None:
     rows: list[tuple[Cell, ...]] = []
     for name, group in by_backend(samples).items():
         of = by_case(group, LOG)
-        rows.append((title(name), *(_bound(of[key]) if key in of else None for key in logs)))
+        rows.append((title(name), *(_bound(book, of[key]) if key in of else None for key in logs)))
     table = Table(
         "Greatest speed at which everything was kept, times real time",
         ("backend", *(log for (log,) in logs)),
         tuple(rows),
-        "Median (least…greatest) of the searches. “or more”: no higher speed was planned, or "
-        "(harness) it could not be published faster.",
+        "Median (least…greatest) of the searches. “or more”: no higher speed was planned, "
+        "(harness) it could not be published faster, or (stopped) the search had not come to its "
+        "end.",
         title(OURS),
     )
     return Section("speed-up", "Faster than real time", text, (), (table,))
@@ -91,9 +93,12 @@ def _trials(book: Book) -> list[Sample]:
     return [one for one in book.all if one.study == FASTER and one.status != "missing"]
 
 
-def _bound(samples: Sequence[Sample]) -> str:
+def _bound(book: Book, samples: Sequence[Sample]) -> str:
     """The greatest speed at which one backend kept all of one log: median and spread."""
-    searches = [_greatest(of) for of in grouped(samples, lambda one: one.repetition).values()]
+    searches = [
+        _greatest(of, book.settings(of[-1]))
+        for of in grouped(samples, lambda one: one.repetition).values()
+    ]
     found = Value.of(speed for speed, _ in searches)
     if found is None:
         return "none tried"
@@ -104,16 +109,31 @@ def _bound(samples: Sequence[Sample]) -> str:
     if found.low != found.high:
         text += f" ({number(found.low)}…{number(found.high)})"
     ends = {end for _, end in searches}
+    if "stopped" in ends:
+        return f"{text} or more (stopped)"
     if "late" in ends:
         return f"{text} or more (harness)"
     return f"{text} or more" if "kept" in ends else text
 
 
-def _greatest(trials: Sequence[Sample]) -> tuple[float, Verdict]:
-    """The greatest speed below all that were not kept, 0 for none, and what ended it."""
+def _greatest(
+    trials: Sequence[Sample], settings: Mapping[str, Any]
+) -> tuple[float, Verdict | Literal["stopped"]]:
+    """The greatest speed below all that were not kept, 0 for none, and what ended the search."""
     verdicts = {float(trial.case[SPEED]): verdict(trial) for trial in trials}
     greatest, lost = bracket({speed: found == "kept" for speed, found in verdicts.items()})
+    if not is_over(verdicts, settings):
+        return greatest or 0.0, "stopped"
     return greatest or 0.0, "kept" if lost is None else verdicts[lost]
+
+
+def _beginning(samples: Sequence[Sample]) -> str:
+    """How much of each log was published, if its samples say so."""
+    seconds = {str(one.case["seconds"]) for one in samples if "seconds" in one.case}
+    if not seconds:
+        return ""
+    most = listed(sorted(seconds))
+    return f", the first {most} s of each if it is longer"
 
 
 def findings(book: Book) -> list[str]:
@@ -142,7 +162,7 @@ def findings(book: Book) -> list[str]:
         if damage:
             found.append(f"Of {log} only what can be read was published: {damage}.")
     for (log,), group in _logs(_trials(book)).items():
-        bounds = [f"{title(name)} {_bound(of)}" for name, of in by_backend(group).items()]
+        bounds = [f"{title(name)} {_bound(book, of)}" for name, of in by_backend(group).items()]
         if bounds:
             found.append(f"Played faster, {log} was kept whole at: {listed(bounds)}.")
     return found

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from benchmarks.samples import Sample
 from benchmarks.studies.runs import Context, chosen, overhead_s
@@ -16,6 +16,7 @@ from benchmarks.studies.search import (
     Search,
     Trial,
     bracket,
+    is_over,
     next_trial,
     take_turns,
     verdict,
@@ -25,6 +26,8 @@ from benchmarks.studies.throughput import QUICK_SIZES, SIZES, make_stream, short
 STUDY = "ceiling"
 HARNESS = "nothing"
 """The backend that shows what the harness itself can carry."""
+
+Limit = Literal["backend", "harness", "plan", "stopped"]
 
 _RATE = "rate"
 
@@ -85,7 +88,8 @@ class Ceiling:
             was offered when the backend still had work after the last message.
         lost_rate: Smallest rate above at which something was lost; None when none was tried.
         limit: What ended the search: the `backend` lost messages, the `harness` could
-            offer no more (so the true ceiling is above), or the `plan` had no higher rate.
+            offer no more (so the true ceiling is above), the `plan` had no higher rate, or
+            it was `stopped`, and may go on.
     """
 
     backend: str
@@ -95,13 +99,20 @@ class Ceiling:
     offered_bytes_s: float
     stored_bytes_s: float
     lost_rate: float | None
-    limit: Literal["backend", "harness", "plan"]
+    limit: Limit
 
 
-def ceilings(samples: Iterable[Sample]) -> list[Ceiling]:
+def ceilings(
+    samples: Iterable[Sample], settings: Callable[[Sample], Mapping[str, Any]] = lambda _: {}
+) -> list[Ceiling]:
     """What the samples of this study show, for each backend, size and search in their order.
 
     Backends that are missing have none.
+
+    Args:
+        samples: Of any study.
+        settings: Those of this study in the run of a sample; without, no search is taken for
+            one that was stopped.
     """
     trials: dict[tuple[str, int, int], list[Sample]] = {}
     harness: dict[int, list[Sample]] = {}
@@ -113,19 +124,22 @@ def ceilings(samples: Iterable[Sample]) -> list[Ceiling]:
         if sample.backend == HARNESS:
             harness.setdefault(size, []).append(sample)
     return [
-        _ceiling(backend, size, repetition, group, harness.get(size, []))
-        for (backend, size, repetition), group in trials.items()
+        _ceiling(group, harness.get(size, []), settings(group[-1]))
+        for (_, size, _), group in trials.items()
     ]
 
 
 def _ceiling(
-    backend: str, size: int, repetition: int, trials: Sequence[Sample], harness: Sequence[Sample]
+    trials: Sequence[Sample], harness: Sequence[Sample], settings: Mapping[str, Any]
 ) -> Ceiling:
+    backend, size, repetition = trials[0].backend, trials[0].case["size"], trials[0].repetition
     by_rate = {float(trial.case[_RATE]): trial for trial in trials}
     verdicts = {rate: verdict(trial) for rate, trial in by_rate.items()}
     rate, lost_rate = bracket({rate: found == "kept" for rate, found in verdicts.items()})
-    limit: Literal["backend", "harness", "plan"] = "backend"
-    if lost_rate is None:
+    limit: Limit = "backend"
+    if not is_over(verdicts, settings):
+        limit = "stopped"
+    elif lost_rate is None:
         limit = "plan"
     elif verdicts[lost_rate] == "late" or (
         _has_queues(backend)

@@ -1,4 +1,4 @@
-"""Study 2: what is kept of whole logs, published as they were recorded; Figure 5."""
+"""Study 2: what is kept of logs, published as they were recorded; Figure 5."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Settings(LogSettings):
         repetitions: Of each log with each backend.
     """
 
-    seconds: float = 60.0
+    log_seconds: float = 60.0
     repetitions: int = 3
 
     @classmethod
     def usual(cls, *, quick: bool) -> Settings:
         """Those of a full or of a quick run: the beginning of each log that is made, once."""
-        return cls(seconds=QUICK_SECONDS, chosen=False, repetitions=1) if quick else cls()
+        return cls(log_seconds=QUICK_SECONDS, chosen=False, repetitions=1) if quick else cls()
 
 
 def plan(context: Context, settings: Settings | None = None) -> list[Case]:

@@ -1,4 +1,4 @@
-"""The whole logs that are published: four that are made, and real ones."""
+"""The logs that are published: four that are made, and real ones."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class LogSettings:
     """Which logs a study publishes, and to whom.
 
     Attributes:
-        seconds: Most of each log that is published, in its own time.
+        log_seconds: Most of each log that is published, in its own time.
         made: Names of the logs that are made.
         logs: Real logs, files and directories.
         chosen: Where `logs` is empty, some of those that lie beside the checkout, if there
@@ -107,7 +107,7 @@ class LogSettings:
         backends: Names of those that take part; None for all.
     """
 
-    seconds: float
+    log_seconds: float
     made: Sequence[str] = MADE
     logs: Sequence[Path] = ()
     chosen: bool = True
@@ -121,7 +121,7 @@ class LogSettings:
             ValueError: A name in `made` is not known, or `seconds` is not above 0.
         """
         logs = self.logs or (chosen_logs() if self.chosen else ())
-        return replays(seed, self.seconds, logs, self.made)
+        return replays(seed, self.log_seconds, logs, self.made)
 
 
 def chosen_logs() -> list[Path]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from benchmarks.samples import Sample
 
@@ -124,6 +124,27 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     first_gap = bounds.start * 2.0 ** math.floor(math.log2(best / bounds.start) + 1e-9)
     is_wide = lost - best > first_gap / 2**bounds.halvings * 1.001
     return (best + lost) / 2 if is_wide else None
+
+
+def is_over(verdicts: Mapping[float, Verdict], settings: Mapping[str, Any]) -> bool:
+    """Whether a search came to its end, and was not stopped before.
+
+    Args:
+        verdicts: Of the rates that were tried.
+        settings: Of the study, as its journal has them; where they do not say where it
+            looks, it is taken for over.
+    """
+    start, lowest, highest = (_above_0(settings, name) for name in ("start", "lowest", "highest"))
+    halvings = settings.get("halvings")
+    if start is None or lowest is None or highest is None or not isinstance(halvings, int):
+        return True
+    kept = {rate: found == "kept" for rate, found in verdicts.items()}
+    return next_rate(kept, Bounds(start, lowest, highest, halvings)) is None
+
+
+def _above_0(settings: Mapping[str, Any], name: str) -> float | None:
+    found = settings.get(name)
+    return float(found) if isinstance(found, int | float) and found > 0 else None
 
 
 def next_trial(context: Context, search: Search, failed: Collection[str] = ()) -> Trial | None:

@@ -30,7 +30,7 @@ class Settings(LogSettings):
         repetitions: Of each search.
     """
 
-    seconds: float = 20.0
+    log_seconds: float = 20.0
     start: float = 1.0
     lowest: float = 1.0
     highest: float = 256.0
@@ -51,7 +51,7 @@ class Settings(LogSettings):
         if not quick:
             return cls()
         return cls(
-            seconds=QUICK_SECONDS,
+            log_seconds=QUICK_SECONDS,
             made=MADE[:1],
             chosen=False,
             start=4.0,

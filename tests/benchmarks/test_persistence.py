@@ -83,7 +83,7 @@ def real(directory: Path, **more: Any) -> Context:
     return Context(directory, backends, Journal(directory), Quiet(), **more)
 
 
-FEW = persistence.Settings(seconds=5, made=("hcr1", "mit1"), chosen=False, repetitions=2)
+FEW = persistence.Settings(log_seconds=5, made=("hcr1", "mit1"), chosen=False, repetitions=2)
 
 
 def test_the_order_of_runs(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_another_speed_is_another_case(tmp_path: Path) -> None:
 
 def test_settings_of_a_quick_run(tmp_path: Path) -> None:
     full, quick = (persistence.Settings.usual(quick=quick) for quick in (False, True))
-    assert (full.seconds, full.repetitions) == (60, 3)
-    assert (quick.seconds, quick.repetitions) == (5, 1)
+    assert (full.log_seconds, full.repetitions) == (60, 3)
+    assert (quick.log_seconds, quick.repetitions) == (5, 1)
     assert _plain(full)["made"] == list(MADE)
     assert _plain(replace(full, logs=[tmp_path]))["logs"] == [str(tmp_path)]
     context = model(tmp_path, quick=True)
@@ -142,7 +142,7 @@ def test_unknown_names(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'oracle'"):
         persistence.plan(context, replace(FEW, backends=["oracle"]))
     with pytest.raises(ValueError, match="more than 0"):
-        persistence.plan(context, replace(FEW, seconds=0))
+        persistence.plan(context, replace(FEW, log_seconds=0))
     with pytest.raises(UsageError, match="--logs"):
         persistence.plan(context, replace(FEW, made=()))
     with pytest.raises(SourceError, match="no such file"):
@@ -226,7 +226,7 @@ def test_chosen_logs_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 
 # --- the search for the speed ---
 
-ONE = speed_up.Settings(seconds=5, made=("hcr1",), chosen=False, repetitions=1)
+ONE = speed_up.Settings(log_seconds=5, made=("hcr1",), chosen=False, repetitions=1)
 
 
 def speeds(context: Model, backend: str) -> list[float]:
@@ -309,7 +309,7 @@ def test_searches_of_two_logs_are_apart(tmp_path: Path) -> None:
 
 def test_a_log_through_the_harness(tmp_path: Path) -> None:
     context = real(tmp_path)
-    settings_ = persistence.Settings(seconds=1, made=("hcr1",), chosen=False, repetitions=1)
+    settings_ = persistence.Settings(log_seconds=1, made=("hcr1",), chosen=False, repetitions=1)
     persistence.run(context, settings_)
     samples = list(context.journal.samples.values())
     assert [(one.backend, one.status) for one in samples] == [("nothing", "ok"), ("mcap", "ok")]

@@ -128,7 +128,7 @@ def test_what_was_not_measured_is_told(tmp_path: Path) -> None:
         )
     )
     rows = {str(row[0]): str(row[1]) for row in table(found, "What was not measured").rows}
-    absent = {"ceilings", "whole logs", "whole logs, faster", "reading back"}
+    absent = {"ceilings", "logs", "logs, faster", "reading back"}
     assert rows.keys() == {"throughput", *absent}
     assert rows["ceilings"] == rows["reading back"] == "all of it"
     assert rows["throughput"].startswith("harness alone, ROS bag, MongoDB (1 of 2 streams were)")
@@ -297,6 +297,43 @@ def test_ceilings_are_those_of_the_search(tmp_path: Path) -> None:
     }
     assert {row[0]: row[1] for row in table(found, "messages/s").rows}["hybridlog"] == "5,120"
     assert table(found, "over the best database's").rows[0] == ("ratio", "4")
+
+
+BOUNDS = {"start": 64.0, "lowest": 1.0, "highest": 16384.0, "halvings": 0}
+
+
+def test_a_search_that_was_stopped_is_no_ceiling(tmp_path: Path) -> None:
+    found = report(
+        journal(
+            tmp_path,
+            ceiling_trial("hybridlog", 64, 1.0),
+            ceiling_trial("mongo_json", 64, 0.9),
+            *(ceiling_trial("sqlite_udf", rate, 1.0 if rate < 256 else 0.9) for rate in (64, 256)),
+            ceiling_trial("sqlite_udf", 128, 1.0),
+            settings={"ceiling": {**BOUNDS, "sizes": [5000, 640_000]}},
+        )
+    )
+    assert {row[0]: row[1] for row in table(found, "Ceiling: offered load").rows} == {
+        "hybridlog": "≥ 6.4 (stopped)",
+        "MongoDB": "none so far (stopped)",
+        "SQLite (Python functions)": "12.8",
+    }
+    missing = {str(row[0]): str(row[1]) for row in table(found, "What was not measured").rows}
+    assert "hybridlog (1 of 2 sizes were)" in missing["ceilings"]
+
+
+def test_a_stopped_search_for_a_speed_is_told(tmp_path: Path) -> None:
+    trial = Sample(
+        "speed-up", {"log": "hcr1", "seconds": 20, "speed": 4}, "mcap", 0, "ok", run_values()
+    )
+    bounds = {**BOUNDS, "start": 1.0, "highest": 256.0}
+    found = report(journal(tmp_path, trial, settings={"speed-up": bounds}))
+    assert table(found, "Greatest speed").rows[0][1] == "4x or more (stopped)"
+
+
+def test_how_much_of_a_log_was_published_is_told(tmp_path: Path) -> None:
+    one = replace(whole_log("mit1", "mcap", 1.0), case={"log": "mit1", "seconds": 60})
+    assert "the first 60 s of each if it is longer" in all_text(report(journal(tmp_path, one)))
 
 
 def test_speeds_of_several_searches_have_a_spread(tmp_path: Path) -> None:
