@@ -33,7 +33,7 @@ from hybridlog.processors import processors
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.messages import Channel, LooseBatch
+from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 
@@ -163,6 +163,8 @@ class LiveRecording:
         # No event: who is interrupted while setting one may leave it locked for ever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._ended = False
+        self._closing = threading.RLock()
+        self._is_closing = False
         self._hurry = _Strain(_HURRY)
         self._behind = _Strain(_BEHIND)
         self._failure: BaseException | None = None
@@ -209,8 +211,10 @@ class LiveRecording:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close it."""
-        self.close()
+        """Close it, unless that was tried already."""
+        with self._closing:
+            if not self._is_closing:
+                self.close()
 
     def expect(self, *channels: Channel) -> None:
         """Prepare for channels before their first message.
@@ -219,12 +223,13 @@ class LiveRecording:
         each, which are better spent while nothing comes yet.
 
         Raises:
-            UsageError: The recording was closed.
+            UsageError: A channel cannot be stored, or the recording was closed.
             DiskFullError: As `write` does.
         """
         with self._lock:
             self._check()
             for channel in channels:
+                _check_channel(channel)
                 self._capture.index.prepare(channel)
 
     def write(
@@ -255,13 +260,13 @@ class LiveRecording:
             Whether it was taken.
 
         Raises:
-            UsageError: The payload is not bytes, a number is not whole or out of its range,
-                or the recording was closed.
+            UsageError: The payload is not bytes, the channel cannot be stored, a number is not
+                whole or out of its range, or the recording was closed.
             DiskFullError: No space; what was flushed before stays.
         """
         # Found out later, it would end the recording of everything else.
         if type(payload) is not bytes:
-            _check_payload(payload)
+            payload = _held_fast(payload)
         try:
             now = time.time_ns() if log_time is None else index_of(log_time)
             sent = now if publish_time is None else index_of(publish_time)
@@ -285,10 +290,9 @@ class LiveRecording:
                 self._room.wait()
             self._room.notify()  # there may be room for another
             self._check()
-            index = self._ids.get(channel)
+            index = self._ids.get(channel) if isinstance(channel, Channel) else None
             if index is None:
-                if not isinstance(channel, Channel):
-                    raise UsageError(f"{channel!r} is no Channel")
+                _check_channel(channel)
                 index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
                 self._taken.append(0)
@@ -335,14 +339,32 @@ class LiveRecording:
     def close(self) -> RecordReport:
         """Write, index and seal everything; tells how the recording went.
 
-        On a full disk what was flushed is sealed, and the rest is in the ledger.
+        On a full disk what was flushed is sealed, and the rest is in the ledger. Thread safe;
+        who closes it once more gets the same report.
 
         Raises:
             DiskFullError: There is no room even for that; what was flushed before stays, and
                 the next opening of the store seals it.
+            UsageError: To close it has failed before, or the same thread does it already, as
+                where a signal is handled meanwhile.
         """
-        if self._report is not None:
+        with self._closing:
+            if self._report is None:
+                self._end()
+                self._report = self._close_once()
+                self._on_close(self._report)
             return self._report
+
+    def _end(self) -> None:
+        """Begin to close or to abort, by who holds `_closing`; that is done once."""
+        if self._is_closing:
+            raise UsageError(
+                f"The recording {self.id!r} is being closed, or that was broken off; the next "
+                "opening of the store seals what was flushed."
+            )
+        self._is_closing = True
+
+    def _close_once(self) -> RecordReport:
         self._stop()
         with self._held:
             try:
@@ -357,7 +379,7 @@ class LiveRecording:
                 self._capture.leave()
                 raise
         index = self._capture.index
-        self._report = RecordReport(
+        return RecordReport(
             self._capture.entry,
             [],
             index.indexed,
@@ -366,8 +388,6 @@ class LiveRecording:
             0,
             time.monotonic() - self._started,
         )
-        self._on_close(self._report)
-        return self._report
 
     def _close_whole(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Write everything; on a disk that is full only now, what there is room for."""
@@ -394,10 +414,16 @@ class LiveRecording:
         return self.ledger.take(everything=True)
 
     def abort(self) -> None:
-        """Take the whole recording back."""
-        self._stop()
-        with self._held:
-            self._capture.forget()
+        """Take the whole recording back.
+
+        Raises:
+            UsageError: It was closed, or is being closed.
+        """
+        with self._closing:
+            self._end()
+            self._stop()
+            with self._held:
+                self._capture.forget()
 
     def _closed_beyond(self) -> int:
         """Bytes in closed chunks beyond those at work."""
@@ -560,15 +586,42 @@ def _spare_processors() -> int:
     return min(PACKERS + 1, max(processors() - 1, 1))
 
 
-def _check_payload(payload: object) -> None:
-    """Whether something that is not `bytes` can be laid down as if it were."""
+def _held_fast(payload: object) -> memoryview:
+    """What is no plain `bytes`, so that it cannot be resized or released until it is laid down."""
     if isinstance(payload, memoryview):
         is_flat = payload.c_contiguous and payload.ndim == 1 and payload.format == "B"
     else:
         is_flat = isinstance(payload, bytes | bytearray)
-    if not is_flat:
+    if not isinstance(payload, bytes | bytearray | memoryview) or not is_flat:
         kind = type(payload).__name__
         raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
+    return memoryview(payload)
+
+
+def _check_channel(channel: object) -> None:
+    """Refuse what no segment could hold."""
+    if not isinstance(channel, Channel):
+        raise UsageError(f"{channel!r} is no Channel")
+    schema = channel.schema
+    if not (schema is None or isinstance(schema, Schema)):
+        raise UsageError(f"the schema of the channel {channel.topic!r} is no Schema")
+    if schema is not None and not isinstance(schema.data, bytes):
+        kind = type(schema.data).__name__
+        raise UsageError(f"the schema of the channel {channel.topic!r} is a {kind}, not bytes")
+    if not isinstance(channel.metadata, Mapping):
+        raise UsageError(f"the metadata of the channel {channel.topic!r} is no mapping")
+    texts = [channel.topic, channel.message_encoding, *channel.metadata, *channel.metadata.values()]
+    if schema is not None:
+        texts += [schema.name, schema.encoding]
+    for text in texts:
+        if not isinstance(text, str):
+            raise UsageError(f"the channel {channel.topic!r} has {text!r} where text must be")
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise UsageError(
+                f"the channel {channel.topic!r} has {text!r}, which UTF-8 cannot hold"
+            ) from error
 
 
 def _patience(flush_interval_s: float) -> float:

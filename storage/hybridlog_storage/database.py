@@ -365,7 +365,10 @@ class Database:
         by_key: bool = False,
         max_time_ms: int | None = None,
     ) -> int:
-        """Number of documents that match; without a filter from the collection's own count.
+        """Number of documents that match.
+
+        Without a filter it is the collection's own count, which costs nothing, and is an
+        estimate since a server was killed.
 
         Args:
             collection: Where to look; one that does not exist is empty.

@@ -25,9 +25,11 @@ import pytest
 from benchmarks.backends import mongo_json, postgres, postgres_server, sqlite
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.backends.registry import BACKENDS
+from hybridlog_storage import mongod
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.messages import Channel, Schema
 from tests.imports import ROOT
+from tests.test_faults import kill_mongod, wait_for
 
 KEEPING = [name for name in BACKENDS if name != "nothing"]
 START = 1_436_866_013_589_000_000
@@ -516,6 +518,21 @@ def test_a_killed_server_is_told_and_leaves_nothing(
             backend.counts()
         assert time.monotonic() - began < 15
     assert not working_in(tmp_path)
+
+
+def test_hybridlog_counts_right_after_its_server_was_killed(tmp_path: Path) -> None:
+    with opened("hybridlog", tmp_path, CHANNELS[:1]) as backend:
+        for message in messages(0, 0, 50):
+            backend.insert(*message)
+        # Once it is in the index; what the server thinks it has is then wrong by as much.
+        recording = backend._recording
+        wait_for(lambda: recording.stored[0] == 50 and recording.lag == 0)
+        time.sleep(2 * mongod._JOURNAL_MS / 1000)
+        kill_mongod(backend.path)
+        for message in messages(0, 50, 100):
+            backend.insert(*message)
+        backend.finish()
+        assert backend.counts() == {CHANNELS[0].topic: 100}
 
 
 HOLD = """

@@ -698,6 +698,83 @@ def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store
     assert not store.verify().findings
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [
+        Channel("/a\udc80", "ros1", TEXT),
+        Channel(None, "ros1", TEXT),  # type: ignore[arg-type]
+        Channel("/a", "ros1", TEXT, {"callerid": "\udc80"}),
+        Channel("/a", "ros1", TEXT, {"latching": 5}),  # type: ignore[dict-item]
+        Channel("/a", "ros1", TEXT, None),  # type: ignore[arg-type]
+        Channel("/a", "ros1", "std_msgs/String"),  # type: ignore[arg-type]
+        Channel("/a", "ros1", Schema("\udc80", "ros1msg", b"")),
+        Channel("/a", "ros1", Schema("a/B", "ros1msg", "string data")),  # type: ignore[arg-type]
+        Channel("/a", "ros1", Schema("a/B", "ros1msg", bytearray(b""))),  # type: ignore[arg-type]
+        ["/a"],
+    ],
+)
+def test_a_channel_that_cannot_be_stored_does_no_harm(store: hl.Store, bad: Any) -> None:
+    with store.start("talk") as recording:
+        recording.write(channel("/talk"), text(b"before"))
+        with pytest.raises(UsageError, match=r"/a|None") as caught:
+            recording.write(bad, text(b"bad"))
+        str(caught.value).encode()
+        with pytest.raises(UsageError, match=r"/a|None"):
+            recording.expect(bad)
+        recording.write(channel("/talk"), text(b"after"))
+    assert [m.raw for m in store.topic("/talk")] == [text(b"before"), text(b"after")]
+
+
+def test_memory_that_a_message_lies_in_is_held_until_it_is_laid_down(store: hl.Store) -> None:
+    reused = bytearray(text(b"one"))
+    released = memoryview(text(b"two"))
+    with store.start("talk", budget_bytes=2 << 20) as recording:
+        with recording._laying:  # nothing is laid down meanwhile
+            recording.write(channel("/talk"), reused)
+            recording.write(channel("/talk"), released)
+            released.release()
+            with pytest.raises(BufferError):
+                reused.clear()
+        wait_for(lambda: recording.stored[0] == 2)
+        wait_for(lambda: not recording._inbox)
+    assert [m.raw for m in store.topic("/talk")] == [text(b"one"), text(b"two")]
+
+
+def test_it_is_closed_once_whoever_else_closes_it(store: hl.Store) -> None:
+    recording = store.start("talk")
+    for i in range(40):
+        recording.write(channel("/talk"), text(b"x" * 300_000), log_time=i)
+    reports = []
+    threads = [threading.Thread(target=lambda: reports.append(recording.close())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert reports == [recording.close()] * 4
+    assert (reports[0].indexed, reports[0].missed, reports[0].failure) == (40, 0, None)
+    assert store.topic("/talk").count() == 40
+    assert store.verify().findings == []
+
+
+def test_who_closes_it_while_the_same_thread_does_is_told(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the handler of a signal may; what comes of it is left to whoever opens the store."""
+    recording = store.start("talk")
+    recording.write(channel("/talk"), text(b"kept"))
+    wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
+    monkeypatch.setattr(recording, "_close_whole", lambda _: recording.close())
+    with recording:
+        for _ in range(2):
+            with pytest.raises(UsageError, match="is being closed, or that was broken off"):
+                recording.close()
+    with pytest.raises(UsageError, match="broken off"):
+        recording.abort()
+    with hl.open(store.directory.path) as again:
+        assert [m.raw for m in again.topic("/talk")] == [text(b"kept")]
+        assert again.verify().findings == []
+
+
 def test_abort_leaves_nothing(store: hl.Store) -> None:
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"gone"))
