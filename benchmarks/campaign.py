@@ -55,6 +55,9 @@ PARTS = {
 }
 """By the names of the command line, in the order in which they run."""
 
+_LARGEST = 1 << 30
+"""Bytes of a message: what takes more is no stream any more."""
+
 _MAY_GROW = frozenset({"sizes", "rates", "backends", "repetitions", "logs", "made"})
 """Settings that say which runs there are, and nothing about what one run is."""
 
@@ -258,6 +261,8 @@ def _message_size(text: str) -> int:
     size = parse_size(text)
     if 0 < size < MIN_SIZE:
         raise UsageError(f"{text}: a message of a stream has {MIN_SIZE} bytes at least.")
+    if size > _LARGEST:
+        raise UsageError(f"{text}: a message of a stream has {_LARGEST >> 20} MiB at most.")
     return size
 
 
@@ -266,7 +271,7 @@ def _rate(text: str) -> float:
         rate = float(text.removesuffix("Hz").strip())
     except ValueError:
         raise UsageError(f"{text!r} is no rate: write 4, 16 or 64.") from None
-    if not 0 < rate < 1e6:
+    if not 1e-3 <= rate < 1e6:
         raise UsageError(f"{text} Hz is no rate that a topic can have.")
     return rate
 

@@ -123,15 +123,20 @@ RatesOption = Annotated[
     typer.Option(help="Rates a topic in Hz, such as 4,64; without, the paper's.", metavar="HZ,…"),
 ]
 MessagesOption = Annotated[
-    int | None, typer.Option(help="Messages a topic; without, 500.", metavar="N", min=1)
+    int | None, typer.Option(help="Messages a topic; without, 500.", metavar="N", min=1, max=10**7)
 ]
-TopicsOption = Annotated[int | None, typer.Option(help="Topics; without, 20.", metavar="N", min=1)]
+TopicsOption = Annotated[
+    int | None, typer.Option(help="Topics; without, 20.", metavar="N", min=1, max=10**4)
+]
 SecondsOption = Annotated[
     float | None,
-    typer.Option(help="Length of each run that looks for a ceiling.", metavar="S", min=0.1),
+    typer.Option(
+        help="Length of each run that looks for a ceiling.", metavar="S", min=0.1, max=86400
+    ),
 ]
 SpeedOption = Annotated[
-    float, typer.Option(help="Publish N times as fast as recorded.", metavar="N", min=0.01)
+    float,
+    typer.Option(help="Publish N times as fast as recorded.", metavar="N", min=0.01, max=10**6),
 ]
 LogsOption = Annotated[
     list[Path] | None,
@@ -154,6 +159,7 @@ LogSecondsOption = Annotated[
         "it is played faster.",
         metavar="S",
         min=0.1,
+        max=86400,
     ),
 ]
 CeilingsOption = Annotated[
@@ -452,7 +458,7 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
     """
     from hybridlog.cli import stopping
     from hybridlog.cli.output import printable
-    from hybridlog_storage.errors import HybridlogError
+    from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
     stopping.install()
     _calls.append([*program.split(), *arguments])
@@ -468,4 +474,8 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
         return stopped.exit_code
     except BrokenPipeError:
         return 0
+    except OSError as error:
+        told = f"{error}. What was measured before stays; the same command goes on with it."
+        print(f"benchmarks: {printable(told)}", file=sys.stderr)
+        return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
     return 0

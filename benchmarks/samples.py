@@ -125,11 +125,15 @@ class Journal:
 
     def _append(self, line: Mapping[str, Any]) -> None:
         data = json.dumps(line, allow_nan=False).encode() + b"\n"
-        with self.path.open("ab") as file:
-            file.truncate(self._end)
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+        try:
+            with self.path.open("ab") as file:
+                file.truncate(self._end)
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            # A full disk does not say which file it is about.
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
         self._end += len(data)
 
     def _read(self) -> None:

@@ -55,5 +55,10 @@ def _replace(path: Path, text: str) -> None:
     """A file appears whole or not at all: somebody may be looking at the last one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(path.name + ".new")
-    new.write_text(text, encoding="utf-8")
-    new.replace(path)
+    try:
+        new.write_text(text, encoding="utf-8")
+        new.replace(path)
+    except OSError as error:
+        new.unlink(missing_ok=True)
+        # A full disk does not say which file it is about.
+        raise OSError(error.errno, error.strerror, str(path)) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -13,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -289,6 +290,10 @@ def test_no_report_when_none_is_wanted(study: Study, tmp_path: Path) -> None:
         (["--rates", "x"], "'x' is no rate"),
         (["--rates", "-4"], "no rate that a topic can have"),
         (["--rates", "nan"], "no rate that a topic can have"),
+        (["--rates", "1e-9"], "no rate that a topic can have"),
+        (["--sizes", "99999999TB"], "has 1024 MiB at most"),
+        (["--messages", "99999999999"], "less than or equal to 10000000"),
+        (["--seconds", "inf"], "less than or equal to 86400"),
     ],
 )
 def test_wrong_options_have_a_cure(
@@ -302,6 +307,32 @@ def test_wrong_options_have_a_cure(
     assert main(["throughput", "--out", str(out), *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_full_disk_is_told_with_the_file(
+    study: Study,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(_: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert throughput(tmp_path) == 7
+    told = capsys.readouterr().err
+    assert f"No space left on device: '{tmp_path / 'samples.jsonl'}'" in told
+    assert "Traceback" not in told
+
+
+def test_a_report_that_cannot_be_written_is_told_with_the_file(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report.md").mkdir()
+    assert throughput(tmp_path) == 1
+    assert f"{tmp_path / 'report.md'}" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.new"))
+    assert Journal(tmp_path).samples
 
 
 def test_directories_that_will_not_do(
@@ -467,8 +498,8 @@ def test_every_option_is_handed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     log = tmp_path / "a.bag"
     given = (
         f"--quick -b mcap -o {tmp_path} --sizes 5kB --rates 4 --messages 3 --topics 2 "
-        f"--seconds 0.5 -l {log} --no-made --speed 2 -n 4 --seed 9 --work {tmp_path} --restart "
-        "--no-report --json"
+        f"--seconds 0.5 -l {log} --no-made --log-seconds 7 --speed 2 -n 4 --seed 9 "
+        f"--work {tmp_path} --restart --no-report --json"
     )
     assert main(["all", *given.split()]) == 0
     choices = asked[0]
@@ -484,6 +515,7 @@ def test_every_option_is_handed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         seconds=0.5,
         logs=[log],
         made=False,
+        log_seconds=7.0,
         speed=2.0,
         repetitions=4,
         seed=9,
