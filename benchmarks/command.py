@@ -457,8 +457,9 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
         The exit code.
     """
     from hybridlog.cli import stopping
+    from hybridlog.cli.exit_codes import of_os_error
     from hybridlog.cli.output import printable
-    from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
+    from hybridlog_storage.errors import HybridlogError
 
     stopping.install()
     _calls.append([*program.split(), *arguments])
@@ -477,5 +478,5 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
     except OSError as error:
         told = f"{error}. What was measured before stays; the same command goes on with it."
         print(f"benchmarks: {printable(told)}", file=sys.stderr)
-        return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
+        return of_os_error(error)
     return 0

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -52,6 +53,15 @@ class Sample:
         return json.dumps(
             [self.study, dict(self.case), self.backend, self.repetition], sort_keys=True
         )
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """See that an error of the system's names a file: a full disk does not say which it is."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 class Journal:
@@ -125,15 +135,11 @@ class Journal:
 
     def _append(self, line: Mapping[str, Any]) -> None:
         data = json.dumps(line, allow_nan=False).encode() + b"\n"
-        try:
-            with self.path.open("ab") as file:
-                file.truncate(self._end)
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            # A full disk does not say which file it is about.
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
+        with naming(self.path), self.path.open("ab") as file:
+            file.truncate(self._end)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
         self._end += len(data)
 
     def _read(self) -> None:

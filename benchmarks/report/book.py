@@ -62,9 +62,12 @@ class Book:
 
 
 def _settings(header: Mapping[str, Any], study: str) -> Mapping[str, Any]:
-    of_all = header.get("settings")
-    found = of_all.get(study) if isinstance(of_all, dict) else None
-    return found if isinstance(found, dict) else {}
+    return mapping(mapping(header.get("settings")).get(study))
+
+
+def mapping(found: object) -> Mapping[str, Any]:
+    """A part of a journal that should be a mapping; an empty one where it is none."""
+    return found if isinstance(found, Mapping) else {}
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:

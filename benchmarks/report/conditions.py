@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.report import coverage
-from benchmarks.report.book import Book, by_backend, grouped
+from benchmarks.report.book import Book, by_backend, grouped, mapping
 from benchmarks.report.look import ordered, title
 from benchmarks.report.model import Cell, Section, Table
 from benchmarks.report.numbers import listed
@@ -107,15 +107,15 @@ def systems(headers: Sequence[Mapping[str, Any]]) -> Section | None:
     """What each backend is and how it is set up, as it said itself when it was run."""
     about_each: dict[str, Mapping[str, Any]] = {}
     for header in headers:
-        about_each.update(_mapping(header.get("backends")))
+        about_each.update(mapping(header.get("backends")))
     if not about_each:
         return None
     rows = tuple(
         (
             name,
             title(name),
-            _text(_mapping(about_each[name]).get("kind", "")),
-            _text(_mapping(about_each[name]).get("about", "")),
+            _text(mapping(about_each[name]).get("kind", "")),
+            _text(mapping(about_each[name]).get("about", "")),
         )
         for name in ordered(about_each)
     )
@@ -243,7 +243,7 @@ def _apart(cells: list[object]) -> tuple[object, list[object]]:
     """What is the same in all runs, None without any; and of each what is not."""
     if not cells or all(one == cells[0] for one in cells):
         return next(iter(cells), None), []
-    maps = [_mapping(one) for one in cells]
+    maps = [mapping(one) for one in cells]
     same = {k: v for k, v in maps[0].items() if all(k in one and one[k] == v for one in maps)}
     if not same:
         return None, cells
@@ -278,18 +278,14 @@ _MOMENT = frozenset({"started", "load_1min"})
 
 
 def _settings(headers: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    names = dict.fromkeys(name for header in headers for name in _mapping(header.get("settings")))
+    names = dict.fromkeys(name for header in headers for name in mapping(header.get("settings")))
     return [(f"settings.{name}", name.replace("_", " ")) for name in names]
 
 
 def _of(header: Mapping[str, Any], key: str) -> object:
     if key.startswith("settings."):
-        return _mapping(header.get("settings")).get(key.removeprefix("settings."))
+        return mapping(header.get("settings")).get(key.removeprefix("settings."))
     return header.get(key)
-
-
-def _mapping(found: object) -> Mapping[str, Any]:
-    return found if isinstance(found, Mapping) else {}
 
 
 def _command(header: Mapping[str, Any]) -> str:

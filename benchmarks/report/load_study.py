@@ -121,8 +121,9 @@ def _greatest(
 ) -> tuple[float, Verdict | Literal["stopped"]]:
     """The greatest speed below all that were not kept, 0 for none, and what ended the search."""
     verdicts = {float(trial.case[SPEED]): verdict(trial) for trial in trials}
-    greatest, lost = bracket({speed: found == "kept" for speed, found in verdicts.items()})
-    if not is_over(verdicts, settings):
+    kept = {speed: found == "kept" for speed, found in verdicts.items()}
+    greatest, lost = bracket(kept)
+    if not is_over(kept, settings):
         return greatest or 0.0, "stopped"
     return greatest or 0.0, "kept" if lost is None else verdicts[lost]
 

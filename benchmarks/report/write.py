@@ -9,6 +9,7 @@ from benchmarks.report.figures import FiguresMissingError, svg
 from benchmarks.report.markdown import markdown
 from benchmarks.report.model import Report
 from benchmarks.report.page import page
+from benchmarks.samples import naming
 
 PAGE = "report.html"
 DOCUMENT = "report.md"
@@ -56,9 +57,9 @@ def _replace(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(path.name + ".new")
     try:
-        new.write_text(text, encoding="utf-8")
-        new.replace(path)
-    except OSError as error:
+        with naming(path):
+            new.write_text(text, encoding="utf-8")
+            new.replace(path)
+    except OSError:
         new.unlink(missing_ok=True)
-        # A full disk does not say which file it is about.
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise

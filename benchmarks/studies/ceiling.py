@@ -135,9 +135,10 @@ def _ceiling(
     backend, size, repetition = trials[0].backend, trials[0].case["size"], trials[0].repetition
     by_rate = {float(trial.case[_RATE]): trial for trial in trials}
     verdicts = {rate: verdict(trial) for rate, trial in by_rate.items()}
-    rate, lost_rate = bracket({rate: found == "kept" for rate, found in verdicts.items()})
+    kept = {rate: found == "kept" for rate, found in verdicts.items()}
+    rate, lost_rate = bracket(kept)
     limit: Limit = "backend"
-    if not is_over(verdicts, settings):
+    if not is_over(kept, settings):
         limit = "stopped"
     elif lost_rate is None:
         limit = "plan"

@@ -126,11 +126,11 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     return (best + lost) / 2 if is_wide else None
 
 
-def is_over(verdicts: Mapping[float, Verdict], settings: Mapping[str, Any]) -> bool:
+def is_over(kept: Mapping[float, bool], settings: Mapping[str, Any]) -> bool:
     """Whether a search came to its end, and was not stopped before.
 
     Args:
-        verdicts: Of the rates that were tried.
+        kept: Of the rates that were tried, whether all was kept.
         settings: Of the study, as its journal has them; where they do not say where it
             looks, it is taken for over.
     """
@@ -138,7 +138,6 @@ def is_over(verdicts: Mapping[float, Verdict], settings: Mapping[str, Any]) -> b
     halvings = settings.get("halvings")
     if start is None or lowest is None or highest is None or not isinstance(halvings, int):
         return True
-    kept = {rate: found == "kept" for rate, found in verdicts.items()}
     return next_rate(kept, Bounds(start, lowest, highest, halvings)) is None
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
+
 INTERNAL: Final = 70
 
 EXIT_CODES: Final = {
@@ -22,6 +24,11 @@ EXIT_CODES: Final = {
     130: "interrupted (Ctrl-C); nothing half-made is kept",
     143: "ended (SIGTERM); nothing half-made is kept",
 }
+
+
+def of_os_error(error: OSError) -> int:
+    """The code for an error of the system's that the library has not mapped."""
+    return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
 
 
 def as_text() -> str:

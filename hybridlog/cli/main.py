@@ -9,9 +9,9 @@ import traceback
 from typing import NoReturn, TextIO
 
 from hybridlog.cli import stopping
-from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL
+from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL, of_os_error
 from hybridlog.cli.spared import spare
-from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
+from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
 
@@ -54,7 +54,7 @@ def _run() -> int:
     except OSError as error:
         # What the library maps carries a cure; this is the rest, such as a failing disk.
         _complain(str(error))
-        return _code_of(error)
+        return of_os_error(error)
     except MemoryError:
         _complain("there is not enough memory for this. Ask for less at a time.")
         return HybridlogError.exit_code
@@ -85,7 +85,7 @@ def _flushed(code: int) -> int:
     except OSError as error:
         _let_go(sys.stdout)
         _complain(f"standard output cannot be written: {error.strerror}")
-        return code or _code_of(error)
+        return code or of_os_error(error)
     return code
 
 
@@ -98,10 +98,6 @@ def _leave(code: int) -> NoReturn:
     with contextlib.suppress(OSError):
         sys.stderr.flush()
     os._exit(code)
-
-
-def _code_of(error: OSError) -> int:
-    return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
 
 
 def _let_go(stream: TextIO) -> None:

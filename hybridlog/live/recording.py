@@ -363,9 +363,9 @@ class LiveRecording:
                 "opening of the store seals what was flushed."
             )
         self._is_closing = True
+        self._stop()
 
     def _close_once(self) -> RecordReport:
-        self._stop()
         with self._held:
             try:
                 end = {"status": "complete", "losses": []}
@@ -421,7 +421,6 @@ class LiveRecording:
         """
         with self._closing:
             self._end()
-            self._stop()
             with self._held:
                 self._capture.forget()
 
@@ -588,14 +587,12 @@ def _spare_processors() -> int:
 
 def _held_fast(payload: object) -> memoryview:
     """What is no plain `bytes`, so that it cannot be resized or released until it is laid down."""
-    if isinstance(payload, memoryview):
-        is_flat = payload.c_contiguous and payload.ndim == 1 and payload.format == "B"
-    else:
-        is_flat = isinstance(payload, bytes | bytearray)
-    if not isinstance(payload, bytes | bytearray | memoryview) or not is_flat:
-        kind = type(payload).__name__
-        raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
-    return memoryview(payload)
+    if isinstance(payload, bytes | bytearray | memoryview):
+        held = memoryview(payload)
+        if held.c_contiguous and held.ndim == 1 and held.format == "B":
+            return held
+    kind = type(payload).__name__
+    raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
 
 
 def _check_channel(channel: object) -> None:
