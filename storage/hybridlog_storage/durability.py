@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import errno
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from hybridlog_storage import files
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError
 from hybridlog_storage.messages import Buffer
 
@@ -43,7 +44,7 @@ def write_all(fd: int, parts: Sequence[Buffer]) -> int:
     views = [memoryview(part).cast("B") for part in parts if len(part)]
     total = sum(len(view) for view in views)
     while views:
-        views = left_over(views, os.writev(fd, views[:512]))
+        views = left_over(views, files.system.writev(fd, views[:512]))
     return total
 
 
@@ -58,48 +59,67 @@ def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
 
 def sync_file(fd: int) -> None:
     """Return once everything written to the file is on the disk."""
-    os.fsync(fd)
+    files.system.sync(fd)
 
 
-def sync_directory(path: Path) -> None:
-    """Return once renames and removals in the directory are on the disk."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+def publish(temporary: Path, final: Path, *, depth: int) -> None:
+    """Give a synced file its final name, durably.
 
+    Args:
+        temporary: The file; in the folder of `final`.
+        final: Its name from now on; a file of that name is replaced.
+        depth: As for `files.open_file`; 1 for a file outside of any store.
 
-def publish(temporary: Path, final: Path) -> None:
-    """Give a synced file its final name, durably."""
-    temporary.replace(final)
-    sync_directory(final.parent)
+    Raises:
+        OSError: It cannot be renamed, or the folder cannot be synced.
+    """
+    files.rename(temporary, final, depth=depth)
+    files.sync_folder(final.parent, depth=depth - 1)
 
 
 @contextmanager
-def new_file(final: Path) -> Iterator[int]:
+def new_file(final: Path, *, depth: int) -> Iterator[int]:
     """A file descriptor of a temporary file that becomes `final` if the block succeeds.
 
-    Nothing is left behind when it does not.
+    Nothing is left behind when it does not. The umask decides who may read the file.
+
+    Args:
+        final: Its name once it is complete.
+        depth: As for `files.open_file`.
+
+    Raises:
+        HybridlogError: It cannot be made or written.
     """
+    temporary = final.with_name(f".{final.name}.{secrets.token_hex(8)}")
     try:
-        fd, name = tempfile.mkstemp(dir=final.parent, prefix=f".{final.name}.")
+        fd = files.open_file(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, depth=depth)
     except OSError as error:
         raise explain(error, final, "creating") from error
-    temporary = Path(name)
+    published = False
     try:
         yield fd
         sync_file(fd)
-        publish(temporary, final)
+        publish(temporary, final, depth=depth)
+        published = True
     except OSError as error:
         raise explain(error, final, "writing") from error
     finally:
         os.close(fd)
-        with suppress(FileNotFoundError):
-            temporary.unlink()
+        if not published:
+            with suppress(OSError):
+                files.unlink(temporary, depth=depth)
 
 
-def write_new(final: Path, content: bytes) -> None:
-    """Write a small file: all of it or nothing."""
-    with new_file(final) as fd:
+def write_new(final: Path, content: bytes, *, depth: int) -> None:
+    """Write a small file: all of it or nothing.
+
+    Args:
+        final: The file.
+        content: All of it.
+        depth: As for `files.open_file`.
+
+    Raises:
+        HybridlogError: It cannot be written.
+    """
+    with new_file(final, depth=depth) as fd:
         write_all(fd, [content])

@@ -61,6 +61,14 @@ class SegmentError(StoreError):
     """A segment of the store that cannot be read where it should be."""
 
 
+class CatalogError(StoreError):
+    """The catalog is damaged, or has lost what it should have. It is made again from the files."""
+
+
+class IndexChangedError(StoreError):
+    """Another process changes the index that was asked; asking again helps."""
+
+
 class DatabaseError(HybridlogError):
     """MongoDB does not answer, refuses, or has died."""
 

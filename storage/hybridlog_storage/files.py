@@ -1,0 +1,298 @@
+"""Files of a store, reached without following a symlink, through one seam.
+
+A store may come from somebody else. So whatever lies inside it is opened relative to the
+handle of its folder, part by part, and a symlink on the way is an error. The user's own
+path to the store may lead through symlinks: only the last parts of a path, those inside
+the store, are held to this. `depth` is the number of these parts.
+
+A folder that is setgid and group-writable is shared: what is made in it is group-writable
+too, whatever the umask says of the group.
+
+Everything that changes a store on the disk goes through `system`, so that tests can
+record what happens in which order, fail at a step, or lose what was not synced.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+IN_STORE: Final = 1
+"""Depth of a file in the store's own folder."""
+IN_FOLDER: Final = 2
+"""Depth of a file in a folder of the store, or of a recording's folder."""
+IN_RECORDING: Final = 3
+"""Depth of a file of a recording."""
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+_SHARED = stat.S_ISGID | stat.S_IWGRP
+_GROUP = stat.S_IRWXG
+
+
+class System:
+    """The calls that change a file system. Tests put another one in place of `system`."""
+
+    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+        """Open, and perhaps make, a file in a folder that is held open."""
+        return os.open(name, flags | os.O_CLOEXEC, mode, dir_fd=folder)
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        """Write at the file's position; may write less than all."""
+        return os.writev(fd, parts)
+
+    def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
+        """Write at a position; may write less than all."""
+        return os.pwritev(fd, parts, position)
+
+    def truncate(self, fd: int, length: int) -> None:
+        """Cut or extend a file."""
+        os.ftruncate(fd, length)
+
+    def sync(self, fd: int) -> None:
+        """Return once a file, or the names in a folder, are on the disk."""
+        os.fsync(fd)
+
+    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        """Give a file another name; replaces what has that name."""
+        os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder)
+
+    def unlink(self, name: str, *, folder: int) -> None:
+        """Remove a file."""
+        os.unlink(name, dir_fd=folder)
+
+    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
+        """Make a folder."""
+        os.mkdir(name, mode, dir_fd=folder)
+
+    def rmdir(self, name: str, *, folder: int) -> None:
+        """Remove an empty folder."""
+        os.rmdir(name, dir_fd=folder)
+
+    def chmod(self, fd: int, mode: int) -> None:
+        """Change who may do what with a file."""
+        os.fchmod(fd, mode)
+
+
+system: System = System()
+"""What all functions here call; looked up anew each time."""
+
+
+@contextmanager
+def folder(path: Path, depth: int) -> Iterator[int]:
+    """The handle of a folder, of which the last `depth` parts are no symlinks.
+
+    Args:
+        path: The folder.
+        depth: Parts of the path that lie inside the store; 0 for the store's own folder.
+
+    Raises:
+        OSError: It is not there, is no folder, or a symlink stands in its place.
+    """
+    outer, inner = _split(path, depth)
+    fd = os.open(outer, _FOLDER)
+    try:
+        for part in inner:
+            inside = os.open(part, _FOLDER | os.O_NOFOLLOW, dir_fd=fd)
+            os.close(fd)
+            fd = inside
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECORDING) -> int:
+    """Open a file of a store; no symlink on the way is followed.
+
+    Args:
+        path: The file.
+        flags: As of `os.open`.
+        mode: For a file that is made; the umask applies.
+        depth: Parts of the path that lie inside the store, the file's name among them.
+
+    Raises:
+        OSError: As `os.open`; ELOOP or ENOTDIR for a symlink.
+    """
+    with folder(path.parent, depth - 1) as fd:
+        opened = system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
+        try:
+            if flags & os.O_CREAT:
+                _let_group_in(fd, opened, mode)
+        except BaseException:
+            os.close(opened)
+            raise
+        return opened
+
+
+def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
+    """The content of a small ordinary file.
+
+    Args:
+        path: The file.
+        most: Bytes that are read at most, and one more.
+        depth: As for `open_file`.
+
+    Raises:
+        OSError: It cannot be read, or is no ordinary file.
+    """
+    fd = open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
+    try:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            raise OSError(0, "it is no ordinary file", str(path))
+        parts: list[bytes] = []
+        left = most + 1
+        while left > 0 and (part := os.read(fd, min(left, 1 << 20))):
+            parts.append(part)
+            left -= len(part)
+        return b"".join(parts)
+    finally:
+        os.close(fd)
+
+
+def write_file(
+    path: Path, content: bytes, mode: int = 0o666, *, depth: int = IN_RECORDING, sync: bool = True
+) -> None:
+    """Write a small file: all of it or nothing. What has its name is replaced, also a symlink.
+
+    Args:
+        path: The file.
+        content: All of it.
+        mode: Who may do what with it; the umask applies.
+        depth: As for `open_file`.
+        sync: Whether to return only once it is on the disk.
+
+    Raises:
+        OSError: It cannot be written; nothing is left of it.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode, depth=depth)
+    try:
+        try:
+            left = memoryview(content)
+            while left:
+                left = left[system.writev(fd, [left]) :]
+            if sync:
+                system.sync(fd)
+        finally:
+            os.close(fd)
+        rename(temporary, path, depth=depth)
+    except BaseException:
+        with suppress(OSError):
+            unlink(temporary, depth=depth)
+        raise
+    if sync:
+        sync_folder(path.parent, depth=depth - 1)
+
+
+def status(path: Path, *, depth: int = IN_RECORDING) -> os.stat_result:
+    """What is known of a file or folder; of a symlink, of the link itself.
+
+    Raises:
+        OSError: It is not there.
+    """
+    with folder(path.parent, depth - 1) as fd:
+        return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
+
+
+def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
+    """What lies in a folder, by name, with what is known of each.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    found: dict[str, os.stat_result] = {}
+    with folder(path, depth) as fd, os.scandir(fd) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):
+                found[entry.name] = entry.stat(follow_symlinks=False)
+    return found
+
+
+def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:
+    """Make a folder; the umask applies.
+
+    Raises:
+        OSError: It is there, or cannot be made.
+    """
+    with folder(path.parent, depth - 1) as fd:
+        system.mkdir(path.name, mode, folder=fd)
+        made = os.open(path.name, _FOLDER | os.O_NOFOLLOW, dir_fd=fd)
+        try:
+            _let_group_in(fd, made, mode)
+        finally:
+            os.close(made)
+
+
+def rename(old: Path, new: Path, *, depth: int = IN_RECORDING) -> None:
+    """Give a file or a folder another name in the same folder of the store.
+
+    Raises:
+        OSError: It is not there, or cannot be renamed.
+    """
+    with folder(old.parent, depth - 1) as fd:
+        system.rename(old.name, new.name, folder=fd, new_folder=fd)
+
+
+def unlink(path: Path, *, depth: int = IN_RECORDING) -> None:
+    """Remove a file.
+
+    Raises:
+        OSError: It is not there, or cannot be removed.
+    """
+    with folder(path.parent, depth - 1) as fd:
+        system.unlink(path.name, folder=fd)
+
+
+def sync_folder(path: Path, *, depth: int = IN_FOLDER) -> None:
+    """Return once renames, new names and removals in a folder are on the disk."""
+    with folder(path, depth) as fd:
+        system.sync(fd)
+
+
+def remove_tree(path: Path, *, depth: int) -> None:
+    """Remove a folder and all in it; what is gone already is no error.
+
+    Raises:
+        OSError: Something cannot be removed.
+    """
+    with folder(path.parent, depth - 1) as fd:
+        _remove(fd, path.name)
+
+
+def _let_group_in(parent: int, fd: int, mode: int) -> None:
+    """Give the group what was asked for it, in a shared folder, of what is this user's."""
+    if os.fstat(parent).st_mode & _SHARED != _SHARED:
+        return
+    about = os.fstat(fd)
+    wanted = about.st_mode | (mode & _GROUP)
+    if wanted != about.st_mode and about.st_uid == os.geteuid():
+        system.chmod(fd, stat.S_IMODE(wanted))
+
+
+def _remove(parent: int, name: str) -> None:
+    try:
+        fd = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
+    except FileNotFoundError:
+        return
+    except OSError:  # a file, or a symlink
+        with suppress(FileNotFoundError):
+            system.unlink(name, folder=parent)
+        return
+    try:
+        for inner in sorted(os.listdir(fd)):  # noqa: PTH208 - of a handle
+            _remove(fd, inner)
+    finally:
+        os.close(fd)
+    with suppress(FileNotFoundError):
+        system.rmdir(name, folder=parent)
+
+
+def _split(path: Path, depth: int) -> tuple[Path, tuple[str, ...]]:
+    """The part of a path outside of the store, and the names inside it."""
+    if depth <= 0:
+        return path, ()
+    return Path(*path.parts[:-depth]), path.parts[-depth:]

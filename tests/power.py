@@ -1,0 +1,221 @@
+"""A file system that can lose its power: what was not synced is dropped, torn or reordered.
+
+`PowerCut` stands in for `files.system`. Every call is carried out, and noted as well: what of
+each file and folder would be on the disk now, and what is only on its way. `after_cut` makes
+the folder that somebody may find after the power has failed.
+
+The model: writes to a file reach the disk in any order, in pieces of a sector, or not at all,
+until the file is synced. Names reach it in order, until the folder is synced. To sync a file
+keeps its name, too, as journalling file systems do.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hybridlog_storage.files import System
+
+SECTOR = 512
+
+
+@dataclass
+class _File:
+    """What of a file is on the disk, and what is on its way there."""
+
+    durable: bytes = b""
+    pending: list[tuple[int, bytes | None]] = field(default_factory=list)
+    """Position and bytes of each write; without bytes the file was cut there."""
+
+    def survive(self, rng: random.Random) -> bytes:
+        """What is found after a cut."""
+        content = bytearray(self.durable)
+        for position, data in self.pending:
+            fate = rng.random()
+            if data is None:
+                if fate < 0.5:
+                    _cut(content, position)
+            elif fate < 0.4:
+                _put(content, position, data)
+            elif fate < 0.7:  # torn
+                first = rng.randrange(0, len(data) + 1) // SECTOR * SECTOR
+                _put(content, position, data[:first])
+        return bytes(content)
+
+
+@dataclass
+class _Folder:
+    """Names in a folder: those on the disk, and changes on their way, oldest first."""
+
+    durable: dict[str, int] = field(default_factory=dict)
+    pending: list[tuple[str | None, str | None, int]] = field(default_factory=list)
+    """Old name, new name, and what it is; a new file has no old name, a removed one no new."""
+
+    def apply(self, count: int) -> dict[str, int]:
+        """The names when so many changes have reached the disk."""
+        names = dict(self.durable)
+        for old, new, what in self.pending[:count]:
+            if old is not None:
+                names.pop(old, None)
+            if new is not None:
+                names[new] = what
+        return names
+
+
+class PowerCut(System):
+    """Notes what is on the disk; after so many calls nothing works any more.
+
+    Args:
+        root: The folder that is watched, as it is now.
+        calls: How many calls work; None for all.
+    """
+
+    def __init__(self, root: Path, calls: int | None = None) -> None:
+        self.calls = 0
+        self._left = calls
+        self._files: dict[int, _File] = {}
+        self._folders: dict[int, _Folder] = {}
+        self._root = root.stat().st_ino
+        for path in [root, *root.rglob("*")]:
+            about = path.lstat()
+            if stat.S_ISDIR(about.st_mode):
+                inside = {p.name: p.lstat().st_ino for p in path.iterdir()}
+                self._folders[about.st_ino] = _Folder(inside)
+            elif stat.S_ISREG(about.st_mode):
+                self._files[about.st_ino] = _File(path.read_bytes())
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the power has failed."""
+        return self._left == 0
+
+    def _step(self) -> None:
+        if self._left == 0:
+            raise OSError(errno.EIO, "the power has failed")
+        if self._left is not None:
+            self._left -= 1
+        self.calls += 1
+
+    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+        if not flags & os.O_CREAT:
+            return super().open(name, flags, mode, folder=folder)
+        self._step()
+        is_new = not _exists(name, folder)
+        fd = super().open(name, flags, mode, folder=folder)
+        inode = os.fstat(fd).st_ino
+        if is_new and folder is not None:
+            self._files[inode] = _File()
+            self._folder(folder).pending.append((None, name, inode))
+        elif flags & os.O_TRUNC:
+            self._file(fd).pending.append((0, None))
+        return fd
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        self._step()
+        position = os.lseek(fd, 0, os.SEEK_CUR)
+        return self._note(fd, parts, position, super().writev(fd, parts))
+
+    def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
+        self._step()
+        return self._note(fd, parts, position, super().pwritev(fd, parts, position))
+
+    def truncate(self, fd: int, length: int) -> None:
+        self._step()
+        super().truncate(fd, length)
+        self._file(fd).pending.append((length, None))
+
+    def sync(self, fd: int) -> None:
+        self._step()
+        inode = os.fstat(fd).st_ino
+        if inode in self._folders:
+            folder = self._folders[inode]
+            folder.durable = folder.apply(len(folder.pending))
+            folder.pending.clear()
+            return
+        file = self._file(fd)
+        content = bytearray(file.durable)
+        for position, data in file.pending:
+            if data is None:
+                _cut(content, position)
+            else:
+                _put(content, position, data)
+        file.durable = bytes(content)
+        file.pending.clear()
+        for folder in self._folders.values():
+            places = [n for n, change in enumerate(folder.pending) if change[2] == inode]
+            if places and folder.pending[places[0]][0] is None:  # it is new
+                count = places[0] + 1
+                folder.durable = folder.apply(count)
+                del folder.pending[:count]
+
+    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        self._step()
+        inode = os.stat(old, dir_fd=folder, follow_symlinks=False).st_ino
+        super().rename(old, new, folder=folder, new_folder=new_folder)
+        self._folder(folder).pending.append((old, new, inode))
+
+    def unlink(self, name: str, *, folder: int) -> None:
+        self._step()
+        super().unlink(name, folder=folder)
+        self._folder(folder).pending.append((name, None, 0))
+
+    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
+        self._step()
+        super().mkdir(name, mode, folder=folder)
+        inode = os.stat(name, dir_fd=folder).st_ino
+        self._folders[inode] = _Folder()
+        self._folder(folder).pending.append((None, name, inode))
+
+    def rmdir(self, name: str, *, folder: int) -> None:
+        self._step()
+        super().rmdir(name, folder=folder)
+        self._folder(folder).pending.append((name, None, 0))
+
+    def after_cut(self, target: Path, rng: random.Random) -> None:
+        """Make the folder that may be found after a cut at this moment."""
+        self._lay(self._root, target, rng)
+
+    def _lay(self, inode: int, target: Path, rng: random.Random) -> None:
+        if inode in self._folders:
+            target.mkdir()
+            folder = self._folders[inode]
+            names = folder.apply(rng.randrange(len(folder.pending) + 1))
+            for name, inside in names.items():
+                self._lay(inside, target / name, rng)
+        elif inode in self._files:
+            target.write_bytes(self._files[inode].survive(rng))
+
+    def _note(self, fd: int, parts: Sequence[memoryview], position: int, done: int) -> int:
+        data = b"".join(parts)[:done]
+        self._file(fd).pending.append((position, data))
+        return done
+
+    def _file(self, fd: int) -> _File:
+        return self._files.setdefault(os.fstat(fd).st_ino, _File())
+
+    def _folder(self, fd: int) -> _Folder:
+        return self._folders.setdefault(os.fstat(fd).st_ino, _Folder())
+
+
+def _exists(name: str, folder: int | None) -> bool:
+    try:
+        os.stat(name, dir_fd=folder, follow_symlinks=False)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _put(content: bytearray, position: int, data: bytes) -> None:
+    if data:
+        content.extend(bytes(max(position - len(content), 0)))
+        content[position : position + len(data)] = data
+
+
+def _cut(content: bytearray, length: int) -> None:
+    del content[length:]
+    content.extend(bytes(length - len(content)))
