@@ -1,0 +1,325 @@
+"""The settings of a store: its file `hybridlog.toml`, and what may stand in it.
+
+The file may come from somebody else, or be read by others of a group. So it holds no
+password, and a URI in it is only a proposal (`hybridlog.consent`).
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import stat
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from hybridlog_storage import files
+from hybridlog_storage.errors import StoreError, UsageError
+
+FORMAT: Final = 2
+"""Format of the stores that this version makes and reads."""
+NAME: Final = "hybridlog.toml"
+EMBEDDED: Final = "embedded"
+"""In place of a URI: the MongoDB that comes with hybridlog."""
+FEATURES: Final[frozenset[str]] = frozenset()
+"""Features that a store may require of its reader."""
+
+_LIMIT = 1 << 20  # bytes of hybridlog.toml
+_PASSWORD_LIMIT = 4096  # bytes of a file with a password
+_HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
+_HOSTS = re.compile(rf"{_HOST}(?:,{_HOST})*")
+LOGIN_CURE: Final = (
+    "Give the password in HYBRIDLOG_MONGO_PASSWORD, or in a file that "
+    "HYBRIDLOG_MONGO_PASSWORD_FILE names."
+)
+"""What to do where a password is missing, or stands where others can read it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoreSettings:
+    """What `hybridlog.toml` says.
+
+    Attributes:
+        store_id: Drawn at random when the store was made.
+        mongo: URI, without a password, of the MongoDB to use instead of the embedded one;
+            None for that.
+        shared: Whether a group shares the store (`hybridlog_storage.sharing`).
+        requires: Features that a reader must know to read the store.
+        optional: Features that a reader may pass over.
+    """
+
+    store_id: str
+    mongo: str | None = None
+    shared: bool = False
+    requires: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+
+
+def read_settings(path: Path) -> StoreSettings:
+    """The settings of a store.
+
+    Args:
+        path: The store's directory.
+
+    Raises:
+        StoreError: There is no store, it has another format, or needs what this version does
+            not know; or the settings are damaged, or hold a password.
+    """
+    file = path / NAME
+    values = _read(path, file)
+    version = values.get("format")
+    if type(version) is not int or version < 1:
+        raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
+    if version > FORMAT:
+        raise StoreError(
+            f"The store {path} has format {version}, this hybridlog knows format {FORMAT}. "
+            "Install a newer hybridlog."
+        )
+    if version < FORMAT:
+        raise StoreError(
+            f"The store {path} has format {version}, which is no longer read; this hybridlog "
+            f"knows format {FORMAT}. Record the logs again into a new store, or use the "
+            "hybridlog that made it."
+        )
+    requires = _names(file, values, "requires")
+    unknown = [name for name in requires if name not in FEATURES]
+    if unknown:
+        told = ", ".join(repr(name[:80]) for name in unknown[:5])
+        raise StoreError(
+            f"The store {path} requires {told}, which this hybridlog does not know. Install a "
+            "newer hybridlog."
+        )
+    store_id, shared = values.get("store_id"), values.get("shared", False)
+    if not isinstance(store_id, str) or not store_id:
+        raise StoreError(f"{file} names no store_id.")
+    if not isinstance(shared, bool):
+        raise StoreError(f"{file}: shared must be true or false.")
+    mongo = _stored_uri(file, values.get("mongo"))
+    return StoreSettings(store_id, mongo, shared, requires, _names(file, values, "optional"))
+
+
+def write_settings(path: Path, settings: StoreSettings) -> None:
+    """Write the settings of a store; a password in its URI is left out.
+
+    Args:
+        path: The store's directory.
+        settings: What to write.
+
+    Raises:
+        UsageError: The URI is no MongoDB connection string.
+        OSError: They cannot be written.
+    """
+    lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
+    if settings.mongo is not None:
+        lines.append(f"mongo = {_quoted(without_password(settings.mongo))}")
+    if settings.shared:
+        lines.append("shared = true")
+    for name, features in (("requires", settings.requires), ("optional", settings.optional)):
+        if features:
+            lines.append(f"{name} = [{', '.join(map(_quoted, features))}]")
+    content = ("\n".join(lines) + "\n").encode()
+    files.write_file(path / NAME, content, depth=files.IN_STORE)
+
+
+def without_password(uri: str) -> str:
+    """A connection string as it may be kept in a file: the user's name stays, secrets go.
+
+    Args:
+        uri: MongoDB connection string.
+
+    Raises:
+        UsageError: It is none, so that a part of a password may stand anywhere in it. The
+            message does not show it.
+    """
+    parts = _split(uri)
+    user, colon, _ = parts.user.partition(":")
+    mark = ";" if ";" in parts.options else "&"
+    options = parts.options.split(mark)
+    kept = [option for option in options if not _is_secret(option)]
+    if not colon and len(kept) == len(options):
+        return uri
+    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, mark.join(kept)))
+
+
+def with_password(uri: str) -> str:
+    """A connection string with the password out of the environment.
+
+    HYBRIDLOG_MONGO_PASSWORD has it, or a file that HYBRIDLOG_MONGO_PASSWORD_FILE names. A URI
+    without a user, or with a password of its own, stays as it is.
+
+    Args:
+        uri: MongoDB connection string.
+
+    Raises:
+        UsageError: The file cannot be read, or others can read it.
+    """
+    try:
+        parts = _split(uri)
+    except UsageError:
+        return uri  # whoever connects says what is wrong with it
+    if not parts.user or ":" in parts.user:
+        return uri
+    password = _password()
+    if password is None:
+        return uri
+    user = f"{parts.user}:{quote(password, safe='')}"
+    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, parts.options))
+
+
+@dataclass(frozen=True, slots=True)
+class _Uri:
+    """The parts of a connection string; those that are not there are empty.
+
+    Attributes:
+        scheme: `mongodb` or `mongodb+srv`.
+        user: Name, and password behind a colon.
+        hosts: One or several.
+        path: `/` and the name of a database.
+        options: What follows the question mark.
+    """
+
+    scheme: str
+    user: str
+    hosts: str
+    path: str
+    options: str
+
+
+def _split(uri: str) -> _Uri:
+    scheme, found, rest = uri.partition("://")
+    rest, _, options = rest.partition("?")
+    authority, slash, name = rest.partition("/")
+    user, _, hosts = authority.rpartition("@")
+    is_whole = (
+        found
+        and scheme in {"mongodb", "mongodb+srv"}
+        and uri.isprintable()
+        and _HOSTS.fullmatch(hosts)
+        and not set(name) & set("@/:")
+        and not {"&", ";"} <= set(options)
+        and all("=" in option for option in re.split("[&;]", options) if option)
+    )
+    if not is_whole:
+        raise UsageError(
+            "The URI is not a MongoDB connection string. Write mongodb://host:port/NAME, and "
+            "percent-encode user name, password and socket path."
+        )
+    return _Uri(scheme, user, hosts, slash + name, options)
+
+
+def _join(parts: _Uri) -> str:
+    user = f"{parts.user}@" if parts.user else ""
+    options = f"?{parts.options}" if parts.options else ""
+    return f"{parts.scheme}://{user}{parts.hosts}{parts.path}{options}"
+
+
+def _is_secret(option: str) -> bool:
+    """Whether an option of a URI holds a password or a token."""
+    name, _, value = option.lower().partition("=")
+    return "password" in name or "passphrase" in name or "token" in value
+
+
+def _stored_uri(file: Path, mongo: object) -> str | None:
+    if mongo is None or mongo == EMBEDDED:
+        return None
+    if not isinstance(mongo, str):
+        raise StoreError(f"{file}: mongo must be a URI in quotes.")
+    try:
+        clean = without_password(mongo)
+    except UsageError as error:
+        raise StoreError(f"{file}: mongo cannot be used. {error}") from None
+    if clean != mongo:
+        raise StoreError(
+            f"{file} holds a password, which others may read there. Take it out of `mongo`: write "
+            f"{clean}. {LOGIN_CURE}"
+        )
+    return mongo
+
+
+def _password() -> str | None:
+    """The password out of the environment.
+
+    Raises:
+        UsageError: It is said to be in a file, and is not to be had from there.
+    """
+    given = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
+    if given:
+        return given
+    named = os.environ.get("HYBRIDLOG_MONGO_PASSWORD_FILE")
+    if not named:
+        return None
+    try:
+        # The user's own choice: symlinks on the way are followed.
+        fd = os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            about = os.fstat(fd)
+            content = os.read(fd, _PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
+        finally:
+            os.close(fd)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise UsageError(
+            f"HYBRIDLOG_MONGO_PASSWORD_FILE names {named}, which cannot be read: {reason}."
+        ) from error
+    if about.st_mode & 0o077:
+        raise UsageError(
+            f"{named}, which HYBRIDLOG_MONGO_PASSWORD_FILE names, can be read or written by "
+            f"others: `chmod 600 {named}`."
+        )
+    try:
+        password = content.decode().removesuffix("\n").removesuffix("\r")
+    except UnicodeDecodeError:
+        password = ""
+    if not password or len(content) > _PASSWORD_LIMIT:
+        raise UsageError(
+            f"{named}, which HYBRIDLOG_MONGO_PASSWORD_FILE names, must be a file that holds one "
+            "line with the password."
+        )
+    return password
+
+
+def _read(path: Path, file: Path) -> dict[str, object]:
+    """What stands in the file.
+
+    Raises:
+        StoreError: It cannot be read, or is no TOML.
+    """
+    try:
+        content = files.read_file(file, _LIMIT, depth=files.IN_STORE)
+        if len(content) > _LIMIT:
+            raise StoreError(f"{file} is too large to be settings.")
+        return tomllib.loads(content.decode())
+    except FileNotFoundError:
+        reason = "there is no such directory" if not path.exists() else f"it has no {NAME}"
+        raise StoreError(
+            f"{path} is no hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
+            "makes one; --store or HYBRIDLOG_STORE says where to look."
+        ) from None
+    except NotADirectoryError:
+        raise StoreError(f"{path} is a file; a store is a directory.") from None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise StoreError(
+                f"{file} is a symlink, and none inside a store is followed. Put the file itself "
+                "there."
+            ) from error
+        raise StoreError(f"{file} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
+
+
+def _names(file: Path, values: dict[str, object], key: str) -> tuple[str, ...]:
+    """A list of names of features."""
+    found = values.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
+        raise StoreError(f"{file}: {key} must be a list of names in quotes.")
+    return tuple(found)
+
+
+def _quoted(text: str) -> str:
+    """A string of TOML."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,0 +1,224 @@
+"""Which servers a store may lead to, and that no command connects to another one."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from hybridlog import consent
+from hybridlog_storage.errors import DatabaseError, StoreError
+from hybridlog_storage.settings import StoreSettings, write_settings
+from tests.cli.running import run
+
+URI = "mongodb://me@lab-server/robots?tls=true"
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return tmp_path / "state" / "hybridlog"
+
+
+def test_the_embedded_one_needs_no_consent(state: Path) -> None:
+    assert consent.trusted_uri(StoreSettings("a")) == "embedded"
+    assert not state.exists()
+
+
+def test_a_server_has_to_be_agreed_to(state: Path) -> None:
+    settings = StoreSettings("a", URI)
+    with pytest.raises(DatabaseError, match=r"mongodb://lab-server/robots\b.*") as caught:
+        consent.trusted_uri(settings, Path("some/store"))
+    assert "hybridlog trust --store some/store" in str(caught.value)
+    assert "--mongo URI" in str(caught.value)
+    assert "me@" not in str(caught.value)
+    consent.remember("a", URI)
+    assert consent.trusted_uri(settings) == URI
+    for other in (StoreSettings("b", URI), StoreSettings("a", URI.replace("lab", "evil"))):
+        with pytest.raises(DatabaseError):
+            consent.trusted_uri(other)
+    assert consent.forget("a")
+    assert not consent.forget("a")
+    with pytest.raises(DatabaseError):
+        consent.trusted_uri(settings)
+
+
+def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -> None:
+    consent.remember("a", URI.replace("me@", "me:hunter2@"))
+    assert consent.is_trusted("a", URI)
+    file = state / "trusted.json"
+    assert "hunter2" not in file.read_text()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(state.stat().st_mode) == 0o700
+    assert [p.name for p in state.iterdir()] == ["trusted.json"]
+
+
+def test_several_stores_and_several_servers() -> None:
+    consent.remember("a", URI)
+    consent.remember("a", "mongodb://other/")
+    consent.remember("a", URI)
+    consent.remember("b", URI)
+    assert consent.is_trusted("a", URI)
+    assert consent.is_trusted("a", "mongodb://other/")
+    assert consent.forget("a")
+    assert not consent.is_trusted("a", URI)
+    assert consent.is_trusted("b", URI)
+
+
+def test_nothing_is_lost_when_many_agree_at_once() -> None:
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda n: consent.remember(f"s{n}", URI), range(40)))
+    assert all(consent.is_trusted(f"s{n}", URI) for n in range(40))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b'{"stores": []}', b'{"stores": {"a": 5}}', b"\xff", b"[" * 100_000],
+)
+def test_a_damaged_file_trusts_nothing(state: Path, content: bytes) -> None:
+    state.mkdir(parents=True)
+    (state / "trusted.json").write_bytes(content)
+    assert not consent.is_trusted("a", URI)
+    consent.remember("a", URI)
+    assert consent.is_trusted("a", URI)
+
+
+def test_a_file_that_others_may_write_trusts_nothing(state: Path) -> None:
+    consent.remember("a", URI)
+    file = state / "trusted.json"
+    for mode in (0o620, 0o602):
+        file.chmod(mode)
+        assert not consent.is_trusted("a", URI)
+    file.chmod(0o600)
+    assert consent.is_trusted("a", URI)
+    file.rename(state / "other.json")
+    file.symlink_to("other.json")
+    assert not consent.is_trusted("a", URI)
+
+
+def test_where_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in ("", "relative/path"):
+        monkeypatch.setenv("XDG_STATE_HOME", name)
+        assert consent.state_directory() == tmp_path / "home/.local/state/hybridlog"
+    consent.remember("a", URI)
+    assert json.loads((tmp_path / "home/.local/state/hybridlog/trusted.json").read_text()) == {
+        "stores": {"a": [URI]}
+    }
+
+
+def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(StoreError, match="trusted"):
+        consent.remember("a", URI)
+    assert not consent.is_trusted("a", URI)
+
+
+# --- the commands ---
+
+
+class Listener:
+    """Counts who connects."""
+
+    def __init__(self) -> None:
+        self.socket = socket.create_server(("127.0.0.1", 0))
+        self.visits = 0
+        threading.Thread(target=self._count, daemon=True).start()
+
+    @property
+    def uri(self) -> str:
+        port = self.socket.getsockname()[1]
+        return f"mongodb://127.0.0.1:{port}/x?serverSelectionTimeoutMS=500"
+
+    def _count(self) -> None:
+        while True:
+            try:
+                self.socket.accept()[0].close()
+            except OSError:
+                return
+            self.visits += 1
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    found = Listener()
+    yield found
+    found.socket.close()
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, listener: Listener) -> Path:
+    """A store of somebody else's that leads to a server."""
+    store = tmp_path / "foreign"
+    (store / "recordings").mkdir(parents=True)
+    write_settings(store, StoreSettings("f0", listener.uri))
+    return store
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("ls",),
+        ("info",),
+        ("fetch", "-t", "x"),
+        ("verify",),
+        ("reindex",),
+        ("rm", "-y", "x"),
+        ("index",),
+        ("schema", "x"),
+        ("record", __file__),
+        ("export", "/nonexistent/x.mcap"),
+        ("losses",),
+    ],
+    ids=lambda c: c[0],
+)
+def test_no_command_connects_without_consent(
+    foreign: Path, listener: Listener, command: tuple[str, ...]
+) -> None:
+    done = run(*command, store=foreign, code=None)
+    assert listener.visits == 0
+    if command[0] in {"verify", "reindex", "index"}:
+        assert done.code == 6
+        assert "hybridlog trust" in done.err
+
+
+def test_trust_and_forget(foreign: Path, listener: Listener) -> None:
+    assert run("trust", "--store", foreign).lines == [f"trusted {listener.uri}"]
+    assert listener.visits == 0, "to agree is not to connect"
+    done = run("verify", store=foreign, code=6)
+    assert listener.visits > 0
+    assert "hybridlog trust" not in done.err
+    before = listener.visits
+    assert run("trust", "--forget", store=foreign).lines == ["forgotten"]
+    assert run("trust", "--forget", store=foreign).lines == ["nothing was trusted"]
+    run("verify", store=foreign, code=6)
+    assert listener.visits == before
+
+
+@pytest.mark.parametrize("way", ["option", "variable"])
+def test_what_is_named_outright_needs_no_consent(
+    foreign: Path, listener: Listener, way: str
+) -> None:
+    extra = ["--mongo", listener.uri] if way == "option" else []
+    env = {"HYBRIDLOG_MONGO_URI": listener.uri} if way == "variable" else {}
+    run("verify", *extra, store=foreign, code=6, **env)
+    assert listener.visits > 0
+    assert not consent.is_trusted("f0", listener.uri), "for this one command"
+
+
+def test_a_store_without_a_server(tmp_path: Path) -> None:
+    write_settings(tmp_path, StoreSettings("x"))
+    assert "nothing to trust" in run("trust", store=tmp_path).out
+    assert not (Path(os.environ["XDG_STATE_HOME"]) / "hybridlog").exists()
+
+
+def test_a_store_that_is_none(tmp_path: Path) -> None:
+    run("trust", store=tmp_path / "none", code=5)

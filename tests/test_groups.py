@@ -1,0 +1,264 @@
+"""Stores that several users of one machine use, tried as those users."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.demo.write import write_bag
+from hybridlog_storage import files
+from hybridlog_storage.settings import StoreSettings, write_settings
+from hybridlog_storage.sharing import make_shared
+from tests.cli.running import wait_for
+from tests.other_user import User, needs_root, open_place
+
+LAB = 23456  # a group that nobody has to know
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.lstat().st_mode)
+
+
+def everything(store: Path) -> list[Path]:
+    """A store's folders and files, but for the servers' own."""
+    return [
+        path
+        for path in [store, *sorted(store.rglob("*"))]
+        if not path.relative_to(store).parts[:1]
+        or not path.relative_to(store).parts[0].startswith("mongod")
+    ]
+
+
+# --- modes, as one user ---
+
+
+def test_a_shared_folder_hands_its_openness_on(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    (store / "recordings").mkdir(parents=True)
+    (store / "hybridlog.toml").touch(0o644)
+    (store / "mongod").mkdir(0o700)
+    make_shared(store)
+    assert (mode(store), mode(store / "recordings")) == (0o2775, 0o2775)
+    assert mode(store / "hybridlog.toml") == 0o664
+    assert mode(store / "mongod") == 0o700
+    make_shared(store)  # once more changes nothing
+    for umask, folder, file in ((0o022, 0o2775, 0o664), (0o077, 0o2770, 0o660)):
+        before = os.umask(umask)
+        try:
+            made = store / "recordings" / f"r{umask}"
+            files.make_folder(made, depth=files.IN_FOLDER)
+            os.close(files.open_file(made / "x", os.O_RDWR | os.O_CREAT))
+            files.write_file(made / "y", b"y")
+            files.make_folder(made / "own", 0o700, depth=files.IN_RECORDING)
+        finally:
+            os.umask(before)
+        assert mode(made) == folder
+        assert (mode(made / "x"), mode(made / "y")) == (file, file)
+        assert mode(made / "own") & 0o077 == 0
+
+
+@pytest.mark.parametrize(("umask", "bits"), [(0o022, 0o755), (0o077, 0o700), (0o002, 0o775)])
+def test_the_umask_decides_in_a_store_of_ones_own(tmp_path: Path, umask: int, bits: int) -> None:
+    parent = tmp_path / "lab"
+    parent.mkdir()
+    parent.chmod(0o2775)  # of a group; what is made there is not therefore shared
+    write_bag(tmp_path / "small.bag", duration_s=5, topics=["/imu/data"])
+    before = os.umask(umask)
+    try:
+        with hl.open(parent / "store", create=True) as store:
+            store.record(tmp_path / "small.bag")
+    finally:
+        os.umask(before)
+    for path in everything(parent / "store"):
+        assert mode(path) & 0o777 == (bits if path.is_dir() else bits & 0o666), path
+
+
+def test_sharing_follows_no_symlink(tmp_path: Path) -> None:
+    store, victim = tmp_path / "store", tmp_path / "victim"
+    store.mkdir()
+    victim.touch(0o600)
+    (store / "recordings").symlink_to(tmp_path / "elsewhere")
+    (store / "hybridlog.toml").symlink_to(victim)
+    (tmp_path / "elsewhere").mkdir(0o700)
+    make_shared(store)
+    assert (mode(victim), mode(tmp_path / "elsewhere")) == (0o600, 0o700)
+
+
+# --- as others ---
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    with open_place() as found:
+        write_bag(found / "small.bag", duration_s=5, seed=2, topics=["/imu/data", "/joint_states"])
+        (found / "small.bag").chmod(0o644)
+        lab = found / "lab"
+        lab.mkdir()
+        os.chown(lab, 0, LAB)
+        lab.chmod(0o2775)
+        yield found
+
+
+MESSAGES = 50
+CRASH = f"""
+import os, sys, time
+import hybridlog as hl
+from tests.live.speaker import text, text_channel
+store = hl.open(sys.argv[1], create=True, shared=True)
+live = store.start("cut", flush_interval_s=0.1)
+channel = text_channel()
+for number in range({MESSAGES}):
+    live.write(channel, text(str(number)))
+deadline = time.monotonic() + 30
+while not live.lag == 0 == {MESSAGES} - live.stored[0] and time.monotonic() < deadline:
+    time.sleep(0.02)
+time.sleep(2)  # twenty times what flushing takes
+os._exit(9)
+"""
+COUNT = ("fetch", "-t", "/imu/data", "--count", "-q")
+ASK = (*COUNT, "--where", "header.seq >= 0")
+
+
+@needs_root
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
+    ann = User(place, 12345, 12345, (LAB,), umask)
+    bob = User(place, 12346, 12346, (LAB,), umask)
+    store, bag = place / "lab" / "store", place / "small.bag"
+    where = ("--store", store)
+    ann.run("record", bag, "--name", "anns", "--shared", "-q", *where)
+    assert "shared = true" in (store / "hybridlog.toml").read_text()
+    expected = ann.run(*ASK, *where).out
+    assert int(expected) > 0
+    assert bob.run(*ASK, *where).out == expected
+    bob.run("record", bag, "--name", "bobs", "--again", "-q", *where)
+    for user in (ann, bob):
+        assert int(user.run(*ASK, *where).out) == 2 * int(expected)
+    bob.run("verify", *where)
+    for path in everything(store):
+        about = path.stat()
+        assert about.st_gid == LAB, path
+        wanted = 0o2770 if path.is_dir() else 0o660
+        assert mode(path) & wanted == wanted, path
+        assert bool(mode(path) & 0o007) == (umask == 0o022), path
+    assert (store / "mongod").stat().st_uid == ann.uid
+    assert (store / f"mongod-{bob.uid}").stat().st_uid == bob.uid
+    for own in ("mongod", f"mongod-{bob.uid}"):
+        assert mode(store / own) & 0o077 == 0
+    # Each may remove what the other one made.
+    bob.run("rm", "-y", "anns", *where)
+    ann.run("rm", "-y", "bobs", *where)
+    assert bob.run("ls", "--json", *where).json == []
+    ann.run("reindex", "-q", *where)
+    assert [p.name for p in (store / "recordings").iterdir()] == []
+
+
+@needs_root
+def test_a_crash_of_one_is_mended_by_the_other(place: Path) -> None:
+    ann = User(place, 12345, 12345, (LAB,))
+    bob = User(place, 12346, 12346, (LAB,))
+    store = place / "lab" / "store"
+    ann.python("-c", CRASH, store, code=9)
+    assert list(store.glob("recordings/cut/*.mcap.open"))
+    done = bob.run("ls", "--store", store)
+    assert f"{MESSAGES} messages of it are recovered" in done.err
+    listed = bob.run("ls", "--json", "--store", store).json
+    assert [r["messages"] for r in listed] == [MESSAGES]
+    assert not list(store.glob("recordings/cut/*.mcap.open"))
+    ann.run("rm", "-y", "cut", "--store", store)
+
+
+@needs_root
+def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
+    ann = User(place, 12345, 12345, (LAB,))
+    eve = User(place, 12347, 12347)
+    store = place / "lab" / "store"
+    where = ("--store", store)
+    ann.run("record", place / "small.bag", "--shared", "-q", *where)
+    wait_for(lambda: not (store / "mongod/mongod.json").exists())
+    expected = ann.run(*COUNT, *where).out
+    before = {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)}
+    assert eve.run(*COUNT, *where).out == expected, "who can read asks by topic and time"
+    for command in (("rm", "-y", "small"), ("record", place / "small.bag"), ("reindex",)):
+        assert eve.run(*command, *where, code=None).code in {5, 6}
+    assert {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)} == before
+
+
+@needs_root
+def test_a_store_for_its_owner_alone(place: Path) -> None:
+    home = place / "open"
+    home.mkdir()
+    home.chmod(0o777)
+    ann, bob = User(place, 12345, umask=0o077), User(place, 12346)
+    ann.run("record", place / "small.bag", "-q", "--store", home / "store")
+    done = bob.run("ls", "--store", home / "store", code=5)
+    assert "Permission denied" in done.err
+
+
+@needs_root
+def test_root_takes_no_ones_server(place: Path) -> None:
+    ann = User(place, 12345, 12345, (LAB,))
+    store = place / "lab" / "store"
+    ann.run("record", place / "small.bag", "-q", "--store", store)
+    with hl.open(store) as opened:
+        assert opened.topic("/imu/data").where("header.seq >= 0").count() > 0
+    assert (store / "mongod-0").stat().st_uid == 0
+    theirs = [store / "mongod", *(store / "mongod").rglob("*")]
+    assert {p.stat().st_uid for p in theirs if p.exists()} == {ann.uid}
+    ann.run(*ASK, "--store", store)
+
+
+@needs_root
+def test_a_name_that_is_taken(place: Path) -> None:
+    ann = User(place, 12345, 12345, (LAB,))
+    store = place / "lab" / "store"
+    (store / "recordings").mkdir(parents=True)
+    for name in ("mongod", f"mongod-{ann.uid}"):
+        (store / name).mkdir()
+    write_settings(store, StoreSettings("x"))
+    make_shared(store)
+    done = ann.run("verify", "--store", store, code=6)
+    assert "belongs to another user" in done.err
+    assert "Remove it" in done.err
+
+
+# --- what others can and cannot read ---
+
+
+@needs_root
+def test_a_trusted_file_of_somebody_else_counts_for_nothing(place: Path) -> None:
+    ann = User(place, 12345)
+    script = (
+        "import sys; from hybridlog import consent\n"
+        "consent.remember('a', 'mongodb://h/x')\n"
+        "print(consent.is_trusted('a', 'mongodb://h/x'))"
+    )
+    assert ann.python("-c", script).lines == ["True"]
+    (ann.home / "state").chmod(0o755)
+    ask = "from hybridlog import consent; print(consent.is_trusted('a', 'mongodb://h/x'))"
+    file = ann.home / "state/hybridlog/trusted.json"
+    os.chown(file, 0, 0)
+    file.chmod(0o644)
+    assert ann.python("-c", ask).lines == ["False"]
+
+
+@needs_root
+def test_a_password_file_of_somebody_else(place: Path) -> None:
+    secret = place / "secret"
+    secret.write_text("hunter2")
+    secret.chmod(0o600)
+    script = (
+        "from hybridlog_storage.settings import with_password\n"
+        "try: print(with_password('mongodb://me@h/x'))\n"
+        "except Exception as error: print(error)"
+    )
+    done = User(place).python("-c", script, HYBRIDLOG_MONGO_PASSWORD_FILE=str(secret))
+    assert "Permission denied" in done.out
+    os.chown(secret, 65534, 65534)
+    done = User(place).python("-c", script, HYBRIDLOG_MONGO_PASSWORD_FILE=str(secret))
+    assert done.out == "mongodb://me:hunter2@h/x\n"
