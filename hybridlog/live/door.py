@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hybridlog_storage import files
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
 from hybridlog_storage.socket_directory import is_our_socket, new_socket
 
@@ -31,6 +32,7 @@ _ODD = re.compile(r"[^A-Za-z0-9._-]+")
 _SIGNS = "recorders"
 _SUFFIX = ".json"
 
+_LONGEST_SIGN = 1 << 16  # bytes
 _LONGEST = 1 << 20  # bytes of a request; answers may be longer
 _LONGEST_ANSWER = 1 << 26
 _PATIENCE_S = 5.0
@@ -58,13 +60,19 @@ class Door:
         try:
             self._socket.bind(str(self._path))
             self._socket.listen(_VISITORS)
-            self._sign.parent.mkdir(exist_ok=True)
-            content = json.dumps({"socket": str(self._path), "pid": os.getpid()})
-            self._sign.write_text(content + "\n", encoding="utf-8")
         except OSError as error:
             self.close()
             raise StoreError(
                 f"The recorder's socket {self._path} cannot be made: {error.strerror}."
+            ) from error
+        try:
+            self._put_up_sign()
+        except OSError as error:
+            self.close()
+            raise StoreError(
+                f"{self._sign}, which says where the recorder is reached, cannot be made: "
+                f"{error.strerror}. Check the owner of {self._sign.parent}, and that it is a "
+                f"folder and no symlink."
             ) from error
         self._places = threading.BoundedSemaphore(_VISITORS)
         self._thread = threading.Thread(target=self._serve, name="hybridlog-door", daemon=True)
@@ -76,11 +84,18 @@ class Door:
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
-        for path in (self._sign, self._path):
-            with suppress(OSError):
-                path.unlink()
+        with suppress(OSError):
+            files.unlink(self._sign, depth=files.IN_FOLDER)
+        with suppress(OSError):
+            self._path.unlink()
         with suppress(OSError):
             self._path.parent.rmdir()
+
+    def _put_up_sign(self) -> None:
+        with suppress(FileExistsError):
+            files.make_folder(self._sign.parent, depth=files.IN_STORE)
+        content = json.dumps({"socket": str(self._path), "pid": os.getpid()}) + "\n"
+        files.write_file(self._sign, content.encode(), depth=files.IN_FOLDER, sync=False)
 
     def _serve(self) -> None:
         while True:
@@ -123,12 +138,18 @@ def running(store: Path) -> list[str]:
         store: The store's directory.
     """
     found: list[tuple[float, str]] = []
-    for sign in (store / _SIGNS).glob(f"*{_SUFFIX}"):
+    try:
+        signs = files.names(store / _SIGNS, depth=files.IN_STORE)
+    except OSError:
+        return []
+    for sign, about in signs.items():
+        name, suffix = os.path.splitext(sign)  # noqa: PTH122 - not a path
+        if suffix != _SUFFIX or sign[0] == ".":
+            continue
         # A recorder that was killed has left its sign behind.
         with suppress(OSError, StoreError):
-            since = sign.stat().st_mtime
-            _connect(store, sign.stem).close()
-            found.append((since, sign.stem))
+            _connect(store, name).close()
+            found.append((about.st_mtime, name))
     return [name for _, name in sorted(found)]
 
 
@@ -179,8 +200,9 @@ def _connect(store: Path, name: str) -> socket.socket:
         OSError: Nobody answers.
     """
     try:
-        path = json.loads(_sign(store, name).read_text(encoding="utf-8"))["socket"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        text = files.read_file(_sign(store, name), _LONGEST_SIGN, depth=files.IN_FOLDER)
+        path = json.loads(text)["socket"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(_gone(name)) from error
     if not isinstance(path, str) or not is_our_socket(path):
         raise StoreError(_gone(name))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
+from hybridlog_storage.settings import LOGIN_CURE
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -71,6 +72,7 @@ _UNNAMED_CODE = "Location"
 """How the server begins the names of codes that have none: checks on the arguments of
 operators and expressions, thousands of them. Failures of the server itself have names."""
 _WRITING_STAGES = frozenset({"$out", "$merge"})
+_LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
 
@@ -781,13 +783,15 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
             f"A document cannot be sent to or read from MongoDB: {error}"
         ) from error
     except PyMongoError as error:
-        raise DatabaseError(f"MongoDB at {address}: {_first_words(error)}") from error
+        cure = f". {LOGIN_CURE}" if "password is required" in str(error) else ""
+        raise DatabaseError(f"MongoDB at {address}: {_first_words(error)}{cure}") from error
 
 
 def _refused(address: str, code: int, text: str) -> DatabaseError | DiskFullError:
     if code in _DISK_FULL or "No space left on device" in text:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
-    return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}")
+    cure = f" {LOGIN_CURE}" if code == _LOGIN_FAILED else ""
+    return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
 
 
 def _is_wrong_question(code: int, details: Mapping[str, Any] | None) -> bool:

