@@ -45,7 +45,7 @@ class Unfinished:
         Raises:
             OSError: It cannot be done.
         """
-        publish(self.path, final)
+        publish(self.path, final, depth=1)
         self.remove()
 
     def remove(self) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from hybridlog_storage import files
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.durability import left_over, sync_file, write_all
 from hybridlog_storage.messages import Buffer
@@ -57,30 +59,33 @@ class AppendFile:
 
     @classmethod
     def create(cls, path: Path) -> Self:
-        """A new file.
+        """A new file of a recording.
 
         Raises:
             OSError: It exists, or cannot be made.
         """
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
         if DIRECT:
             try:
-                return cls(os.open(path, flags | DIRECT, 0o644), direct=True)
+                return cls(files.open_file(path, flags | DIRECT), direct=True)
             except OSError as error:
                 if error.errno not in _REFUSED:
                     raise
                 with suppress(FileNotFoundError):
-                    path.unlink()  # some systems refuse only after they have made it
-        return cls(os.open(path, flags, 0o644))
+                    files.unlink(path)  # some systems refuse only after they have made it
+        return cls(files.open_file(path, flags))
 
     @classmethod
     def reopen(cls, path: Path) -> Self:
-        """A file that is there already.
+        """An ordinary file that is there already.
 
         Raises:
-            OSError: It cannot be opened for writing.
+            OSError: It cannot be opened for writing, or is no ordinary file.
         """
-        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
         return cls(fd, os.lseek(fd, 0, os.SEEK_END))
 
     @property
@@ -146,9 +151,23 @@ class AppendFile:
             OSError: when the system refuses.
         """
         assert self._stage is None
-        os.ftruncate(self._fd, position)
+        files.system.truncate(self._fd, position)
         os.lseek(self._fd, position, os.SEEK_SET)
         self.position = position
+
+    def rewrite(self, position: int, data: Buffer) -> None:
+        """Write over bytes that are in the file; not for direct writes.
+
+        Raises:
+            OSError: when the system refuses; some of them may have been written by then.
+        """
+        assert self._stage is None
+        assert position + len(data) <= self.position
+        pieces = [memoryview(data)]
+        while pieces:
+            done = files.system.pwritev(self._fd, pieces, position)
+            position += done
+            pieces = left_over(pieces, done)
 
     def finish(self, *, sync: bool) -> None:
         """Give the file its exact length and close it.
@@ -160,8 +179,8 @@ class AppendFile:
             OSError: when the system refuses.
         """
         try:
-            if self._stage is not None:
-                os.ftruncate(self._fd, self.position)
+            if os.fstat(self._fd).st_size != self.position:
+                files.system.truncate(self._fd, self.position)
             if sync:
                 self.sync()
         finally:
@@ -186,8 +205,9 @@ class AppendFile:
         self.position = position
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
-        with suppress(OSError):  # the error that led here says more
-            self.cut(position)
+        os.lseek(self._fd, position, os.SEEK_SET)
+        with suppress(OSError):  # what is added is written over it, and `finish` cuts the rest
+            files.system.truncate(self._fd, position)
 
     def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
         """Write pieces and what was staged behind them; keep what is behind the last block."""
@@ -205,7 +225,7 @@ class AppendFile:
     def _write(self, pieces: list[memoryview], position: int) -> None:
         while pieces:
             try:
-                done = os.pwritev(self._fd, pieces, position)
+                done = files.system.pwritev(self._fd, pieces, position)
             except OSError as error:
                 if error.errno not in _REFUSED:
                     raise

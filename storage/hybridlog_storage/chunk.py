@@ -5,9 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.checksum import crc32
+from hybridlog_storage.checksum import crc32, crc32_combine
+from hybridlog_storage.chunk_table import parts_of
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.segment_format import message_indexes, pack_arrivals
+from hybridlog_storage.segment_format import (
+    chunk_head,
+    index_order,
+    message_indexes,
+    pack_arrivals,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,18 +25,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PackedChunk:
-    """A closed chunk, compressed and indexed, ready for the file."""
+    """A closed chunk, compressed and indexed, ready for the file.
+
+    Attributes:
+        batch: Its messages over the uncompressed content; `channel` holds channel ids.
+        seq: int64[n], arrival numbers.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+        uncompressed_size: Bytes of content.
+        compression: MCAP name of the codec.
+        head: The chunk record up to the compressed content.
+        data: The compressed content.
+        crc: CRC-32 of head and data.
+        indexes: Message index record of each channel, by channel id.
+        indexes_crc: CRC-32 of all of them, one behind the other.
+        arrivals: The arrival numbers, packed.
+        parts: `PART`[c], what the chunk holds of each channel.
+    """
 
     batch: Batch
     seq: NDArray[np.int64]
     first: int
     last: int
     uncompressed_size: int
-    crc: int
     compression: str
+    head: bytes
     data: Buffer
+    crc: int
     indexes: dict[int, bytes]
+    indexes_crc: int
     arrivals: bytes
+    parts: NDArray[np.void]
 
 
 def pack(
@@ -41,40 +66,69 @@ def pack(
     *,
     hurried: bool = False,
 ) -> PackedChunk:
-    """Compress a chunk and build its message indexes; runs on a worker thread."""
+    """Compress a chunk, build its message indexes and checksums; runs on a worker thread."""
     compression, data = compressor.compress(batch.buffer, hurried=hurried)
+    order = index_order(batch.channel, batch.log_time)
+    parts, first, last = parts_of(batch, order)
+    content_crc = crc32(batch.buffer)
+    head = chunk_head(
+        first=first,
+        last=last,
+        uncompressed_size=size,
+        crc=content_crc,
+        compression=compression,
+        compressed_size=len(data),
+    )
+    if compression:
+        crc = crc32(data, crc32(head))
+    else:
+        crc = crc32_combine(crc32(head), content_crc, len(data))
+    starts = batch.offset - MESSAGE_HEAD.itemsize
+    indexes = message_indexes(batch.channel, batch.log_time, starts, order)
+    indexes_crc = 0
+    for index in indexes.values():
+        indexes_crc = crc32(index, indexes_crc)
     return PackedChunk(
-        batch,
-        seq,
-        int(batch.log_time.min()),
-        int(batch.log_time.max()),
-        size,
-        crc32(batch.buffer),
-        compression,
-        data,
-        message_indexes(batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize),
-        pack_arrivals(seq),
+        batch=batch,
+        seq=seq,
+        first=first,
+        last=last,
+        uncompressed_size=size,
+        compression=compression,
+        head=head,
+        data=data,
+        crc=crc,
+        indexes=indexes,
+        indexes_crc=indexes_crc,
+        arrivals=pack_arrivals(seq),
+        parts=parts,
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StoredChunk:
     """A chunk that lies in a segment, with its content at hand.
 
     Attributes:
         segment: Number of the segment in its recording.
+        number: Number of the chunk in its segment, from 0, in file order.
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of the message indexes and arrival numbers that follow it.
+        crc: CRC-32 of the chunk record as it is stored, its head included.
+        trailer_crc: CRC-32 of the trailer.
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
         compressed_size: Bytes of compressed content.
     """
 
     segment: int
+    number: int
     offset: int
     length: int
     trailer: int
+    crc: int
+    trailer_crc: int
     batch: Batch
     seq: NDArray[np.int64]
     compressed_size: int

@@ -3,25 +3,32 @@
 A segment that was being written when its recorder died ends somewhere, perhaps in the
 middle of a record. Everything before that is kept: the file is cut behind its last
 whole record, what is missing of the last chunk's indexes is written again from the
-chunk itself, and the segment is sealed like any other.
+chunk itself, and the segment is sealed like any other. A segment that was complete, and
+only had no final name yet, gets that name and nothing else.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from mcap.records import Attachment, DataEnd, Header, MessageIndex, Metadata
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
-from hybridlog_storage import durability
+from hybridlog_storage import durability, files
 from hybridlog_storage.append_file import BLOCK, AppendFile
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.chunk_table import parts_of
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.mcap_content import RECORD_HEAD
 from hybridlog_storage.mcap_scan import (
+    Item,
     PrivateRecord,
     ScanDamage,
     ScannedChunk,
@@ -29,21 +36,44 @@ from hybridlog_storage.mcap_scan import (
     scan,
 )
 from hybridlog_storage.messages import Batch, Schema
-from hybridlog_storage.segment_file import OPEN_SUFFIX, SegmentFile
+from hybridlog_storage.segment_check import damaged_pieces
+from hybridlog_storage.segment_file import (
+    OPEN_SUFFIX,
+    SEALED_SUFFIX,
+    OnSealing,
+    Sealed,
+    SegmentFile,
+    sealed_channels,
+    sealed_name,
+)
 from hybridlog_storage.segment_format import (
+    ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
     END_METADATA,
+    LOSSES_METADATA,
+    MAGIC,
     RECORDING_METADATA,
     ChunkSummary,
     arrival_record,
-    arrivals_of,
     channel_of,
+    index_order,
     json_metadata,
     json_of,
-    message_indexes,
     pack_arrivals,
 )
-from hybridlog_storage.segment_reader import check_format
+from hybridlog_storage.segment_reader import (
+    SegmentReader,
+    check_arrivals,
+    check_format,
+    indexes_of,
+    loss_rows,
+    right_head,
+)
+
+if TYPE_CHECKING:
+    from hybridlog_storage.segment_reader import SegmentSummary
+
+_PIECE = 1 << 20  # bytes that are read at once to sum them up
 
 
 @dataclass(slots=True)
@@ -53,7 +83,7 @@ class Recovered:
     Attributes:
         path: The sealed file, None when nothing at all was in it (it is removed then).
         messages: Messages kept.
-        cut_bytes: Bytes cut from the end.
+        cut_bytes: Bytes of records cut from the end; a torn summary is not counted.
         damage: What inside the file could not be read, in words.
     """
 
@@ -70,170 +100,433 @@ _RECORDS = (
     MessageIndex,
     Metadata,
     PrivateRecord,
-    ScannedChunk,
     SchemaRecord,
 )
 
 
 @dataclass(slots=True)
-class _Pending:
-    """The last chunk, while the records that belong to it are still to come."""
+class _Whole:
+    """A chunk whose content is right.
+
+    Attributes:
+        scanned: The record.
+        batch: Its messages.
+        head: What the record must start with.
+        indexes: Its message indexes as they must be, by channel id.
+    """
 
     scanned: ScannedChunk
     batch: Batch
-    indexes: dict[int, int]
+    head: bytes
+    indexes: dict[int, bytes]
+
+    @property
+    def place(self) -> str:
+        return f"chunk at byte {self.scanned.offset}"
+
+    @property
+    def end(self) -> int:
+        return self.scanned.offset + self.scanned.length
+
+
+class _DamagedError(SegmentError):
+    """What a record says cannot be right."""
 
 
 class _Rebuilder:
     """Follows the records of an open segment and remembers what a writer would have."""
 
-    def __init__(self, segment: SegmentFile, damage: list[str]) -> None:
+    def __init__(self, segment: SegmentFile, fd: int, damage: list[str]) -> None:
         self.segment = segment
         self.good_end = 0
         self.messages = 0
-        self.next_seq = 0
         self.has_recording = False
         self.has_end = False  # the recorder had written all, and only the summary is missing
-        self.pending: _Pending | None = None
+        self.is_empty = True  # no chunk or attachment was met, whole or not
+        self.resume: int | None = None  # where the record behind the last chunk must start
+        self._next_seq = 0
+        self._torn: _Whole | None = None  # the last chunk, while only its trailer may be torn
+        self._why_torn = ""
+        self._fd = fd
+        self._size = segment.position
         self._schemas: dict[int, SchemaRecord] = {}
         self._damage = damage
+        self._take_magic()
 
-    def take(self, offset: int, item: object, end: int) -> None:
+    def _take_magic(self) -> None:
+        found = os.pread(self._fd, len(MAGIC), 0)
+        if len(found) < len(MAGIC):
+            return
+        if found != MAGIC:
+            self._damage.append("byte 0: the file did not start as an MCAP file, and is mended")
+            self.segment.rewrite(0, MAGIC)
+        self.segment.table.other(MAGIC)
+        self.good_end = len(MAGIC)
+
+    def take(self, offset: int, item: Item) -> None:
+        """Take note of the next item of a scan."""
+        if offset < self.segment.table.end:
+            return  # it lies in the trailer of a chunk, which has been looked at as a whole
         if isinstance(item, ScanDamage):
             self._damage.append(f"byte {item.offset}: {item.reason}")
-        if not isinstance(item, _RECORDS):
-            return
+        elif isinstance(item, ScannedChunk):
+            self._forget_torn()
+            self.is_empty = False
+            self.good_end = offset + item.length
+            self._take_chunk(item)
+        elif isinstance(item, _RECORDS):
+            end = _record_end(self._fd, offset)
+            if self._torn is None or not _is_of_chunk(item):
+                self._forget_torn()
+                try:
+                    self._take_record(offset, item, end)
+                except _DamagedError as error:
+                    self._damage.append(f"byte {offset}: {error}")
+                    return
+            self.good_end = end
+
+    def _forget_torn(self) -> None:
+        """Something whole follows a chunk whose arrival numbers are lost."""
+        if self._torn is not None:
+            self._damage.append(f"{self._torn.place}: {self._why_torn}")
+            self._torn = None
+
+    def _take_record(self, offset: int, item: Item, end: int) -> None:
+        length = end - offset
         if isinstance(item, SchemaRecord):
             self._schemas[item.id] = item
             # The crash may have come before the channel that it was written for.
             schema = Schema(item.name, item.encoding, bytes(item.data))
             self.segment.schemas.setdefault(item.id, schema)
         elif isinstance(item, ChannelRecord):
-            channel = channel_of(item, self._schemas)
+            try:
+                channel = channel_of(item, self._schemas)
+            except SegmentError as error:
+                raise _DamagedError(str(error)) from error
             self.segment.define(item.id, item.schema_id, channel, write=False)
         elif isinstance(item, Metadata):
-            if item.name == RECORDING_METADATA:
-                recording = json_of(item)
-                check_format(recording, self.segment.path)
-                started = recording.get("next_seq")
-                self.next_seq = started if isinstance(started, int) else 0
-                self.has_recording = True
-            self.has_end |= item.name == END_METADATA
-            self.segment.note_metadata(item.name, offset, end - offset)
+            self._take_metadata(item)
+            self.segment.note_metadata(item.name, offset, length)
         elif isinstance(item, Attachment):
-            self.segment.note_attachment(item, offset, end - offset)
-        elif isinstance(item, ScannedChunk):
-            self._take_chunk(item)
-        elif isinstance(item, MessageIndex) and self.pending is not None:
-            self.pending.indexes[item.channel_id] = end - offset
-        elif isinstance(item, PrivateRecord) and item.opcode == ARRIVAL_OPCODE:
-            self._take_arrivals(item)
-        self.good_end = end
+            self.is_empty = False
+            self.segment.note_attachment(item, offset, length)
+        self._cover(offset)
+        record = os.pread(self._fd, length, offset)
+        self.segment.table.other(record, alone=isinstance(item, Metadata))
+
+    def _take_metadata(self, item: Metadata) -> None:
+        if item.name not in {RECORDING_METADATA, END_METADATA, LOSSES_METADATA}:
+            return
+        try:
+            value = json_of(item)
+            if item.name == LOSSES_METADATA:
+                loss_rows(value)
+        except SegmentError as error:
+            raise _DamagedError(str(error)) from error
+        if item.name == RECORDING_METADATA:
+            check_format(value, self.segment.path)
+            started = value.get("next_seq")
+            self._next_seq = max(self._next_seq, started if isinstance(started, int) else 0)
+            self.has_recording = True
+        self.has_end |= item.name == END_METADATA
+
+    def _cover(self, end: int) -> None:
+        """List bytes up to `end` that no record explains."""
+        start = self.segment.table.end
+        if end > start:
+            self.segment.table.stretch(end - start, _crc_of(self._fd, start, end - start))
 
     def _take_chunk(self, item: ScannedChunk) -> None:
-        if self.pending is not None:
-            place = self.pending.scanned.offset
-            self._damage.append(f"chunk at byte {place}: its arrival numbers are missing")
         try:
-            batch = parse_content(item.content_bytes()).batch
+            chunk = self._whole(item)
         except SegmentError as error:
             self._damage.append(f"chunk at byte {item.offset}: {error}")
             return
-        self.pending = _Pending(item, batch, {})
-
-    def _take_arrivals(self, item: PrivateRecord) -> None:
-        pending, self.pending = self.pending, None
-        if pending is None:
-            return
+        indexes = b"".join(chunk.indexes.values())
+        trailer = self._trailer(chunk.end, len(indexes))
         try:
-            _, seq = arrivals_of(item.data, len(pending.batch))
+            seq = check_arrivals(indexes + trailer[len(indexes) :], item.offset, len(chunk.batch))
         except SegmentError as error:
-            self._damage.append(f"chunk at byte {pending.scanned.offset}: {error}")
+            self._torn, self._why_torn = chunk, str(error)
             return
-        self.next_seq = max(self.next_seq, int(seq.max()) + 1)
-        self._note(pending)
+        self._mend_head(chunk)
+        if trailer[: len(indexes)] != indexes:
+            self._damage.append(f"{chunk.place}: its message indexes were damaged, and are mended")
+            self.segment.rewrite(chunk.end, indexes)
+        self._note(chunk, len(trailer), int(seq.max()))
 
-    def finish_torn(self) -> None:
-        """Complete the last chunk when the crash came between it and its indexes."""
-        pending, self.pending = self.pending, None
-        if pending is None:
+    def _whole(self, item: ScannedChunk) -> _Whole:
+        content = item.content_bytes(check_crc=False)
+        if item.uncompressed_crc != crc32(content):
+            raise SegmentError("its checksum differs")
+        batch = parse_content(content).batch
+        if not len(batch):
+            raise SegmentError("it holds no message")
+        lost = set(batch.channel.tolist()) - self.segment.channels.keys()
+        if lost:
+            raise SegmentError(f"the definition of its channel {min(lost)} is lost")
+        head = right_head(
+            batch, len(content), item.uncompressed_crc, item.compression, len(item.data)
+        )
+        if item.length != len(head) + len(item.data):
+            raise SegmentError("the length of its record is wrong")
+        return _Whole(item, batch, head, indexes_of(batch))
+
+    def _mend_head(self, chunk: _Whole) -> None:
+        if os.pread(self._fd, len(chunk.head), chunk.scanned.offset) != chunk.head:
+            self._damage.append(f"{chunk.place}: its head was damaged, and is mended")
+            self.segment.rewrite(chunk.scanned.offset, chunk.head)
+
+    def _trailer(self, start: int, indexes: int) -> bytes:
+        """What stands where the trailer of a chunk must be; nothing if it cannot be whole."""
+        head = os.pread(self._fd, ARRIVAL_HEAD.size, start + indexes)
+        if len(head) < ARRIVAL_HEAD.size:
+            return b""
+        opcode, length = RECORD_HEAD.unpack_from(head)
+        size = indexes + RECORD_HEAD.size + length
+        if opcode != ARRIVAL_OPCODE or start + size > self._size:
+            return b""
+        return os.pread(self._fd, size, start)
+
+    def finish(self) -> None:
+        """Cut what is torn; complete the last chunk when only its trailer is."""
+        chunk, self._torn = self._torn, None
+        if chunk is None:
+            self.segment.cut(self.good_end)
+            self._cover(self.good_end)
             return
-        chunk, batch = pending.scanned, pending.batch
-        seq = np.arange(self.next_seq, self.next_seq + len(batch), dtype=np.int64)
-        indexes = message_indexes(
-            batch.channel, batch.log_time, batch.offset - MESSAGE_HEAD.itemsize
+        count = len(chunk.batch)
+        seq = np.arange(self._next_seq, self._next_seq + count, dtype=np.int64)
+        arrivals = arrival_record(chunk.scanned.offset, pack_arrivals(seq))
+        trailer = b"".join((*chunk.indexes.values(), arrivals))
+        self.segment.cut(chunk.end)
+        self._mend_head(chunk)
+        self.segment.append_trailer(trailer)
+        self._note(chunk, len(trailer), int(seq.max()))
+
+    def _note(self, chunk: _Whole, trailer: int, last_seq: int) -> None:
+        scanned, batch = chunk.scanned, chunk.batch
+        self._cover(scanned.offset)
+        parts, first, last = parts_of(batch, index_order(batch.channel, batch.log_time))
+        self.segment.note_chunk(
+            ChunkSummary(
+                first=first,
+                last=last,
+                offset=scanned.offset,
+                length=scanned.length,
+                indexes={channel: len(index) for channel, index in chunk.indexes.items()},
+                compression=scanned.compression,
+                compressed_size=len(scanned.data),
+                uncompressed_size=scanned.uncompressed_size,
+            ),
+            parts,
+            trailer=trailer,
+            crc=_crc_of(self._fd, scanned.offset, scanned.length),
+            trailer_crc=_crc_of(self._fd, chunk.end, trailer),
         )
-        self.segment.cut(chunk.offset + chunk.length)
-        self.segment.append_trailer(indexes, arrival_record(chunk.offset, pack_arrivals(seq)))
-        pending.indexes = {channel: len(data) for channel, data in indexes.items()}
-        self._note(pending)
-
-    def _note(self, pending: _Pending) -> None:
-        chunk = pending.scanned
-        self.messages += len(pending.batch)
-        log_time = pending.batch.log_time
-        ids, counts = np.unique(pending.batch.channel, return_counts=True)
-        summary = ChunkSummary(
-            first=int(log_time.min()),
-            last=int(log_time.max()),
-            offset=chunk.offset,
-            length=chunk.length,
-            indexes=pending.indexes,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            uncompressed_size=chunk.uncompressed_size,
-        )
-        self.segment.note_chunk(summary, dict(zip(ids.tolist(), counts.tolist(), strict=True)))
+        self.messages += len(batch)
+        self._next_seq = max(self._next_seq, last_seq + 1)
+        self.good_end = self.resume = chunk.end + trailer
 
 
-def recover_segment(path: Path) -> Recovered:
+def recover_segment(
+    path: Path,
+    on_sealing: OnSealing | None = None,
+    *,
+    recording: Mapping[str, object] | None = None,
+) -> Recovered:
     """Cut, complete and seal one open segment.
 
     Args:
         path: A file whose name ends in `.mcap.open`, which nobody is writing.
+        on_sealing: Told of the segment when it is complete and on the disk, before it gets
+            its final name. When it fails, the file stays, and this can be called again.
+        recording: Catalog entry of the recording, for a segment whose own is damaged.
 
     Raises:
-        StoreError: it cannot be written, or is of a newer format.
-        DiskFullError: no room for the summary; the file stays as it was.
+        StoreError: It cannot be written, is of another format, or is sealed already under
+            its final name. The file stays as it was.
+        DiskFullError: No room for the summary; all whole records stay.
     """
+    tell = on_sealing or (lambda _: None)
     number = int(path.name.removesuffix(OPEN_SUFFIX))
+    final = path.with_name(sealed_name(number))
+    try:
+        with suppress(FileNotFoundError):
+            files.status(final)
+            raise StoreError(
+                f"{final} is sealed, and {path} lies beside it. Move one of them out of the store."
+            )
+        found = _complete(path, number)
+        if found is None:
+            return _rebuild(path, number, tell, recording)
+        tell(found)
+        durability.publish(path, final, depth=files.IN_RECORDING)
+        return Recovered(final, sum(channel.messages for channel in found.channels))
+    except OSError as error:
+        raise durability.explain(error, path, "recovering") from error
+
+
+def _complete(path: Path, number: int) -> Sealed | None:
+    """A segment that lacks nothing but its final name, once it is forced to the disk.
+
+    Returns:
+        None when something is missing or damaged.
+    """
+    file = AppendFile.reopen(path)
+    try:
+        summary = _proven_summary(path, number)
+        if summary is None:
+            return None
+        if summary.size < file.position:
+            file.cut(summary.size)
+        file.sync()
+    finally:
+        file.close()
+    channels = sealed_channels(summary.table, summary.channels)
+    return Sealed(number, sealed_name(number), summary.size, summary.digest, channels)
+
+
+def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
+    """The summary of an open segment, if there is one and every byte is as it says."""
+    with SegmentReader(path, number) as reader:
+        # The zeros that fill the last block of a direct write are no part of the segment.
+        last = min(reader.size, BLOCK)
+        reader.size -= last - len(bytes(reader.read(reader.size - last, last)).rstrip(b"\0"))
+        try:
+            summary = reader.summary()
+        except SegmentError:
+            return None
+        return None if any(damaged_pieces(reader, summary.table)) else summary
+
+
+def _rebuild(
+    path: Path, number: int, tell: OnSealing, recording: Mapping[str, object] | None
+) -> Recovered:
+    """Seal a segment by what can be read of it."""
     damage: list[str] = []
+    segment = SegmentFile(path, number, AppendFile.reopen(path))
     try:
-        segment = SegmentFile(path, number, AppendFile.reopen(path))
-    except OSError as error:
-        raise durability.explain(error, path, "recovering") from error
-    size = segment.position
-    rebuilder = _Rebuilder(segment, damage)
-    try:
-        with path.open("rb") as file:
-            fd = file.fileno()
-            for offset, item in scan(file, size=size):
-                if isinstance(item, ScanDamage) and _is_padding(fd, item.offset, size):
-                    size = item.offset
-                    continue
-                if isinstance(item, DataEnd):
-                    break  # behind it is a summary, whole or not, which is made anew
-                if isinstance(item, ScannedChunk):
-                    end = offset + item.length
-                else:
-                    end = _record_end(fd, offset)
-                rebuilder.take(offset, item, end)
+        with os.fdopen(files.open_file(path, os.O_RDONLY), "rb") as file:
+            rebuilder = _Rebuilder(segment, file.fileno(), damage)
+            end = _follow(file, segment.position, rebuilder)
+            if not rebuilder.has_recording and rebuilder.is_empty:
+                segment.abandon()
+                files.unlink(path)
+                files.sync_folder(path.parent)
+                return Recovered(None, cut_bytes=end, damage=damage)
+            if not rebuilder.has_recording and recording is None:
+                raise SegmentError(
+                    f"{path} was left open, and what it says of its recording is damaged. "
+                    "Move it out of the store, and see what is left with `mcap recover`."
+                )
+            cut_bytes = end - rebuilder.good_end
+            rebuilder.finish()
         if not rebuilder.has_recording:
-            segment.abandon()
-            path.unlink()
-            durability.sync_directory(path.parent)
-            return Recovered(None, cut_bytes=size, damage=damage)
-        cut_bytes = size - rebuilder.good_end
-        segment.cut(rebuilder.good_end)
-        rebuilder.finish_torn()
-    except OSError as error:
+            segment.add_recording(recording or {})
+        if damage or not rebuilder.has_end:
+            end_note = {"status": "recovered", "cut_bytes": cut_bytes, "damage": damage}
+            segment.add_metadata(json_metadata(END_METADATA, end_note))
+        sealed = segment.seal(sync=True, on_sealing=tell)
+    finally:
         segment.abandon()
-        raise durability.explain(error, path, "recovering") from error
-    if damage or not rebuilder.has_end:
-        end_note = {"status": "recovered", "cut_bytes": cut_bytes, "damage": damage}
-        segment.add_metadata(json_metadata(END_METADATA, end_note))
-    sealed = segment.seal()
     return Recovered(sealed, rebuilder.messages, cut_bytes, damage)
+
+
+def rebuild_summary(path: Path, digest: str) -> bool:
+    """Make the damaged end of a sealed segment again, if it comes out as it was.
+
+    The summary follows from what lies before it. It is made in a copy, which takes the
+    segment's place only when its digest is the one that the segment had.
+
+    Args:
+        path: The sealed segment.
+        digest: Of the summary that it was sealed with.
+
+    Returns:
+        Whether the segment is whole again; if not, it is as before.
+
+    Raises:
+        StoreError: It cannot be read, or the copy cannot be written.
+        DiskFullError: There is no room for the copy.
+    """
+    number = int(path.name.removesuffix(SEALED_SUFFIX))
+    copy = path.with_name(f".{path.name}.rebuilt")
+    try:
+        _copy(path, copy)
+        try:
+            if not _is_rebuilt(copy, number, digest):
+                return False
+            durability.publish(copy, path, depth=files.IN_RECORDING)
+            return True
+        finally:
+            with suppress(FileNotFoundError):
+                files.unlink(copy)
+    except OSError as error:
+        raise durability.explain(error, path, "rebuilding") from error
+
+
+def _is_rebuilt(path: Path, number: int, digest: str) -> bool:
+    """Cut off the end of a copy of a segment, make it again, and say whether it is right."""
+    damage: list[str] = []
+    segment = SegmentFile(path, number, AppendFile.reopen(path))
+    try:
+        with os.fdopen(files.open_file(path, os.O_RDONLY), "rb") as file:
+            rebuilder = _Rebuilder(segment, file.fileno(), damage)
+            _follow(file, segment.position, rebuilder)
+            if damage or not rebuilder.has_recording:
+                return False
+            rebuilder.finish()
+        if segment.complete().digest != digest:
+            return False
+        segment.sync()
+    finally:
+        segment.abandon()
+    with SegmentReader(path, number) as reader:
+        return not any(damaged_pieces(reader, reader.summary().table))
+
+
+def _copy(source: Path, target: Path) -> None:
+    fd = files.open_file(source, os.O_RDONLY)
+    try:
+        out = files.open_file(target, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+        try:
+            while piece := os.read(fd, 8 << 20):
+                durability.write_all(out, [piece])
+        finally:
+            os.close(out)
+    finally:
+        os.close(fd)
+
+
+def _follow(file: BinaryIO, size: int, rebuilder: _Rebuilder) -> int:
+    """Show every record to a rebuilder; returns the byte where the data ends.
+
+    Where a damaged record behind a chunk has led the scan astray, it starts again at the
+    byte where the next record must be.
+    """
+    start: int | None = len(MAGIC)
+    while start is not None:
+        first, start = start, None
+        for offset, item in scan(file, size=size, start=first):
+            if rebuilder.resume is not None and offset >= rebuilder.resume:
+                expected, rebuilder.resume = rebuilder.resume, None
+                if offset > expected:
+                    start = expected
+                    break
+            if isinstance(item, ScanDamage) and _is_padding(file.fileno(), item.offset, size):
+                size = item.offset
+            elif isinstance(item, DataEnd):
+                return offset  # behind it is a summary, whole or not, which is made anew
+            else:
+                rebuilder.take(offset, item)
+    return size
+
+
+def _is_of_chunk(item: Item) -> bool:
+    """Whether a record belongs to the chunk before it."""
+    is_arrivals = isinstance(item, PrivateRecord) and item.opcode == ARRIVAL_OPCODE
+    return is_arrivals or isinstance(item, MessageIndex)
 
 
 def _is_padding(fd: int, offset: int, size: int) -> bool:
@@ -247,3 +540,16 @@ def _record_end(fd: int, offset: int) -> int:
     if len(head) < RECORD_HEAD.size:
         return offset
     return offset + RECORD_HEAD.size + int(RECORD_HEAD.unpack(head)[1])
+
+
+def _crc_of(fd: int, offset: int, length: int) -> int:
+    """CRC-32 of some bytes of a file."""
+    crc = 0
+    while length > 0:
+        piece = os.pread(fd, min(length, _PIECE), offset)
+        if not piece:
+            raise OSError(0, "it has become shorter")
+        crc = crc32(piece, crc)
+        offset += len(piece)
+        length -= len(piece)
+    return crc

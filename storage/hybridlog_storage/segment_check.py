@@ -1,70 +1,42 @@
-"""What in a sealed segment no checksum covers, held against what one does.
-
-Chunks and the summary have checksums. Around the chunks stand records without one:
-definitions, message indexes, metadata. hybridlog reads around damage in most of them,
-but another MCAP reader may not, so they are to be as they were written.
-"""
+"""Every byte of a sealed segment, held against the checksums in its summary."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import replace
 from typing import TYPE_CHECKING, Self
 
-from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Header, Metadata, Schema
-
-from hybridlog_storage.append_file import BLOCK
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
-from hybridlog_storage.mcap_scan import MAGIC, read_summary
-from hybridlog_storage.segment_format import (
-    ARRIVAL_OPCODE,
-    CHUNK_HEAD,
-    PADDING_OPCODE,
-    PROFILE,
-    index_offsets,
-    message_indexes,
-)
+from hybridlog_storage.mcap_scan import ScanDamage, ScannedChunk, scan
+from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from mcap.summary import Summary
-
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.mcap_content import Record
-
-_HEAD = RECORD_HEAD.size
-_DATA_END_SIZE = _HEAD + 4
-_FOOTER_SIZE = _HEAD + 20
-_OF_CHUNKS = frozenset({int(Opcode.MESSAGE_INDEX), ARRIVAL_OPCODE})
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.segment_reader import SegmentSummary
 
 
 class SegmentCheck:
-    """Checks the records of one sealed segment; a context manager.
+    """Checks one sealed segment; a context manager.
 
     Args:
         path: The segment.
 
     Raises:
-        SegmentError: It cannot be opened, or has no readable summary.
+        SegmentError: It cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.summary: SegmentSummary | None = None
+        """What the segment says of itself; None when that is damaged anywhere."""
+        self._reader = SegmentReader(path, 0)
+        self._table: ChunkTable | None = None
+        self._problem = ""
         try:
-            self._file = path.open("rb")
-        except OSError as error:
-            raise SegmentError(f"Segment {path} cannot be opened: {error.strerror}.") from error
-        self._size = os.fstat(self._file.fileno()).st_size
-        summary = read_summary(self._file, self._size)
-        if summary is None:
-            self._file.close()
-            raise SegmentError(f"Segment {path} has no readable summary.")
-        self._summary: Summary = summary
-        self._listed = {listed.chunk_start_offset: listed for listed in summary.chunk_indexes}
+            self._table = self._reader.table()
+            self.summary = self._reader.summary()
+        except SegmentError as error:
+            self._problem = str(error)
 
     def __enter__(self) -> Self:
         """The check itself."""
@@ -72,103 +44,73 @@ class SegmentCheck:
 
     def __exit__(self, *_: object) -> None:
         """Close."""
-        self._file.close()
+        self._reader.close()
 
-    def chunk(self, chunk: StoredChunk) -> str | None:
-        """What is wrong around a chunk whose content is right.
+    def problems(self, progress: Callable[[int], None] | None = None) -> Iterator[tuple[int, str]]:
+        """All that is wrong.
+
+        Without a summary only what has a checksum of its own can be checked: the content of
+        chunks and attachments.
 
         Args:
-            chunk: As it was read from this segment.
+            progress: Called with the byte up to which the segment has been read.
+
+        Yields:
+            Byte and description, in file order; a damaged summary comes first.
         """
-        batch = chunk.batch
-        _, _, first, last, size, _ = CHUNK_HEAD.unpack(self._read(chunk.offset, CHUNK_HEAD.size))
-        if (first, last) != (int(batch.log_time.min()), int(batch.log_time.max())):
-            return "its head names other times than those of its messages"
-        starts = batch.offset - MESSAGE_HEAD.itemsize
-        indexes = message_indexes(batch.channel, batch.log_time, starts)
-        want = b"".join(indexes.values())
-        at = chunk.offset + chunk.length
-        if self._read(at, len(want)) != want or self._head(at + len(want))[0] != ARRIVAL_OPCODE:
-            return "its message indexes are damaged"
-        listed = self._listed.get(chunk.offset)
-        if listed is None or listed != replace(
-            listed,
-            message_start_time=first,
-            message_end_time=last,
-            message_index_offsets=index_offsets(
-                {channel: len(index) for channel, index in indexes.items()}, at
-            ),
-            message_index_length=len(want),
-            compressed_size=chunk.compressed_size,
-            uncompressed_size=size,
-        ):
-            return "the summary lists it otherwise than it is"
-        return None
+        if self._table is not None:
+            problems = list(damaged_pieces(self._reader, self._table, progress))
+            yield from problems
+            if self.summary is None and not problems:
+                yield self._table.end, self._problem
+            return
+        yield max(self._reader.size - 1, 0), self._problem
+        with self._reader.stream() as file:
+            for offset, item in scan(file, size=self._reader.size):
+                if isinstance(item, ScanDamage):
+                    yield item.offset, item.reason
+                elif isinstance(item, ScannedChunk):
+                    try:
+                        item.content_bytes()
+                    except SegmentError as error:
+                        yield offset, f"a chunk is damaged: {error}"
+                if progress is not None:
+                    progress(offset)
 
-    def between_chunks(self) -> Iterator[tuple[int, str]]:
-        """Byte and description of all that is wrong outside of chunks and their indexes."""
-        at, end = len(MAGIC), self._end_of_data()
-        # A chunk that is said to lie behind the data is found by who reads it.
-        starts = [*sorted(start for start in self._listed if start < end), end]
-        if self._read(0, at) != MAGIC:
-            yield 0, "the file does not start as an MCAP file"
-        for start in starts:
-            while at < start:
-                opcode, length = self._head(at)
-                if at + _HEAD + length > start:
-                    yield at, "no record starts here"
-                    break
-                problem = self._problem(opcode, at, length)
-                if problem is not None:
-                    yield at, problem
-                at += _HEAD + length
-            listed = self._listed.get(start)
-            at = end if listed is None else start + listed.chunk_length
-        if self._head(end) != (Opcode.DATA_END, 4):
-            yield end, "the record that ends the data is damaged"
 
-    def _end_of_data(self) -> int:
-        footer = self._size - len(MAGIC) - _FOOTER_SIZE
-        start = int.from_bytes(self._read(footer + _HEAD, 8), "little")
-        return start - _DATA_END_SIZE
+def damaged_pieces(
+    reader: SegmentReader, table: ChunkTable, progress: Callable[[int], None] | None = None
+) -> Iterator[tuple[int, str]]:
+    """The parts of a segment that differ from their checksums.
 
-    def _problem(self, opcode: int, at: int, length: int) -> str | None:
-        if opcode in _OF_CHUNKS:
-            return None  # `chunk` compares those
-        if opcode == PADDING_OPCODE:
-            damaged = length >= BLOCK or any(self._read(at + _HEAD, length))
-            return "the padding before a chunk is damaged" if damaged else None
+    Args:
+        reader: The segment.
+        table: Of its summary.
+        progress: Called with the byte up to which the segment has been read.
+
+    Yields:
+        Byte and description, in file order.
+    """
+    for start, length, crc, what in _pieces(table):
         try:
-            record, _ = read_record(opcode, self._read(at + _HEAD, length))
+            if reader.checksum(start, length) != crc:
+                yield start, f"{what} changed: the checksum of {length} bytes differs"
         except SegmentError as error:
-            return str(error)
-        return self._misfit(record, at)
+            yield start, str(error)
+        if progress is not None:
+            progress(start + length)
 
-    def _misfit(self, record: Record | None, at: int) -> str | None:
-        summary = self._summary
-        if isinstance(record, Schema):
-            if summary.schemas.get(record.id) != record:
-                return "a schema differs from the summary's"
-        elif isinstance(record, Channel):
-            if summary.channels.get(record.id) != record:
-                return "a channel differs from the summary's"
-        elif isinstance(record, Metadata):
-            if all((i.offset, i.name) != (at, record.name) for i in summary.metadata_indexes):
-                return "a metadata record differs from the summary's index"
-        elif isinstance(record, Header):
-            if record.profile != PROFILE:
-                return f"the header names the profile {record.profile!r}"
-        elif record is None or isinstance(record, DataEnd):
-            return "no segment has such a record here"
-        return None
 
-    def _head(self, at: int) -> tuple[int, int]:
-        """Opcode and length of the record at a byte; zeros at the end of the file."""
-        opcode, length = RECORD_HEAD.unpack(self._read(at, _HEAD).ljust(_HEAD, b"\0"))
-        return opcode, length
-
-    def _read(self, at: int, length: int) -> bytes:
-        try:
-            return os.pread(self._file.fileno(), max(min(length, self._size - at), 0), at)
-        except OSError as error:
-            raise SegmentError(f"{self._path} cannot be read: {error.strerror}.") from error
+def _pieces(table: ChunkTable) -> list[tuple[int, int, int, str]]:
+    """Start, bytes, checksum and description of every part that a table lists."""
+    found: list[tuple[int, int, int, str]] = []
+    names = ("offset", "length", "trailer", "crc", "trailer_crc")
+    columns = (table.chunks[name].tolist() for name in names)
+    rows = zip(*columns, strict=True)
+    for number, (offset, length, trailer, crc, trailer_crc) in enumerate(rows):
+        found.append((offset, length, crc, f"chunk {number}"))
+        what = f"the message indexes or arrival numbers of chunk {number}"
+        found.append((offset + length, trailer, trailer_crc, what))
+    for offset, length, crc in table.others.tolist():
+        found.append((offset, length, crc, "what stands between chunks"))
+    return sorted(found)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,12 +23,15 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hybridlog_storage import durability
+from hybridlog_storage import durability, files
 from hybridlog_storage.append_file import AppendFile
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.chunk_table import ChunkTable, TableBuilder
+from hybridlog_storage.errors import StoreError
 from hybridlog_storage.mcap_content import RECORD_HEAD
 from hybridlog_storage.segment_format import (
+    CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LIBRARY,
     MAGIC,
@@ -35,9 +40,7 @@ from hybridlog_storage.segment_format import (
     ChunkSummary,
     arrival_record,
     channel_record,
-    chunk_head,
     chunk_index_record,
-    entries_of,
     json_metadata,
     padding_record,
     record_bytes,
@@ -45,41 +48,131 @@ from hybridlog_storage.segment_format import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hybridlog_storage.messages import Buffer, Channel, Schema
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
 
 
+@dataclass(frozen=True, slots=True)
+class SealedChannel:
+    """What a sealed segment holds of one channel.
+
+    Attributes:
+        id: The channel's id in the recording.
+        topic: Its topic.
+        messages: Number of its messages, one at least.
+        payload_bytes: Bytes of their payloads.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+    """
+
+    id: int
+    topic: str
+    messages: int
+    payload_bytes: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """A complete segment, for the journal of its recording.
+
+    Attributes:
+        segment: Its number.
+        file: Its name once it is sealed.
+        bytes: Its size.
+        digest: `sha256:` and the hex digest of its bytes from the start of the summary on.
+            The summary has checksums of all bytes before, so this proves the whole file.
+        channels: By channel id; only those with messages.
+    """
+
+    segment: int
+    file: str
+    bytes: int
+    digest: str
+    channels: tuple[SealedChannel, ...]
+
+
+OnSealing = Callable[[Sealed], None]
+"""Called when a segment is complete and on the disk, before it gets its final name."""
+
+
+def digest_of(tail: Buffer) -> str:
+    """Digest of a segment's bytes from the start of its summary to its end."""
+    return f"sha256:{hashlib.sha256(tail).hexdigest()}"
+
+
+def sealed_name(number: int) -> str:
+    """File name of a sealed segment."""
+    return f"{number:06d}{SEALED_SUFFIX}"
+
+
+def sealed_channels(
+    table: ChunkTable, channels: Mapping[int, Channel]
+) -> tuple[SealedChannel, ...]:
+    """What a segment holds of each channel that has messages in it."""
+    rows = table.by_channel()
+    names = ("channel", "messages", "payload_bytes", "first", "last")
+    columns = (rows[name].tolist() for name in names)
+    return tuple(
+        SealedChannel(number, channels[number].topic, messages, payload_bytes, first, last)
+        for number, messages, payload_bytes, first, last in zip(*columns, strict=True)
+    )
+
+
 class SegmentFile:
-    """One open segment: appends whole records, keeps what the summary will say."""
+    """One open segment: appends whole records, keeps what the summary will say.
+
+    Args:
+        path: The file; its name ends in `.mcap.open`.
+        number: Number of the segment.
+        file: The open file; a new one, or one whose records are about to be noted.
+    """
 
     def __init__(self, path: Path, number: int, file: AppendFile) -> None:
         self.path = path
         self.number = number
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, tuple[int, Channel]] = {}
+        self.table = TableBuilder()
+        """What lies in the file, with checksums."""
         self._file = file
-        self.chunks = 0
-        """Chunks in the file."""
         self._chunk_indexes = bytearray()  # as records: of a long segment there are many
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._first: int | None = None
         self._last = 0
+        self._sealed: Sealed | None = None  # once the file is complete
+        self._finished = False  # and closed
 
     @classmethod
     def create(
-        cls, directory: Path, number: int, recording: Mapping[str, object], next_seq: int = 0
+        cls,
+        directory: Path,
+        number: int,
+        recording: Mapping[str, object],
+        next_seq: int = 0,
+        *,
+        sync: bool = False,
     ) -> SegmentFile:
         """Start a new segment file.
 
         Args:
             directory: The recording's directory.
             number: Segment number, also the file's name.
-            recording: Catalog entry of the recording, kept in the file for `reindex`.
+            recording: Catalog entry of the recording, kept in the file.
             next_seq: No message of the segments before has this arrival number or a later one.
+            sync: Return once the file's name is on the disk.
+
+        Raises:
+            StoreError: The file cannot be made.
+            DiskFullError: There is no room for it; nothing is left behind.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
         try:
@@ -87,24 +180,28 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, path, "creating") from error
         segment = cls(path, number, file)
+        head = [MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))]
         try:
-            segment._write([MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))])
-            segment.add_metadata(
-                json_metadata(
-                    RECORDING_METADATA,
-                    {
-                        **recording,
-                        "segment": number,
-                        "format": FORMAT_VERSION,
-                        "next_seq": next_seq,
-                    },
-                )
-            )
+            segment._write(head)
+            segment.add_recording(recording, next_seq)
+            if sync:
+                segment._sync_folder()
         except BaseException:
             file.close()
-            path.unlink()  # or the next try would find it there
+            with suppress(OSError):
+                files.unlink(path)  # or the next try would find it there
             raise
         return segment
+
+    @property
+    def chunks(self) -> int:
+        """Chunks in the file: the number of the next one."""
+        return self.table.chunks
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the summary is written; nothing can be added any more."""
+        return self._sealed is not None
 
     @property
     def position(self) -> int:
@@ -122,18 +219,26 @@ class SegmentFile:
         """Make a channel known; its schema first if this is the first use in the file."""
         parts: list[bytes] = []
         if schema_id and channel.schema is not None and schema_id not in self.schemas:
-            self.schemas[schema_id] = channel.schema
             parts.append(record_bytes(schema_record(schema_id, channel.schema)))
-        self.channels[channel_id] = (schema_id, channel)
         parts.append(record_bytes(channel_record(channel_id, schema_id, channel)))
         if write:
             self._write(parts)
+        if schema_id and channel.schema is not None:
+            self.schemas.setdefault(schema_id, channel.schema)
+        self.channels[channel_id] = (schema_id, channel)
+
+    def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
+        """Append what the segment says of its recording and of itself."""
+        about = {"segment": self.number, "format": FORMAT_VERSION, "next_seq": next_seq}
+        self.add_metadata(json_metadata(RECORDING_METADATA, {**recording, **about}))
 
     def add_metadata(self, record: Metadata) -> None:
         """Append a metadata record."""
         data = record_bytes(record)
-        self.note_metadata(record.name, self.position, len(data))
-        self._write([data])
+        offset = self.position
+        self._append([data])
+        self.table.other(data, alone=True)
+        self.note_metadata(record.name, offset, len(data))
 
     def note_metadata(self, name: str, offset: int, length: int) -> None:
         """List a metadata record that is in the file already."""
@@ -142,8 +247,9 @@ class SegmentFile:
     def add_attachment(self, record: Attachment) -> None:
         """Append an attachment."""
         data = record_bytes(record)
-        self.note_attachment(record, self.position, len(data))
+        offset = self.position
         self._write([data])
+        self.note_attachment(record, offset, len(data))
 
     def note_attachment(self, record: Attachment, offset: int, length: int) -> None:
         """List an attachment that is in the file already."""
@@ -171,64 +277,99 @@ class SegmentFile:
         """
         parts: list[Buffer] = []
         stored: list[StoredChunk] = []
+        paddings: list[bytes] = []
         at = self.position
         for chunk in chunks:
             if stored and at >= end:
                 break
-            head = chunk_head(
-                first=chunk.first,
-                last=chunk.last,
-                uncompressed_size=chunk.uncompressed_size,
-                crc=chunk.crc,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-            )
-            padding = self._padding(chunk.data, at, len(head))
+            padding = self._padding(chunk.data, at, len(chunk.head))
             offset = at + len(padding)
-            length = len(head) + len(chunk.data)
-            trailer = [*chunk.indexes.values(), arrival_record(offset, chunk.arrivals)]
-            trailer_length = sum(map(len, trailer))
-            parts += [padding, head, chunk.data, *trailer]
+            length = len(chunk.head) + len(chunk.data)
+            arrivals = arrival_record(offset, chunk.arrivals)
+            trailer_length = sum(map(len, chunk.indexes.values())) + len(arrivals)
+            parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
             at = offset + length + trailer_length
+            paddings.append(padding)
             stored.append(
                 StoredChunk(
-                    self.number,
-                    offset,
-                    length,
-                    trailer_length,
-                    chunk.batch,
-                    chunk.seq,
-                    len(chunk.data),
+                    segment=self.number,
+                    number=self.chunks + len(stored),
+                    offset=offset,
+                    length=length,
+                    trailer=trailer_length,
+                    crc=chunk.crc,
+                    trailer_crc=crc32(arrivals, chunk.indexes_crc),
+                    batch=chunk.batch,
+                    seq=chunk.seq,
+                    compressed_size=len(chunk.data),
                 )
             )
-        self._write(parts)
-        for chunk, place in zip(chunks, stored, strict=False):
-            summary = ChunkSummary(
-                first=chunk.first,
-                last=chunk.last,
-                offset=place.offset,
-                length=place.length,
-                indexes={channel: len(data) for channel, data in chunk.indexes.items()},
-                compression=chunk.compression,
-                compressed_size=place.compressed_size,
-                uncompressed_size=chunk.uncompressed_size,
+        self._append(parts)
+        for chunk, padding, place in zip(chunks, paddings, stored, strict=False):
+            self.table.other(padding)
+            self.note_chunk(
+                ChunkSummary(
+                    first=chunk.first,
+                    last=chunk.last,
+                    offset=place.offset,
+                    length=place.length,
+                    indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+                    compression=chunk.compression,
+                    compressed_size=place.compressed_size,
+                    uncompressed_size=chunk.uncompressed_size,
+                ),
+                chunk.parts,
+                trailer=place.trailer,
+                crc=place.crc,
+                trailer_crc=place.trailer_crc,
             )
-            counts = {channel: entries_of(data) for channel, data in chunk.indexes.items()}
-            self.note_chunk(summary, counts)
         return stored
 
-    def append_trailer(self, indexes: Mapping[int, bytes], arrivals: bytes) -> None:
+    def append_trailer(self, trailer: bytes) -> None:
         """Give a chunk the indexes and arrival numbers that a crash has cost it."""
-        self._write([*indexes.values(), arrivals])
+        self._append([trailer])
 
-    def note_chunk(self, chunk: ChunkSummary, counts: Mapping[int, int]) -> None:
-        """List a chunk that is in the file, with the messages of each channel in it."""
-        self.chunks += 1
+    def note_chunk(
+        self,
+        chunk: ChunkSummary,
+        parts: NDArray[np.void],
+        *,
+        trailer: int,
+        crc: int,
+        trailer_crc: int,
+    ) -> None:
+        """List a chunk that is in the file.
+
+        Args:
+            chunk: What the summary says of it.
+            parts: `PART`[c], what it holds of each channel.
+            trailer: Bytes of message indexes and arrival record behind it.
+            crc: CRC-32 of the chunk record.
+            trailer_crc: CRC-32 of the trailer.
+        """
+        self.table.chunk(
+            offset=chunk.offset,
+            length=chunk.length,
+            trailer=trailer,
+            crc=crc,
+            trailer_crc=trailer_crc,
+            first=chunk.first,
+            last=chunk.last,
+            parts=parts,
+        )
         self._chunk_indexes += chunk_index_record(chunk)
-        for channel, count in counts.items():
+        counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
+        for channel, count in counts:
             self._counts[channel] = self._counts.get(channel, 0) + count
         self._first = chunk.first if self._first is None else min(self._first, chunk.first)
         self._last = max(self._last, chunk.last)
+
+    def rewrite(self, position: int, data: Buffer) -> None:
+        """Write over bytes that a crash or the disk has damaged."""
+        try:
+            self._file.rewrite(position, data)
+        except OSError as error:
+            raise durability.explain(error, self.path, "recovering") from error
 
     def cut(self, position: int) -> None:
         """Drop everything from a position on; the next record is written there."""
@@ -244,19 +385,60 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, self.path, "syncing") from error
 
-    def seal(self, *, sync: bool = True) -> Path:
-        """Write the summary, close, and give the file its final name."""
-        # In one go: where there is no room, the file is as before, and can be sealed again.
-        end = record_bytes(DataEnd(data_section_crc=0))
-        self._write([end, self._summary(self.position + len(end)), MAGIC])
-        final = self.path.with_name(self.path.name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX)
+    def seal(self, *, sync: bool, on_sealing: OnSealing) -> Path:
+        """Write the summary, close, and give the file its final name.
+
+        What was done already is not done again when this is called once more after
+        `on_sealing` or the rename has failed.
+
+        Args:
+            sync: Force the file to the disk before `on_sealing` is called.
+            on_sealing: Told of the complete file, before it gets its name.
+
+        Returns:
+            The sealed file.
+
+        Raises:
+            StoreError: It cannot be written, or a sealed segment of this number is there.
+            DiskFullError: There is no room for the summary; the file is as before.
+        """
+        final = self.path.with_name(sealed_name(self.number))
         try:
-            self._file.finish(sync=sync)
-            durability.publish(self.path, final)
+            if self.path != final and _is_there(final):
+                raise StoreError(
+                    f"{final} is there already, so {self.path} cannot be sealed. "
+                    "Move one of them out of the store."
+                )
+            sealed = self._sealed or self.complete()
+            if not self._finished:
+                self._file.finish(sync=sync)
+                self._finished = True
+            on_sealing(sealed)
+            if self.path != final:
+                files.rename(self.path, final)
+                self.path = final
+            files.sync_folder(final.parent)
         except OSError as error:
             raise durability.explain(error, final, "sealing") from error
-        self.path = final
         return final
+
+    def complete(self) -> Sealed:
+        """Write the summary; the file keeps its name, and is not forced to the disk."""
+        # In one go: where there is no room, the file is as before, and can be sealed again.
+        end = record_bytes(DataEnd(data_section_crc=0))
+        table = self.table.build(end)
+        assert table.end == self.position + len(end)
+        tail = self._summary(table) + MAGIC
+        self._append([end, tail])
+        channels = {number: channel for number, (_, channel) in self.channels.items()}
+        self._sealed = Sealed(
+            self.number,
+            sealed_name(self.number),
+            self.position,
+            digest_of(tail),
+            sealed_channels(table, channels),
+        )
+        return self._sealed
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
@@ -270,14 +452,28 @@ class SegmentFile:
         least = RECORD_HEAD.size
         return padding_record(least + self._file.room_before(content, at + least + head))
 
-    def _write(self, parts: Sequence[Buffer]) -> None:
+    def _write(self, records: Sequence[bytes]) -> None:
+        """Append records that belong to no chunk."""
+        self._append(records)
+        for record in records:
+            self.table.other(record)
+
+    def _append(self, parts: Sequence[Buffer]) -> None:
         try:
             self._file.append(parts)
         except OSError as error:
             raise durability.explain(error, self.path, "writing") from error
 
-    def _summary(self, start: int) -> bytes:
-        groups: list[tuple[Opcode, bytes]] = [
+    def _sync_folder(self) -> None:
+        try:
+            files.sync_folder(self.path.parent)
+        except OSError as error:
+            raise durability.explain(error, self.path, "creating") from error
+
+    def _summary(self, table: ChunkTable) -> bytes:
+        start = table.end
+        body = table.to_bytes()
+        groups: list[tuple[int, bytes]] = [
             (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
             (
                 Opcode.CHANNEL,
@@ -287,6 +483,7 @@ class SegmentFile:
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
             (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
             (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
+            (CHUNK_TABLE_OPCODE, RECORD_HEAD.pack(CHUNK_TABLE_OPCODE, len(body)) + body),
         ]
         offsets: list[SummaryOffset] = []
         at = start
@@ -315,6 +512,14 @@ class SegmentFile:
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self.schemas),
         )
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        files.status(path)
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _joined(records: Iterable[McapRecord]) -> bytes:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import struct
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 MAGIC: Final = b"\x89MCAP0\r\n"
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 
 RECORDING_METADATA: Final = "hybridlog.recording"
 END_METADATA: Final = "hybridlog.end"
@@ -53,6 +53,9 @@ ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: arrival numbers of a chunk's messages."""
 PADDING_OPCODE: Final = 0x91
 """Record of zeros, so that the content of the chunk behind it starts at a block."""
+
+CHUNK_TABLE_OPCODE: Final = 0x92
+"""Record of the summary: the chunk table, see `chunk_table`."""
 
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
@@ -202,13 +205,29 @@ def padding_record(size: int) -> bytes:
     return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
 
 
+def index_order(channel: NDArray[np.int32], log_time: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows of a chunk by channel and, within one, by log time.
+
+    Returns:
+        intp[n]; messages of one channel and time stay in the order of the chunk.
+    """
+    return np.lexsort((log_time, channel))
+
+
 def message_indexes(
     channel: NDArray[np.int32],
     log_time: NDArray[np.int64],
     record_offset: NDArray[np.int64],
+    order: NDArray[np.intp],
 ) -> dict[int, bytes]:
-    """Message index record of each channel in a chunk, by channel id."""
-    order = np.lexsort((log_time, channel))
+    """Message index record of each channel in a chunk, by channel id.
+
+    Args:
+        channel: int32[n], channel ids.
+        log_time: int64[n], ns.
+        record_offset: int64[n], byte of the content where each message record starts.
+        order: intp[n], from `index_order`.
+    """
     channels = channel[order]
     entries = np.empty(len(order), _INDEX_ENTRY)
     entries["log_time"] = log_time[order]
@@ -237,16 +256,21 @@ def entries_of(index: bytes) -> int:
     return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
 
 
-def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
-    """Arrival numbers of a chunk's messages, in chunk order, with a checksum."""
+def checked_frame(data: Buffer) -> bytes:
+    """Data as one zstd frame with a checksum of its content."""
     compressor = getattr(_per_thread, "compressor", None)
     if compressor is None:
         compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)
         _per_thread.compressor = compressor
+    packed: bytes = compressor.compress(data)
+    return packed
+
+
+def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
+    """Arrival numbers of a chunk's messages, in chunk order, with a checksum."""
     steps = seq.astype("<i8")
     steps[1:] -= seq[:-1]
-    packed: bytes = compressor.compress(steps.tobytes())
-    return packed
+    return checked_frame(steps.tobytes())
 
 
 def arrival_record(chunk_offset: int, packed: bytes) -> bytes:
@@ -277,9 +301,13 @@ def message_starts(trailer: Buffer) -> NDArray[np.int64]:
         trailer: The message index records, and the record of arrival numbers.
 
     Returns:
-        int64[n]; unchecked: an index has no checksum of its own.
+        int64[n]; as right as the trailer is.
+
+    Raises:
+        SegmentError: The trailer holds something else.
     """
-    found = [entries["offset"].astype(np.int64) for _, entries in _index_entries(trailer)]
+    indexes, _ = split_trailer(trailer)
+    found = [entries["offset"].astype(np.int64) for _, entries in indexes]
     # Each channel's are in order already: sorted runs are merged, which is ten times as fast.
     return np.sort(np.concatenate(found), kind="stable") if found else np.empty(0, np.int64)
 
@@ -291,24 +319,46 @@ def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
         trailer: The message index records, and the record of arrival numbers.
 
     Returns:
-        int64[n], ns, in the order of the index; unchecked, like the starts.
+        int64[n], ns, ascending; as right as the trailer is.
+
+    Raises:
+        SegmentError: The trailer holds something else.
     """
-    return {c: entries["log_time"].astype(np.int64) for c, entries in _index_entries(trailer)}
+    indexes, _ = split_trailer(trailer)
+    return {channel: entries["log_time"].astype(np.int64) for channel, entries in indexes}
 
 
-def _index_entries(trailer: Buffer) -> Iterator[tuple[int, NDArray[np.void]]]:
-    """Channel id and entries of each message index record, up to the first other record."""
+def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], memoryview]:
+    """The records behind a chunk.
+
+    Args:
+        trailer: The message index records, and the record of arrival numbers, no byte more.
+
+    Returns:
+        Channel id and entries (`log_time`, `offset`) of each message index; the body of the
+        record of arrival numbers.
+
+    Raises:
+        SegmentError: It holds something else.
+    """
     view = memoryview(trailer)
+    found: list[tuple[int, NDArray[np.void]]] = []
     at = 0
-    while at + INDEX_HEAD.size <= len(view):
+    while at + INDEX_HEAD.size <= len(view) and view[at] != ARRIVAL_OPCODE:
         opcode, length, channel, size = INDEX_HEAD.unpack_from(view, at)
-        if opcode != Opcode.MESSAGE_INDEX or size + 6 != length or size % _INDEX_ENTRY.itemsize:
-            break
         start = at + INDEX_HEAD.size
-        if start + size > len(view):
-            break
-        yield channel, np.frombuffer(view[start : start + size], _INDEX_ENTRY)
         at = start + size
+        is_index = opcode == Opcode.MESSAGE_INDEX and size + 6 == length
+        if not is_index or size % _INDEX_ENTRY.itemsize or at > len(view):
+            raise SegmentError("its message indexes are damaged")
+        found.append((channel, np.frombuffer(view[start:at], _INDEX_ENTRY)))
+    if at + ARRIVAL_HEAD.size > len(view):
+        raise SegmentError("its arrival numbers are missing")
+    opcode, length = RECORD_HEAD.unpack_from(view, at)
+    at += RECORD_HEAD.size
+    if opcode != ARRIVAL_OPCODE or at + length != len(view):
+        raise SegmentError("its arrival numbers are damaged")
+    return found, view[at:]
 
 
 def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:

@@ -9,90 +9,125 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
-from io import BytesIO
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Metadata, MetadataIndex
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Metadata, MetadataIndex, Statistics
+from mcap.records import Schema as SchemaRecord
 
+from hybridlog_storage import files
 from hybridlog_storage.append_file import BLOCK, DIRECT
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import StoredChunk
+from hybridlog_storage.chunk_table import ChunkTable
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_scan import (
-    parse_content,
-    read_summary,
-)
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content, read_record
 from hybridlog_storage.messages import Buffer, Channel
+from hybridlog_storage.segment_file import digest_of
 from hybridlog_storage.segment_format import (
-    ARRIVAL_HEAD,
-    ARRIVAL_OPCODE,
     CHUNK_HEAD,
+    CHUNK_TABLE_OPCODE,
     END_METADATA,
     FORMAT_VERSION,
     LOSSES_METADATA,
+    MAGIC,
     RECORDING_METADATA,
     arrivals_of,
     channel_of,
+    chunk_head,
+    index_order,
     json_of,
+    message_indexes,
     message_starts,
     message_times,
     messages_at,
+    split_trailer,
 )
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hybridlog_storage.messages import Batch
 
-@dataclass(frozen=True, slots=True)
+_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
+_TAIL = _FOOTER.size + len(MAGIC)
+_MAX_SUMMARY = 1 << 30
+_PIECE = 4 << 20  # bytes that are read at once to sum them up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkPlace:
     """Where a chunk lies in its segment.
 
     Attributes:
+        number: Number of the chunk in its segment, from 0, in file order.
         offset: Byte of the chunk record.
         length: Bytes of the chunk record.
-        trailer: Bytes of message indexes and arrival numbers behind it, -1 if unknown.
+        trailer: Bytes of message indexes and arrival numbers behind it.
         first: Smallest log time in it, ns.
         last: Largest log time in it, ns.
         channels: Ids of the channels in it.
+        crc: CRC-32 of the chunk record, its head included; None when not known.
+        trailer_crc: CRC-32 of the trailer; None when not known.
     """
 
+    number: int
     offset: int
     length: int
     trailer: int
     first: int
     last: int
     channels: tuple[int, ...]
+    crc: int | None = None
+    trailer_crc: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentSummary:
-    """What a sealed segment says of itself.
+    """What a sealed segment says of itself. All of it has been checked.
 
     Attributes:
         recording: Catalog entry of the recording, as when the segment was started.
         end: How the recording ended; None in all but a recording's last segment.
         channels: By channel id.
+        schema_ids: Id of each channel's schema, 0 without one, by channel id.
         chunks: In file order.
         counts: Messages by channel id.
         losses: Rows of the loss ledger that were written with its messages.
+        table: Where everything lies, with checksums.
+        digest: Of the bytes from the start of the summary on, as in `Sealed`.
+        size: Bytes of the file.
     """
 
     recording: dict[str, object]
     end: dict[str, object] | None
     channels: dict[int, Channel]
+    schema_ids: dict[int, int]
     chunks: list[ChunkPlace]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
+    table: ChunkTable
+    digest: str
+    size: int
+
+
+@dataclass(slots=True)
+class _Records:
+    """The records of a summary that a reader of segments needs."""
+
+    schemas: dict[int, SchemaRecord]
+    channels: dict[int, ChannelRecord]
+    metadata: list[MetadataIndex]
+    statistics: Statistics | None
+    table: Buffer | None
 
 
 class SegmentReader:
@@ -127,12 +162,12 @@ class SegmentReader:
         self.bytes_read = 0
 
     def _open(self, path: Path) -> int:
-        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
+        flags = os.O_RDONLY | os.O_NONBLOCK
         if self._direct:
             with suppress(OSError):
-                return os.open(path, flags | DIRECT)
+                return files.open_file(path, flags | DIRECT)
             self._direct = False
-        return os.open(path, flags)
+        return files.open_file(path, flags)
 
     def close(self) -> None:
         """Give the file back."""
@@ -152,6 +187,17 @@ class SegmentReader:
         """Close."""
         self.close()
 
+    def stream(self) -> BinaryIO:
+        """Another handle of the file, for `scan`; the caller closes it.
+
+        Raises:
+            SegmentError: It cannot be opened.
+        """
+        try:
+            return os.fdopen(os.dup(self._fd), "rb")
+        except OSError as error:
+            raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
+
     def grow(self) -> None:
         """Take note of what was appended since the file was opened."""
         self.size = os.fstat(self._fd).st_size
@@ -160,68 +206,161 @@ class SegmentReader:
         """Channels, chunks and metadata, from the summary at the end of the file.
 
         Raises:
-            SegmentError: there is none, or it is damaged.
+            SegmentError: There is none, it is damaged, or it is of another format.
         """
-        with self.path.open("rb") as file:
-            summary = read_summary(file, self.size)
-        if summary is None or summary.statistics is None:
+        with self._explained():
+            start, tail = self._tail()
+            records = _records(tail[: len(tail) - _TAIL])
+            return self._summary(records, self._table(records, start), digest_of(tail))
+
+    def table(self) -> ChunkTable:
+        """The chunk table of the summary; metadata is not read for it.
+
+        Raises:
+            SegmentError: As `summary`.
+        """
+        with self._explained():
+            start, tail = self._tail()
+            return self._table(_records(tail[: len(tail) - _TAIL]), start)
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except _NoSummaryError as error:
             raise SegmentError(
-                f"Segment {self.path} has no readable summary. It was sealed and has changed "
-                "since: restore it, or see what is left with `mcap recover`."
-            )
-        metadata = {
-            index.name: self._metadata(index.offset, index.length)
-            for index in summary.metadata_indexes
-            if index.name in {RECORDING_METADATA, END_METADATA}
-        }
-        if RECORDING_METADATA not in metadata:
+                f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
+                "changed since: restore it, or see what is left with `mcap recover`."
+            ) from error
+
+    def _tail(self) -> tuple[int, memoryview]:
+        """Where the summary starts, and all bytes from there on, checked."""
+        if self.size < len(MAGIC) + _TAIL:
+            raise _NoSummaryError("it is too short")
+        tail = self.read(self.size - _TAIL, _TAIL)
+        opcode, length, start, offsets, crc = _FOOTER.unpack_from(tail)
+        if bytes(tail[_FOOTER.size :]) != MAGIC or opcode != Opcode.FOOTER or length != 20:
+            raise _NoSummaryError("its end is damaged or missing")
+        end = self.size - _TAIL
+        if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
+            raise _NoSummaryError("its footer is damaged")
+        data = self.read(start, self.size - start)
+        if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
+            raise _NoSummaryError("its checksum differs")
+        return start, data
+
+    def _table(self, records: _Records, start: int) -> ChunkTable:
+        if records.table is None:
+            self._refuse_other_format(records)
+            if all(index.name != RECORDING_METADATA for index in records.metadata):
+                raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+            raise _NoSummaryError("its chunk table is missing")
+        try:
+            table = ChunkTable.from_bytes(records.table)
+        except SegmentError as error:
+            self._refuse_other_format(records)
+            raise _NoSummaryError(str(error)) from error
+        if table.end != start:
+            raise _NoSummaryError("its chunk table is of another file")
+        return table
+
+    def _refuse_other_format(self, records: _Records) -> None:
+        """Tell a format that is not ours; what it says of itself is not checked."""
+        for index in records.metadata:
+            if index.name == RECORDING_METADATA:
+                record = _metadata(self.read(index.offset, index.length), index.offset, self.path)
+                check_format(json_of(record), self.path)
+
+    def _summary(self, records: _Records, table: ChunkTable, digest: str) -> SegmentSummary:
+        found: dict[str, dict[str, object]] = {}
+        losses: list[dict[str, Any]] = []
+        for index in records.metadata:
+            if index.name in {RECORDING_METADATA, END_METADATA}:
+                found[index.name] = json_of(self._checked_metadata(table, index))
+                if index.name == RECORDING_METADATA:
+                    check_format(found[index.name], self.path)
+            elif index.name == LOSSES_METADATA:
+                losses += loss_rows(json_of(self._checked_metadata(table, index)))
+        if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
-        recording = json_of(metadata[RECORDING_METADATA])
-        check_format(recording, self.path)
-        end = metadata.get(END_METADATA)
+        totals = table.by_channel()
+        counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
+        told = records.statistics.channel_message_counts if records.statistics else {}
+        if counts != {c: n for c, n in told.items() if n} or not counts.keys() <= (
+            records.channels.keys()
+        ):
+            raise _NoSummaryError("its statistics and its chunk table differ")
         return SegmentSummary(
-            recording,
-            json_of(end) if end is not None else None,
-            {i: channel_of(record, summary.schemas) for i, record in summary.channels.items()},
-            [_place(index) for index in summary.chunk_indexes],
-            dict(summary.statistics.channel_message_counts),
-            self._losses(summary.metadata_indexes),
+            recording=found[RECORDING_METADATA],
+            end=found.get(END_METADATA),
+            channels={i: channel_of(r, records.schemas) for i, r in records.channels.items()},
+            schema_ids={i: r.schema_id for i, r in records.channels.items()},
+            chunks=places_of(table),
+            counts=counts,
+            losses=losses,
+            table=table,
+            digest=digest,
+            size=self.size,
         )
 
-    def _losses(self, indexes: Iterable[MetadataIndex]) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = []
-        for index in indexes:
-            if index.name == LOSSES_METADATA:
-                found = json_of(self._metadata(index.offset, index.length)).get("rows")
-                if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
-                    raise SegmentError(
-                        f"{self.path}: the loss ledger at byte {index.offset} is damaged."
-                    )
-                rows.extend(found)
-        return rows
+    def _checked_metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
+        """A metadata record, after the checksum of the stretch that holds it."""
+        stretch = table.stretch(index.offset, index.length)
+        if stretch is None:
+            raise _NoSummaryError(f"no metadata record lies at byte {index.offset}")
+        start, length, crc = stretch
+        data = self.read(start, length)
+        if crc32(data) != crc:
+            raise SegmentError(
+                f"{self.path}: bytes {start} to {start + length} are damaged, and with them the "
+                f"metadata record {index.name!r} at byte {index.offset}. Restore the file."
+            )
+        at = index.offset - start
+        return _metadata(data[at : at + index.length], index.offset, self.path)
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """Read, decompress and check one chunk.
 
+        Args:
+            place: Where it lies. Its checksums, where they are known, are compared before a
+                byte of the chunk is believed. Without them everything is held against the
+                checksum of the content.
+
         Raises:
             SegmentError: it is not there, or it is damaged; names file and offset.
         """
-        data = self._read(place.offset, place.length + max(place.trailer, 0))
+        data = self.read(place.offset, place.length + place.trailer)
+        record, trailer = data[: place.length], data[place.length :]
         try:
-            content, compressed = open_chunk(memoryview(data)[: place.length])
-            if place.trailer >= 0:
-                trailer = memoryview(data)[place.length :]
-            else:
-                trailer = self._trailer(place)
-            # The indexes say where messages start; walking the records is the slow way.
-            batch = messages_at(content, message_starts(trailer))
-            if batch is None:
+            for part, crc, what in (
+                (record, place.crc, "its checksum differs"),
+                (trailer, place.trailer_crc, "its message indexes or arrival numbers changed"),
+            ):
+                if crc not in {None, crc32(part)}:
+                    raise SegmentError(what)
+            content, compressed = open_chunk(record, is_checked=place.crc is not None)
+            if place.crc is None or place.trailer_crc is None:
                 batch = parse_content(content).batch
-            seq = _arrivals(trailer, place.offset, len(batch))
+                _check_around(record, trailer, batch)
+            else:
+                found = messages_at(content, message_starts(trailer))
+                if found is None:
+                    raise SegmentError("its message indexes do not fit its messages")
+                batch = found
+            seq = check_arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
         return StoredChunk(
-            self.number, place.offset, place.length, len(trailer), batch, seq, compressed
+            segment=self.number,
+            number=place.number,
+            offset=place.offset,
+            length=place.length,
+            trailer=place.trailer,
+            crc=crc32(record) if place.crc is None else place.crc,
+            trailer_crc=crc32(trailer) if place.trailer_crc is None else place.trailer_crc,
+            batch=batch,
+            seq=seq,
+            compressed_size=compressed,
         )
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
@@ -230,20 +369,63 @@ class SegmentReader:
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, from its message indexes alone.
 
+        Where the checksum of the trailer is not known, the chunk is read instead.
+
         Returns:
-            int64[n], ns, by channel id; unchecked: an index has no checksum of its own.
+            int64[n], ns, ascending, by channel id.
 
         Raises:
-            SegmentError: they are not there; names file and offset.
+            SegmentError: they are not there, or damaged; names file and offset.
         """
-        if place.trailer >= 0:
-            return message_times(self._read(place.offset + place.length, place.trailer))
+        if place.trailer_crc is None:
+            chunk = self.read_chunk(place)
+            place = replace(place, trailer_crc=chunk.trailer_crc)
+        trailer = self.read(place.offset + place.length, place.trailer)
         try:
-            return message_times(self._trailer(place))
+            if crc32(trailer) != place.trailer_crc:
+                raise SegmentError("its message indexes or arrival numbers changed")
+            return message_times(trailer)
         except SegmentError as error:
             raise self._damaged(place, error) from error
 
-    def _read(self, offset: int, length: int) -> memoryview:
+    def read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
+        """Arrival numbers of a chunk's messages, without reading the chunk.
+
+        Args:
+            place: Where it lies, with the checksum of what is behind it.
+            count: Messages in it.
+
+        Returns:
+            int64[count].
+
+        Raises:
+            SegmentError: they are not there, or damaged; names file and offset.
+        """
+        trailer = self.read(place.offset + place.length, place.trailer)
+        try:
+            if crc32(trailer) != place.trailer_crc:
+                raise SegmentError("its message indexes or arrival numbers changed")
+            return check_arrivals(trailer, place.offset, count)
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
+
+    def checksum(self, offset: int, length: int) -> int:
+        """CRC-32 of some bytes of the file.
+
+        Raises:
+            SegmentError: They cannot be read.
+        """
+        crc = 0
+        for at in range(offset, offset + length, _PIECE):
+            crc = crc32(self.read(at, min(_PIECE, offset + length - at)), crc)
+        return crc
+
+    def read(self, offset: int, length: int) -> memoryview:
+        """Bytes of the file; nothing about them is checked.
+
+        Raises:
+            SegmentError: The file is too short, or cannot be read.
+        """
         if offset + length > self.size:
             raise SegmentError(
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
@@ -263,47 +445,129 @@ class SegmentReader:
         self.bytes_read += length
         return buffer[ahead:wanted]
 
-    def _trailer(self, place: ChunkPlace) -> memoryview:
-        """Walk the records behind a chunk as far as its arrival numbers."""
-        start = at = place.offset + place.length
-        while at + 9 <= self.size:
-            opcode, length = struct.unpack("<BQ", self._read(at, 9))
-            at += 9 + length
-            if opcode == ARRIVAL_OPCODE:
-                return self._read(start, at - start)
-            if opcode != Opcode.MESSAGE_INDEX:
-                break
-        raise SegmentError("its arrival numbers are missing")
 
-    def _metadata(self, offset: int, length: int) -> Metadata:
+class _NoSummaryError(SegmentError):
+    """Why a summary cannot be believed."""
+
+
+def _records(summary: memoryview) -> _Records:
+    """The records of a summary whose checksum is right."""
+    found = _Records({}, {}, [], None, None)
+    at = 0
+    while at < len(summary):
+        if at + RECORD_HEAD.size > len(summary):
+            raise _NoSummaryError("it ends in the middle of a record")
+        opcode, length = RECORD_HEAD.unpack_from(summary, at)
+        at += RECORD_HEAD.size
+        if length > len(summary) - at:
+            raise _NoSummaryError("it ends in the middle of a record")
+        body = summary[at : at + length]
+        at += length
+        if opcode == CHUNK_TABLE_OPCODE:
+            found.table = body
+        if opcode not in _WANTED:
+            continue  # the chunk indexes above all: the table says more, and is read sooner
         try:
-            body = ReadDataStream(BytesIO(self._read(offset, length)[9:]))
-            record: Metadata = Metadata.read(body)
-        except (McapError, ValueError, struct.error, EOFError) as error:
-            raise SegmentError(f"Metadata at byte {offset} of {self.path} is damaged.") from error
-        return record
+            record, _ = read_record(opcode, body)
+        except SegmentError as error:
+            raise _NoSummaryError(str(error)) from error
+        if isinstance(record, SchemaRecord):
+            found.schemas[record.id] = record
+        elif isinstance(record, ChannelRecord):
+            found.channels[record.id] = record
+        elif isinstance(record, MetadataIndex):
+            found.metadata.append(record)
+        elif isinstance(record, Statistics):
+            found.statistics = record
+    return found
+
+
+_WANTED = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA_INDEX, Opcode.STATISTICS})
+
+
+def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:
+    try:
+        opcode, length = RECORD_HEAD.unpack_from(data)
+        if opcode == Opcode.METADATA and length == len(data) - RECORD_HEAD.size:
+            record, _ = read_record(opcode, data[RECORD_HEAD.size :])
+            if isinstance(record, Metadata):
+                return record
+    except (SegmentError, struct.error) as error:
+        raise SegmentError(f"Metadata at byte {offset} of {path} is damaged: {error}.") from error
+    raise SegmentError(f"No metadata record is at byte {offset} of {path}.")
+
+
+def places_of(table: ChunkTable) -> list[ChunkPlace]:
+    """Where each chunk of a table lies, in file order."""
+    channels = table.parts["channel"].tolist()
+    bounds = table.part_bounds().tolist()
+    names = ("offset", "length", "trailer", "first", "last", "crc", "trailer_crc")
+    columns = (table.chunks[name].tolist() for name in names)
+    return [
+        ChunkPlace(
+            number=number,
+            offset=offset,
+            length=length,
+            trailer=trailer,
+            first=first,
+            last=last,
+            channels=tuple(channels[bounds[number] : bounds[number + 1]]),
+            crc=crc,
+            trailer_crc=trailer_crc,
+        )
+        for number, (offset, length, trailer, first, last, crc, trailer_crc) in enumerate(
+            zip(*columns, strict=True)
+        )
+    ]
+
+
+def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Rows of the loss ledger, from the value of its metadata record.
+
+    Raises:
+        SegmentError: They are no rows.
+    """
+    found = value.get("rows")
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise SegmentError("a record of the loss ledger is damaged")
+    return found
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:
-    """Refuse a segment of a newer format."""
-    version = recording.get("format")
-    if not isinstance(version, int) or version > FORMAT_VERSION:
-        raise SegmentError(
-            f"{path} has segment format {version}, this hybridlog knows up to "
-            f"{FORMAT_VERSION}. Install a newer hybridlog."
-        )
-
-
-def open_chunk(record: memoryview) -> tuple[Buffer, int]:
-    """The content of a whole chunk record, checksum verified, and its compressed size.
+    """Refuse a segment of another format.
 
     Raises:
-        SegmentError: it is no chunk record, or damaged.
+        SegmentError: It is of a newer one, or of one that is not read any more.
+    """
+    version = recording.get("format")
+    if version == FORMAT_VERSION:
+        return
+    if isinstance(version, int) and version < FORMAT_VERSION:
+        raise SegmentError(
+            f"{path} has segment format {version}, and this hybridlog reads format "
+            f"{FORMAT_VERSION} only. Record the log again."
+        )
+    raise SegmentError(
+        f"{path} has segment format {version}, this hybridlog knows up to "
+        f"{FORMAT_VERSION}. Install a newer hybridlog."
+    )
+
+
+def open_chunk(record: memoryview, *, is_checked: bool = False) -> tuple[Buffer, int]:
+    """The content of a whole chunk record, and its compressed size.
+
+    Args:
+        record: The chunk record, its head included.
+        is_checked: Whether a checksum of the record has been compared. Content that is not
+            compressed is then not summed up a second time.
+
+    Raises:
+        SegmentError: It is no chunk record, or damaged.
     """
     if len(record) < CHUNK_HEAD.size + 4:
         raise SegmentError("the record is too short")
     opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or length + 9 != len(record):
+    if opcode != Opcode.CHUNK or length + RECORD_HEAD.size != len(record):
         raise SegmentError("no chunk record is there")
     at = CHUNK_HEAD.size
     (name_length,) = struct.unpack_from("<I", record, at)
@@ -311,32 +575,76 @@ def open_chunk(record: memoryview) -> tuple[Buffer, int]:
     if name_length > 16 or at + name_length + 8 > len(record):
         raise SegmentError("its compression cannot be read")
     compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
-    at += name_length + 8
+    at += name_length
+    (compressed,) = struct.unpack_from("<Q", record, at)
+    at += 8
+    if compressed != len(record) - at:
+        raise SegmentError("the length of its records is wrong")
     content = decompress(compression, record[at:], size)
-    if crc32(content) != crc:
+    if not (is_checked and not compression) and crc32(content) != crc:
         raise SegmentError("its checksum differs")
-    return content, len(record) - at
+    return content, compressed
 
 
-def _arrivals(trailer: memoryview, chunk_offset: int, count: int) -> NDArray[np.int64]:
-    at = 0
-    while at + ARRIVAL_HEAD.size <= len(trailer):
-        opcode, length = struct.unpack_from("<BQ", trailer, at)
-        if opcode == ARRIVAL_OPCODE:
-            owner, seq = arrivals_of(trailer[at + 9 : at + 9 + length], count)
-            if owner != chunk_offset:
-                raise SegmentError("its arrival numbers belong to another chunk")
-            return seq
-        at += 9 + length
-    raise SegmentError("its arrival numbers are missing")
+def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: int) -> bytes:
+    """What a chunk record must start with.
 
-
-def _place(index: ChunkIndex) -> ChunkPlace:
-    return ChunkPlace(
-        index.chunk_start_offset,
-        index.chunk_length,
-        -1,
-        index.message_start_time,
-        index.message_end_time,
-        tuple(sorted(index.message_index_offsets)),
+    Args:
+        batch: The messages of its content.
+        size: Bytes of the content.
+        crc: CRC-32 of the content.
+        compression: MCAP name of the codec.
+        compressed: Bytes of compressed content.
+    """
+    return chunk_head(
+        first=int(batch.log_time.min()),
+        last=int(batch.log_time.max()),
+        uncompressed_size=size,
+        crc=crc,
+        compression=compression,
+        compressed_size=compressed,
     )
+
+
+def indexes_of(batch: Batch) -> dict[int, bytes]:
+    """The message index records of a chunk as they must be, by channel id."""
+    order = index_order(batch.channel, batch.log_time)
+    starts = batch.offset - MESSAGE_HEAD.itemsize
+    return message_indexes(batch.channel, batch.log_time, starts, order)
+
+
+def _check_around(record: memoryview, trailer: memoryview, batch: Batch) -> None:
+    """Hold the head of a chunk and its message indexes against its content.
+
+    Raises:
+        SegmentError: They say something else.
+    """
+    if not len(batch):
+        raise SegmentError("it holds no message")
+    _, _, first, last, _, _ = CHUNK_HEAD.unpack_from(record)
+    if (first, last) != (int(batch.log_time.min()), int(batch.log_time.max())):
+        raise SegmentError("its head names other times than those of its messages")
+    want = b"".join(indexes_of(batch).values())
+    if trailer[: len(want)] != want:
+        raise SegmentError("its message indexes are damaged")
+
+
+def check_arrivals(trailer: Buffer, chunk_offset: int, count: int) -> NDArray[np.int64]:
+    """Arrival numbers of a chunk's messages.
+
+    Args:
+        trailer: The message indexes and the record of arrival numbers.
+        chunk_offset: Byte of the file where the chunk starts.
+        count: Its messages.
+
+    Returns:
+        int64[count], in chunk order.
+
+    Raises:
+        SegmentError: They are missing, damaged, or another chunk's.
+    """
+    _, body = split_trailer(trailer)
+    owner, seq = arrivals_of(body, count)
+    if owner != chunk_offset:
+        raise SegmentError("its arrival numbers belong to another chunk")
+    return seq

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,15 +28,17 @@ from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
-from hybridlog_storage.segment_file import SegmentFile
+from hybridlog_storage.segment_file import OnSealing, SegmentFile
 from hybridlog_storage.segment_format import entries_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     _Count = TypeVar("_Count", int, NDArray[np.int64])
+from hybridlog_storage.threads import Threads
 
 _MOST_CHUNKS = 1 << 14  # of a segment: whoever reads its summary has a kilobyte of each in memory
+_MOST_PARTS = 1 << 20  # channels of all chunks of a segment, which its summary lists, too
 PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
@@ -131,6 +133,9 @@ class RecordingWriter:
         on_written: Called, on a thread of the writer's, when there is less that waits. With
             it nothing that is appended waits for the disk: whoever appends looks at
             `waiting`. Without it `append` waits while the disk is slow.
+        on_sealing: Called when a segment is complete and, unless the settings say never, on
+            the disk; only then it gets its final name. A thread of the writer's calls it, or
+            the one that calls `give_up`. What it raises stops the writer like a failed write.
     """
 
     def __init__(
@@ -144,6 +149,7 @@ class RecordingWriter:
         next_chunk_size: Callable[[], int] | None = None,
         spare: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
+        on_sealing: OnSealing | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -159,13 +165,14 @@ class RecordingWriter:
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, ChunkBuilder] = {}
         self._compressor = Compressor(self.settings.compression, self.settings.level)
-        self._pool = ThreadPoolExecutor(PACKERS, thread_name_prefix="hybridlog-pack")
-        self._disk = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-disk")
+        self._pool = Threads(PACKERS, "hybridlog-pack")
+        self._disk = Threads(1, "hybridlog-disk")
         self._hurry = hurry or (lambda: False)
         self._spare = spare or BoundedSemaphore(PACKERS)
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
+        self._on_sealing: OnSealing = on_sealing or (lambda _: None)
         self._closed_bytes = 0
         self._stored_bytes = 0
         self._packed: deque[Future[PackedChunk]] = deque()  # in the order of the file
@@ -309,6 +316,8 @@ class RecordingWriter:
         """
         self._syncing = None
         self._shut_down()
+        if self._segment is not None and self._segment.is_complete:
+            self._seal()
         segment = self._open_segment()
         for extra in extras:
             segment.add_metadata(extra)
@@ -505,8 +514,9 @@ class RecordingWriter:
             self._tell(chunk, place)
         span = self.settings.segment_span_s
         is_old = span is not None and time.monotonic() - self._opened >= span
-        is_full = segment.position >= self.settings.segment_size or segment.chunks >= _MOST_CHUNKS
-        if is_old or is_full:
+        is_full = segment.position >= self.settings.segment_size
+        has_many = segment.chunks >= _MOST_CHUNKS or segment.table.parts >= _MOST_PARTS
+        if is_old or is_full or has_many:
             self._seal()
 
     def _tell(self, chunk: PackedChunk, stored: StoredChunk) -> None:
@@ -537,7 +547,11 @@ class RecordingWriter:
     def _open_segment(self) -> SegmentFile:
         if self._segment is None:
             self._segment = SegmentFile.create(
-                self._directory, self._number, self._recording, self._stored_seq
+                self._directory,
+                self._number,
+                self._recording,
+                self._stored_seq,
+                sync=self.settings.sync == "chunk",
             )
             self._number += 1
             self._opened = time.monotonic()
@@ -547,7 +561,8 @@ class RecordingWriter:
         segment = self._open_segment()
         self._finish_sync()
         self._synced = 0
-        self._closed.append(segment.seal(sync=self.settings.sync != "never"))
+        sync = self.settings.sync != "never"
+        self._closed.append(segment.seal(sync=sync, on_sealing=self._on_sealing))
         self.totals.stored_bytes += segment.position
         self.totals.segments += 1
         self._segment = None

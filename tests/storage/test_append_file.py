@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog_storage import append_file
+from hybridlog_storage import append_file, durability, files
 from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Buffer
+from tests.storage.steps import Steps, through
 
 Refusal = Callable[[pytest.MonkeyPatch], None]
 
@@ -25,39 +28,40 @@ def never(_: pytest.MonkeyPatch) -> None:
 
 def at_opening(patch: pytest.MonkeyPatch) -> None:
     """It knows the flag, and says no when the file is opened."""
-    real = os.open
 
-    def refuse(path: Path, flags: int, *mode: int) -> int:
-        if flags & append_file.DIRECT:
-            os.close(real(path, flags & ~append_file.DIRECT, *mode))
-            raise OSError(errno.EINVAL, "no direct writes here")
-        return real(path, flags, *mode)
+    class Refusing(files.System):
+        def open(
+            self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None
+        ) -> int:
+            fd = super().open(name, flags & ~append_file.DIRECT, mode, folder=folder)
+            if flags & append_file.DIRECT:
+                os.close(fd)
+                raise OSError(errno.EINVAL, "no direct writes here")
+            return fd
 
-    patch.setattr(append_file.os, "open", refuse)
+    patch.setattr(files, "system", Refusing())
 
 
 def at_writing(patch: pytest.MonkeyPatch) -> None:
     """It opens the file, and says no when it is written."""
-    import fcntl
 
-    real = os.pwritev
+    class Refusing(files.System):
+        def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
+            if fcntl.fcntl(fd, fcntl.F_GETFL) & append_file.DIRECT:
+                raise OSError(errno.EINVAL, "no direct writes here")
+            return super().pwritev(fd, parts, position)
 
-    def refuse(fd: int, pieces: list[memoryview], position: int) -> int:
-        if fcntl.fcntl(fd, fcntl.F_GETFL) & append_file.DIRECT:
-            raise OSError(errno.EINVAL, "no direct writes here")
-        return real(fd, pieces, position)
-
-    patch.setattr(append_file.os, "pwritev", refuse)
+    patch.setattr(files, "system", Refusing())
 
 
 def in_steps(patch: pytest.MonkeyPatch) -> None:
     """It takes one block at a time."""
-    real = os.pwritev
 
-    def short(fd: int, pieces: list[memoryview], position: int) -> int:
-        return real(fd, [pieces[0][:BLOCK]], position)
+    class Slow(files.System):
+        def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
+            return super().pwritev(fd, [parts[0][:BLOCK]], position)
 
-    patch.setattr(append_file.os, "pwritev", short)
+    patch.setattr(files, "system", Slow())
 
 
 def without(patch: pytest.MonkeyPatch) -> None:
@@ -127,17 +131,122 @@ def test_reopen_goes_on_at_the_end_and_cuts(tmp_path: Path) -> None:
     assert path.read_bytes() == b"0123abc"
 
 
-def test_a_full_disk_is_the_systems_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = AppendFile.create(tmp_path / "file")
-    file.append([b"x" * 5000])
+class Full(files.System):
+    """A disk that takes the first bytes of what is written, and then no more."""
 
-    def full(*_: object) -> int:
+    full = False
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        if not self.full:
+            return super().writev(fd, parts)
+        super().writev(fd, [parts[0][:100]])
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(append_file.os, "pwritev", full)
-    monkeypatch.setattr("hybridlog_storage.durability.os.writev", full)
-    with pytest.raises(OSError, match="full") as caught:
-        file.append([b"y" * 5000])
-    assert caught.value.errno == errno.ENOSPC
-    file.close()
-    assert (tmp_path / "file").read_bytes().startswith(b"x" * 5000)
+    def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
+        if not self.full:
+            return super().pwritev(fd, parts, position)
+        super().pwritev(fd, [parts[0][:BLOCK]], position)
+        raise OSError(errno.ENOSPC, "full")
+
+
+@pytest.mark.parametrize("refusal", [never, at_opening])
+@pytest.mark.parametrize("can_cut", [True, False])
+@pytest.mark.parametrize("before", [0, 100, BLOCK, 5000, 2 * BLOCK])
+def test_what_is_appended_after_a_failed_write_stands_behind_what_was_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Refusal, can_cut: bool, before: int
+) -> None:
+    """Once there is room again; also where the system did not even cut the file."""
+    path = tmp_path / "file"
+    refusal(monkeypatch)
+    file = AppendFile.create(path)
+    file.append([b"a" * before])
+    system = Full()
+    monkeypatch.setattr(files, "system", system)
+    if not can_cut:
+
+        def refuse(*_: object) -> None:
+            raise OSError(errno.EIO, "no")
+
+        monkeypatch.setattr(system, "truncate", refuse, raising=True)
+    system.full = True
+    for _ in range(2):
+        with pytest.raises(OSError, match="full") as caught:
+            file.append([b"b" * 9000])
+        assert caught.value.errno == errno.ENOSPC
+        assert file.position == before
+    assert path.read_bytes()[:before] == b"a" * before
+    system.full = False
+    file.append([b"c" * 10])
+    monkeypatch.setattr(files, "system", files.System())
+    file.append([b"d" * 20])
+    file.finish(sync=False)
+    assert path.read_bytes() == b"a" * before + b"c" * 10 + b"d" * 20
+
+
+def test_bytes_are_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"0123456789")
+    file = AppendFile.reopen(path)
+    file.rewrite(3, b"abc")
+    file.append([b"!"])
+    file.finish(sync=False)
+    assert path.read_bytes() == b"012abc6789!"
+
+
+def test_the_file_gets_its_length_before_it_is_synced(tmp_path: Path) -> None:
+    steps = Steps()
+    with through(steps):
+        file = AppendFile.create(tmp_path / "file")
+        file.append([b"x" * 5000])
+        file.finish(sync=True)
+    assert (tmp_path / "file").stat().st_size == 5000
+    assert [what for what, _ in steps.log if what != "write"][-1] == "sync"
+
+
+def test_what_is_no_file_of_the_recording_is_not_opened(tmp_path: Path) -> None:
+    """No symlink is followed, nothing that is not an ordinary file is written."""
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"mine")
+    link = tmp_path / "link"
+    link.symlink_to(outside)
+    for make in (AppendFile.create, AppendFile.reopen):
+        with pytest.raises(OSError, match="link"):
+            make(link)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="ordinary"):
+        AppendFile.reopen(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "inside").symlink_to(tmp_path / "folder")
+    with pytest.raises(OSError, match="inside"):
+        AppendFile.create(tmp_path / "inside" / "file")
+    assert outside.read_bytes() == b"mine"
+    assert not list((tmp_path / "folder").iterdir())
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_the_umask_decides_who_may_read_a_file(tmp_path: Path, mask: int, mode: int) -> None:
+    before = os.umask(mask)
+    try:
+        AppendFile.create(tmp_path / "file").close()
+        durability.write_new(tmp_path / "small", b"x", depth=files.IN_STORE)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == mode
+    assert (tmp_path / "small").stat().st_mode & 0o777 == mode
+
+
+def test_a_small_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    """At each step that fails; and nothing else is left."""
+    steps = Steps()
+    with through(steps):
+        durability.write_new(tmp_path / "f", b"old", depth=1)
+    assert [what for what, _ in steps.log] == ["create", "write", "sync", "rename", "sync"]
+    assert [name for _, name in steps.log][3:] == ["f", tmp_path.name]
+    for number in range(len(steps.log)):
+        failing = Steps(fail_from=number, fail_until=number + 1)
+        with through(failing), pytest.raises(DiskFullError):
+            durability.write_new(tmp_path / "f", b"new", depth=1)
+        want = b"new" if number == 4 else b"old"
+        assert (tmp_path / "f").read_bytes() == want
+        assert [path.name for path in tmp_path.iterdir()] == ["f"]
+        (tmp_path / "f").write_bytes(b"old")

@@ -2,47 +2,58 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
+import random
 import re
 import shutil
+import struct
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Attachment, ChunkIndex, Metadata
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.copying import COPIED_AT_ONCE
-from hybridlog_storage.errors import DiskFullError, SegmentError, UsageError
+from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_file import SegmentFile
+from hybridlog_storage.segment_file import Sealed, SealedChannel, SegmentFile
 from hybridlog_storage.segment_format import (
+    CHUNK_TABLE_OPCODE,
     END_METADATA,
+    LOSSES_METADATA,
+    RECORDING_METADATA,
     ChunkSummary,
+    arrival_record,
     chunk_index_record,
     json_metadata,
+    pack_arrivals,
     record_bytes,
 )
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from tests.storage.steps import Steps, through
 
 RECORDING = {
-    "id": "r",
-    "key": 7,
+    "id": "0123456789abcdef0123456789abcdef",
     "name": "r",
     "tags": {"a": "b"},
     "source": {},
@@ -572,7 +583,7 @@ def test_reader_gives_the_chunks_that_were_written(
     (path,) = paths
     with SegmentReader(path, 0) as reader:
         summary = reader.summary()
-        assert summary.recording["key"] == 7
+        assert summary.recording["id"] == RECORDING["id"]
         assert summary.end == {"status": "complete"}
         assert [p.offset for p in summary.chunks] == [c.offset for c in chunks]
         for place, chunk in zip(summary.chunks, chunks, strict=True):
@@ -679,7 +690,7 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
     with SegmentReader(recovered.path, 0) as reader:
         assert reader.summary().end == {"status": "complete"}
     with SegmentCheck(recovered.path) as check:
-        assert list(check.between_chunks()) == []
+        assert list(check.problems()) == []
 
 
 def test_a_flipped_bit_is_found_and_named(tmp_path: Path) -> None:
@@ -732,7 +743,7 @@ def test_large_content_that_is_not_compressed_starts_at_a_block(tmp_path: Path) 
     if AppendFile.create(tmp_path / "probe").direct:
         assert [place % BLOCK for place in places] == [0] * 5
     with SegmentCheck(path) as check:
-        assert list(check.between_chunks()) == []
+        assert list(check.problems()) == []
     paddings = [
         found.start()
         for found in re.finditer(b"\x91", data)
@@ -745,7 +756,7 @@ def test_large_content_that_is_not_compressed_starts_at_a_block(tmp_path: Path) 
             damaged[place] ^= 4
             path.write_bytes(damaged)
             with SegmentCheck(path) as check:
-                assert list(check.between_chunks()), place
+                assert list(check.problems()), place
 
 
 def test_a_segment_that_was_left_open_is_recovered_with_its_padding(tmp_path: Path) -> None:
@@ -764,7 +775,7 @@ def test_a_segment_that_was_left_open_is_recovered_with_its_padding(tmp_path: Pa
             found = [message.data for _, _, message in make_reader(file).iter_messages()]
         assert found == [rows[0][1] for rows in batches[:-1]]
         with SegmentCheck(recovered.path) as check:
-            assert list(check.between_chunks()) == []
+            assert list(check.problems()) == []
         recovered.path.unlink()
 
 
@@ -779,10 +790,793 @@ def test_a_crash_between_a_schema_and_its_channel(tmp_path: Path) -> None:
     assert chunks
     if recovered.path is not None:
         with SegmentCheck(recovered.path) as check:
-            assert list(check.between_chunks()) == []
+            assert list(check.problems()) == []
 
 
 @pytest.mark.parametrize("span", [0, -1, 1 << 62])
 def test_a_chunk_lasts_longer_than_no_time(span: int) -> None:
     with pytest.raises(UsageError, match="a chunk must last"):
         SegmentSettings(chunk_span_ns=span)
+
+
+# What is on the disk, and when
+
+
+def small_writer(
+    directory: Path, steps: Steps, sync: Literal["chunk", "seal", "never"]
+) -> RecordingWriter:
+    directory.mkdir()
+    return RecordingWriter(
+        directory,
+        RECORDING,
+        lambda chunk, _: steps.log.append(("told", f"chunk {chunk.number}")),
+        SegmentSettings(sync=sync),
+        on_sealing=lambda sealed: steps.log.append(("journal", sealed.file)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("sync", "want"),
+    [
+        (
+            "chunk",
+            [
+                ("sync", "rec"),
+                ("sync", "000000.mcap.open"),
+                ("told", "chunk 0"),
+                ("sync", "000000.mcap.open"),
+                ("told", "chunk 1"),
+                ("sync", "000000.mcap.open"),
+                ("journal", "000000.mcap"),
+                ("rename", "000000.mcap"),
+                ("sync", "rec"),
+            ],
+        ),
+        (
+            "seal",
+            [
+                ("told", "chunk 0"),
+                ("told", "chunk 1"),
+                ("sync", "000000.mcap.open"),
+                ("journal", "000000.mcap"),
+                ("rename", "000000.mcap"),
+                ("sync", "rec"),
+            ],
+        ),
+        (
+            "never",
+            [
+                ("told", "chunk 0"),
+                ("told", "chunk 1"),
+                ("journal", "000000.mcap"),
+                ("rename", "000000.mcap"),
+                ("sync", "rec"),
+            ],
+        ),
+    ],
+)
+def test_what_is_forced_to_the_disk_and_when(
+    tmp_path: Path, sync: Literal["chunk", "seal", "never"], want: list[tuple[str, str]]
+) -> None:
+    steps = Steps()
+    with through(steps):
+        writer = small_writer(tmp_path / "rec", steps, sync)
+        for n in range(2):
+            writer.append(batch_of([(0, b"abc", n, n, n)]), CHANNELS)
+            writer.flush()
+        writer.close()
+    seen = {"sync", "told", "journal", "rename"}
+    assert [step for step in steps.log if step[0] in seen] == want
+    # Nothing is written behind the last sync of the file.
+    if sync != "never":
+        last = max(n for n, step in enumerate(steps.log) if step == ("sync", "000000.mcap.open"))
+        assert not [step for step in steps.log[last:] if step[0] in {"write", "truncate"}]
+
+
+def test_a_recovered_segment_is_on_the_disk_before_it_gets_its_name(tmp_path: Path) -> None:
+    whole, _ = sample(tmp_path / "a")
+    for keep in (len(whole), len(whole) - 5, len(whole) // 2):
+        opened = tmp_path / "000000.mcap.open"
+        opened.write_bytes(whole[:keep])
+        steps = Steps()
+        log = steps.log
+        with through(steps):
+            recovered = recover_segment(
+                opened, lambda sealed, log=log: log.append(("journal", sealed.file))
+            )
+        assert recovered.path == tmp_path / "000000.mcap"
+        assert steps.log[-4:] == [
+            ("sync", "000000.mcap.open"),
+            ("journal", "000000.mcap"),
+            ("rename", "000000.mcap"),
+            ("sync", tmp_path.name),
+        ]
+        recovered.path.unlink()
+
+
+def test_long_segments_are_synced_as_they_grow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where writes go through the page cache; so sealing takes no time."""
+    monkeypatch.setattr(segment_writer, "_SYNC_STRIDE", 1000)
+    monkeypatch.setattr("hybridlog_storage.append_file.DIRECT", 0)
+    steps = Steps()
+    with through(steps):
+        writer = small_writer(tmp_path / "rec", steps, "seal")
+        for n in range(5):
+            writer.append(batch_of([(0, os.urandom(2000), n, n, n)]), CHANNELS)
+            writer.flush()
+        writer.close()
+    assert steps.log.count(("sync", "000000.mcap.open")) >= 2
+
+
+def test_a_segment_whose_head_found_no_room_can_be_made_again(tmp_path: Path) -> None:
+    steps = Steps(fail_from=0, only=frozenset({"write"}))
+    with through(steps), pytest.raises(DiskFullError):
+        SegmentFile.create(tmp_path, 0, RECORDING)
+    assert not list(tmp_path.iterdir())
+    segment = SegmentFile.create(tmp_path, 0, RECORDING)
+    assert segment.seal(sync=False, on_sealing=lambda _: None).name == "000000.mcap"
+
+
+def test_old_chunks_are_flushed_and_young_ones_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks: list[StoredChunk] = []
+    now = 100.0
+    monkeypatch.setattr("hybridlog_storage.chunk_builder.time.monotonic", lambda: now)
+    writer = RecordingWriter(tmp_path, RECORDING, lambda c, _: chunks.append(c))
+    writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
+    now = 101.0
+    writer.append(batch_of([(1, bytes(5000), 1, 1, 1)]), CHANNELS)
+    writer.flush_older(1.5)
+    writer._drain(limit=0)
+    assert not chunks
+    now = 101.5
+    writer.flush_older(1.5)
+    writer._drain(limit=0)
+    assert [chunk.batch.channel.tolist() for chunk in chunks] == [[1]]
+    writer.close()
+    assert len(chunks) == 2
+
+
+# What proves a segment
+
+
+def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
+    """A small segment with everything in it: two shared chunks, one of its own, extras."""
+    directory.mkdir()
+    chunks: list[StoredChunk] = []
+    writer = RecordingWriter(
+        directory, RECORDING, lambda c, _: chunks.append(c), SegmentSettings(chunk_size=1024)
+    )
+    rows = [(2 * (n % 2), bytes([n]) * (20 + n), 50 * n % 400, 50 * n, n) for n in range(20)]
+    writer.append(batch_of(rows[:12]), CHANNELS)
+    writer.add_extra(Attachment(1, 2, "a.txt", "text/plain", b"attached"))
+    writer.append(batch_of([(1, bytes(1500), 77, 78, 1)]), CHANNELS)
+    writer.add_extra(Metadata("source", {"k": "v"}))
+    writer.append(batch_of(rows[12:]), CHANNELS)
+    writer.flush()
+    writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [{"topic": "/small", "count": 3}]}))
+    (path,) = writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+    return path.read_bytes(), chunks
+
+
+def answers(reader: SegmentReader, summary: SegmentSummary | None = None) -> Iterator[object]:
+    """All that a segment answers, or None where it says that it cannot."""
+    try:
+        found = reader.summary()
+    except SegmentError:
+        found = None
+        yield None
+    else:
+        about = (found.recording, found.end, found.channels.keys(), found.counts, found.losses)
+        topics = [(c.topic, c.schema, dict(c.metadata)) for c in found.channels.values()]
+        yield (about, topics, found.digest, found.size, found.chunks)
+    known = summary or found
+    for place in known.chunks if known else []:
+        try:
+            yield content_of(reader.read_chunk(place))
+        except SegmentError:
+            yield None
+        try:
+            yield {c: times.tolist() for c, times in reader.read_times(place).items()}
+        except SegmentError:
+            yield None
+
+
+def content_of(chunk: StoredChunk) -> tuple[Any, ...]:
+    batch = chunk.batch
+    columns = (batch.channel, batch.log_time, batch.publish_time, batch.sequence, chunk.seq)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    payloads = [bytes(batch.payload(row)) for row in range(len(batch))]
+    sizes = chunk.length, chunk.trailer, chunk.compressed_size
+    return chunk.number, chunk.crc, chunk.trailer_crc, list(rows), payloads, sizes
+
+
+@pytest.mark.parametrize("bit", [0, 3, 7])
+def test_no_flipped_bit_changes_an_answer_and_each_is_found(tmp_path: Path, bit: int) -> None:
+    """In any byte of a segment: heads, lengths, metadata, indexes, summary, footer, magic."""
+    whole, _ = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    path.write_bytes(whole)
+    with SegmentReader(path, 0) as reader:
+        summary = reader.summary()
+        right = list(answers(reader, summary))
+    assert None not in right
+    assert len(right) == 1 + 2 * len(summary.chunks)
+    for at in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << bit
+        path.write_bytes(damaged)
+        with SegmentReader(path, 0) as reader:
+            found = list(answers(reader, summary))
+        assert all(f in (None, r) for f, r in zip(found, right, strict=True)), at
+        with SegmentCheck(path) as check:
+            problems = list(check.problems())
+        assert problems, at
+        if at < summary.table.end:
+            # It names the place: the part in which the byte lies.
+            ((start, _),) = problems
+            assert start <= at
+        else:
+            assert found[0] is None, at
+            assert "summary" in problems[0][1]
+
+
+@pytest.mark.parametrize("bit", [1, 6])
+def test_a_chunk_without_known_checksums_is_held_against_its_content(
+    tmp_path: Path, bit: int
+) -> None:
+    """As in a segment that is still written."""
+    whole, _ = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    path.write_bytes(whole)
+    with SegmentReader(path, 0) as reader:
+        summary = reader.summary()
+        places = [replace(place, crc=None, trailer_crc=None) for place in summary.chunks]
+        bare = replace(summary, chunks=places)
+        right = list(answers(reader, summary))
+        assert list(answers(reader, bare)) == right
+    first, last = places[0], places[-1]
+    for at in range(first.offset, last.offset + last.length + last.trailer):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << bit
+        path.write_bytes(damaged)
+        with SegmentReader(path, 0) as reader:
+            for number, place in enumerate(places):
+                try:
+                    chunk = content_of(reader.read_chunk(place))
+                    times = {c: t.tolist() for c, t in reader.read_times(place).items()}
+                except SegmentError:
+                    assert place.offset <= at < place.offset + place.length + place.trailer
+                    continue
+                # A frame has bits without meaning: they change the checksum, and no answer.
+                assert chunk[3:] == right[1 + 2 * number][3:]
+                assert times == right[2 + 2 * number]
+
+
+def test_the_summary_tells_what_the_chunks_hold(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    with SegmentReader(tmp_path / "a" / "000000.mcap", 0) as reader:
+        summary = reader.summary()
+        assert [chunk.number for chunk in chunks] == list(range(len(chunks)))
+        for chunk, place in zip(chunks, summary.chunks, strict=True):
+            assert content_of(reader.read_chunk(place)) == content_of(chunk)
+            assert (place.number, place.crc) == (chunk.number, chunk.crc)
+            assert place.channels == tuple(sorted(set(chunk.batch.channel.tolist())))
+            assert place.first == chunk.batch.log_time.min()
+            assert place.last == chunk.batch.log_time.max()
+            for channel, times in reader.read_times(place).items():
+                of = chunk.batch.log_time[chunk.batch.channel == channel]
+                assert times.tolist() == sorted(of.tolist())
+    assert summary.size == len(whole)
+    assert summary.losses == [{"topic": "/small", "count": 3}]
+    tail = whole[summary.table.end :]
+    assert summary.digest == f"sha256:{hashlib.sha256(tail).hexdigest()}"
+    # The footer says where the summary starts.
+    assert struct.unpack_from("<Q", whole, len(whole) - 28)[0] == summary.table.end
+
+
+def test_independent_readers_pass_over_the_chunk_table(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    count = sum(len(chunk.batch) for chunk in chunks)
+    for kind in (make_reader, NonSeekingReader):
+        reader = kind(io.BytesIO(whole), validate_crcs=True)
+        assert len(list(reader.iter_messages())) == count
+        summary = kind(io.BytesIO(whole), validate_crcs=True).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == count
+        assert len(summary.chunk_indexes) == len(chunks)
+
+
+def test_rosbags_passes_over_the_chunk_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It reads logs of ROS 2 only, and asks the header for that."""
+    from rosbags.rosbag2.storage_mcap import McapReader
+
+    monkeypatch.setattr("hybridlog_storage.segment_file.PROFILE", "ros2")
+    rows = many(60, 1, 200)
+    (path,), chunks = write(tmp_path / "a", [rows], SegmentSettings(chunk_size=4096))
+    reader = McapReader(path)
+    reader.open()
+    assert [chunk.chunk_start_offset for chunk in reader.chunks] == [c.offset for c in chunks]
+    counted = [sum(chunk.channel_count.values()) for chunk in reader.chunks]
+    assert counted == [len(chunk.batch) for chunk in chunks]
+    found = [(time, bytes(data)) for _, time, data in reader.messages(reader.connections)]
+    assert found == [(time, payload) for _, payload, time, _, _ in rows]
+    reader.close()
+
+
+def test_the_summary_says_where_the_chunk_table_is(tmp_path: Path) -> None:
+    whole, _ = sample(tmp_path / "a")
+    offsets = struct.unpack_from("<Q", whole, len(whole) - 20)[0]
+    found = {}
+    while whole[offsets] == Opcode.SUMMARY_OFFSET:
+        group, start, length = struct.unpack_from("<BQQ", whole, offsets + 9)
+        found[group] = start, length
+        offsets += 9 + 17
+    start, length = found[CHUNK_TABLE_OPCODE]
+    assert whole[start] == CHUNK_TABLE_OPCODE
+    assert int.from_bytes(whole[start + 1 : start + 9], "little") + 9 == length
+
+
+def test_a_table_that_does_not_end_at_the_summary_is_refused(tmp_path: Path) -> None:
+    """Bytes that no checksum covers would stand between."""
+    whole, _ = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    start, offsets = struct.unpack_from("<QQ", whole, len(whole) - 28)
+    tail = bytearray(whole[start:-8])
+    struct.pack_into("<QQ", tail, len(tail) - 20, start + 5, offsets + 5)
+    struct.pack_into("<I", tail, len(tail) - 4, crc32(tail[:-4]))
+    path.write_bytes(whole[:start] + b"extra" + tail + whole[-8:])
+    with SegmentReader(path, 0) as reader, pytest.raises(SegmentError, match="another file"):
+        reader.summary()
+
+
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [(3, "Install a newer"), ("x", "Install a newer"), (1, "Record the log again")],
+)
+@pytest.mark.parametrize("with_table", [True, False])
+def test_a_segment_of_another_format_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    version: object,
+    message: str,
+    with_table: bool,
+) -> None:
+    monkeypatch.setattr("hybridlog_storage.segment_file.FORMAT_VERSION", version)
+    if not with_table:
+        monkeypatch.setattr("hybridlog_storage.segment_file.CHUNK_TABLE_OPCODE", 0xF0)
+    (path,), _ = write(tmp_path / "a", [many(30)])
+    with SegmentReader(path, 0) as reader, pytest.raises(SegmentError, match=message):
+        reader.summary()
+    whole = path.read_bytes()
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(whole)
+    with pytest.raises(SegmentError, match=message):
+        recover_segment(opened)
+    assert opened.read_bytes() == whole
+
+
+def test_arrival_numbers_of_another_chunk_are_refused(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    chunk = chunks[1]
+    right = arrival_record(chunk.offset, pack_arrivals(chunk.seq))
+    assert right in whole
+    damaged = whole.replace(right, arrival_record(chunk.offset + 1, pack_arrivals(chunk.seq)))
+    path.write_bytes(damaged)
+    with SegmentReader(path, 0) as reader:
+        place = reader.summary().chunks[1]
+        with pytest.raises(SegmentError, match="changed"):
+            reader.read_chunk(place)
+        with pytest.raises(SegmentError, match="belong to another chunk"):
+            reader.read_chunk(replace(place, trailer_crc=None))
+    opened = tmp_path / "000001.mcap.open"
+    opened.write_bytes(damaged)
+    recovered = recover_segment(opened)
+    assert any("another chunk" in text for text in recovered.damage)
+    assert recovered.messages == sum(len(c.batch) for c in chunks) - len(chunk.batch)
+
+
+def test_no_symlink_is_followed_to_a_segment(tmp_path: Path) -> None:
+    whole, _ = sample(tmp_path / "a")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "000000.mcap").write_bytes(whole)
+    (outside / "000001.mcap.open").write_bytes(whole[:-9])
+    recordings = tmp_path / "recordings"
+    (recordings / "r").mkdir(parents=True)
+    (recordings / "r" / "000000.mcap").symlink_to(outside / "000000.mcap")
+    (recordings / "r" / "000001.mcap.open").symlink_to(outside / "000001.mcap.open")
+    (recordings / "s").symlink_to(outside)
+    for label in "rs":
+        with pytest.raises(SegmentError, match="cannot be opened"):
+            SegmentReader(recordings / label / "000000.mcap", 0)
+        with pytest.raises(SegmentError, match="cannot be opened"):
+            SegmentReader(recordings / label / "000000.mcap", 0, direct=True)
+        with pytest.raises(StoreError):
+            recover_segment(recordings / label / "000001.mcap.open")
+        with pytest.raises(SegmentError, match="cannot be opened"):
+            SegmentCheck(recordings / label / "000000.mcap")
+    with pytest.raises(StoreError):
+        SegmentFile.create(recordings / "s", 7, RECORDING)
+    assert (outside / "000001.mcap.open").read_bytes() == whole[:-9]
+
+
+def test_a_segment_is_told_of_as_it_is(tmp_path: Path) -> None:
+    told: list[Sealed] = []
+    directory = tmp_path / "a"
+    directory.mkdir()
+    writer = RecordingWriter(
+        directory,
+        RECORDING,
+        lambda *_: None,
+        SegmentSettings(segment_size=3000),
+        on_sealing=lambda sealed: (
+            told.append(sealed),
+            # It lies there whole, under its old name.
+            sizes.append((directory / f"{sealed.file}.open").stat().st_size),
+        )[0],
+    )
+    sizes: list[int] = []
+    for n in range(3):
+        writer.append(
+            batch_of([(0, bytes([n]) * 9, n, n, n), (1, os.urandom(4000), 5, 5, 5)]), CHANNELS
+        )
+        writer.flush()
+    paths = writer.close(json_metadata(END_METADATA, {}))
+    assert [sealed.file for sealed in told] == [path.name for path in paths]
+    assert [sealed.segment for sealed in told] == list(range(len(paths)))
+    assert [sealed.bytes for sealed in told] == sizes == [p.stat().st_size for p in paths]
+    for sealed, path in zip(told, paths, strict=True):
+        with SegmentReader(path, 0) as reader:
+            summary = reader.summary()
+            assert sealed.digest == summary.digest
+            assert {c.id: c.messages for c in sealed.channels} == summary.counts
+    every = [channel for sealed in told for channel in sealed.channels]
+    assert sum(c.payload_bytes for c in every) == 3 * 4009
+    assert [c for c in every if c.topic == "/large"] == [
+        SealedChannel(2, "/large", 1, 4000, 5, 5)
+    ] * 3
+    small = [c for c in every if c.topic == "/small"]
+    assert [(c.first, c.last, c.messages, c.payload_bytes) for c in small] == [
+        (n, n, 1, 9) for n in range(3)
+    ]
+
+
+# What a crash leaves
+
+
+@pytest.mark.parametrize("zeros", [0, 1, BLOCK - 1])
+def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> None:
+    """Killed between its sync and its rename: what the journal says of it still holds."""
+    told: list[Sealed] = []
+    directory = tmp_path / "a"
+    directory.mkdir()
+    writer = RecordingWriter(directory, RECORDING, lambda *_: None, on_sealing=told.append)
+    writer.append(batch_of(many(50)), CHANNELS)
+    (path,) = writer.close()  # without an end, as of a segment in the middle
+    whole = path.read_bytes()
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(whole + bytes(zeros))
+    steps = Steps()
+    with through(steps):
+        recovered = recover_segment(opened, told.append)
+    assert recovered.path is not None
+    assert recovered.path.read_bytes() == whole
+    assert (recovered.messages, recovered.cut_bytes, recovered.damage) == (50, 0, [])
+    assert told[0] == told[1]
+    assert not [step for step in steps.log if step[0] == "write"]
+
+
+def test_when_a_recovery_fails_nothing_is_lost(tmp_path: Path) -> None:
+    """At each step; and trying again gives what it would have given."""
+    whole, chunks = sample(tmp_path / "a")
+    torn = len(whole) - len(whole) // 3
+    last = chunks[-1].offset + chunks[-1].length  # in the middle of its indexes
+    for keep in (len(whole), len(whole) - 5, torn, last + 7):
+        opened = tmp_path / "000000.mcap.open"
+        final = tmp_path / "000000.mcap"
+        opened.write_bytes(whole[:keep])
+        steps = Steps()
+        with through(steps):
+            recover_segment(opened)
+        right = messages_in(final)
+        for number in range(len(steps.log)):
+            final.unlink(missing_ok=True)
+            opened.write_bytes(whole[:keep])
+            failing = Steps(fail_from=number)
+            with through(failing), pytest.raises(DiskFullError):
+                recover_segment(opened)
+            assert opened.exists() != final.exists()
+            if opened.exists():
+                recover_segment(opened)
+            assert messages_in(final) == right
+            with SegmentCheck(final) as check:
+                assert list(check.problems()) == []
+        final.unlink()
+
+
+def test_when_the_journal_fails_the_segment_is_sealed_later(tmp_path: Path) -> None:
+    told: list[Sealed] = []
+    fails = True
+
+    def journal(sealed: Sealed) -> None:
+        if fails:
+            raise DiskFullError("no room for a line")
+        told.append(sealed)
+
+    directory = tmp_path / "a"
+    directory.mkdir()
+    writer = RecordingWriter(directory, RECORDING, lambda *_: None, on_sealing=journal)
+    writer.append(batch_of(many(50)), CHANNELS)
+    with pytest.raises(DiskFullError, match="line"):
+        writer.close()
+    opened = directory / "000000.mcap.open"
+    assert [path.name for path in directory.iterdir()] == [opened.name]
+    with pytest.raises(DiskFullError, match="line"):
+        recover_segment(opened, journal)
+    before = opened.read_bytes()
+    # Who gives up tries it once more, and says the rest in another segment.
+    fails = False
+    writer.give_up([json_metadata(END_METADATA, {"status": "full"})])
+    assert [sealed.file for sealed in told] == ["000000.mcap", "000001.mcap"]
+    assert (directory / "000000.mcap").read_bytes() == before
+    with SegmentReader(directory / "000001.mcap", 1) as reader:
+        assert reader.summary().end == {"status": "full"}
+
+
+def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
+    whole, _ = sample(tmp_path / "a")
+    (tmp_path / "000000.mcap").write_bytes(b"sealed")
+    opened = tmp_path / "000000.mcap.open"
+    for content in (whole, whole[:-9]):
+        opened.write_bytes(content)
+        with pytest.raises(StoreError, match="Move one of them"):
+            recover_segment(opened)
+        assert opened.read_bytes() == content
+    assert (tmp_path / "000000.mcap").read_bytes() == b"sealed"
+    opened.unlink()
+    segment = SegmentFile.create(tmp_path, 0, RECORDING)
+    with pytest.raises(StoreError, match="Move one of them"):
+        segment.seal(sync=False, on_sealing=lambda _: None)
+
+
+def test_what_is_wrong_around_a_whole_chunk_is_mended(tmp_path: Path) -> None:
+    """Its messages are not lost for a bit in their index, nor for one in its head."""
+    whole, chunks = sample(tmp_path / "a")
+    chunk = chunks[1]
+    torn = len(whole) - 9
+    indexes = chunk.offset + chunk.length
+    end = indexes + chunk.trailer - len(arrival_record(chunk.offset, pack_arrivals(chunk.seq)))
+    places = [*range(chunk.offset + 9, chunk.offset + 25), *range(indexes, end)]
+    for at in places:
+        for bit in (0, 5):
+            opened = tmp_path / "000000.mcap.open"
+            damaged = bytearray(whole[:torn])
+            damaged[at] ^= 1 << bit
+            opened.write_bytes(damaged)
+            recovered = recover_segment(opened)
+            assert recovered.path is not None
+            assert recovered.messages == sum(len(c.batch) for c in chunks), (at, bit)
+            assert any("mended" in text for text in recovered.damage)
+            with SegmentReader(recovered.path, 0) as reader:
+                summary = reader.summary()
+                for place, want in zip(summary.chunks, chunks, strict=True):
+                    assert content_of(reader.read_chunk(place)) == content_of(want)
+            # The recorder had ended well, but the segment is not as it was.
+            assert summary.end is not None
+            assert summary.end["status"] == "recovered"
+            assert summary.end["damage"] == recovered.damage
+            with SegmentCheck(recovered.path) as check:
+                assert list(check.problems()) == []
+            recovered.path.unlink()
+
+
+def test_an_index_that_claims_the_next_chunk_hides_no_chunk(tmp_path: Path) -> None:
+    """Its length is wrong, and leads exactly to where another chunk starts."""
+    (path,), chunks = write(tmp_path / "a", [many(60)], SegmentSettings(chunk_size=1024))
+    assert len(chunks) > 4
+    whole = bytearray(path.read_bytes()[:-9])
+    index = chunks[1].offset + chunks[1].length
+    assert whole[index] == Opcode.MESSAGE_INDEX
+    struct.pack_into("<Q", whole, index + 1, chunks[3].offset - index - 9)
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(whole)
+    recovered = recover_segment(opened)
+    assert recovered.messages == 60
+    assert len(recovered.damage) == 1
+    assert "mended" in recovered.damage[0]
+
+
+def test_the_times_in_the_head_of_a_chunk_are_checked_where_nothing_else_covers_them(
+    tmp_path: Path,
+) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    for at in range(chunks[0].offset + 9, chunks[0].offset + 25):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1
+        path.write_bytes(damaged)
+        with SegmentReader(path, 0) as reader:
+            place = reader.summary().chunks[0]
+            with pytest.raises(SegmentError, match="other times"):
+                reader.read_chunk(replace(place, crc=None))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damage_inside_an_open_segment_costs_no_other_chunk(tmp_path: Path, seed: int) -> None:
+    """A few bytes anywhere: chunks that they do not touch are kept, and all is told."""
+    rng = random.Random(seed)
+    whole, chunks = sample(tmp_path / "a")
+    first = chunks[0].offset
+    opened = tmp_path / "000000.mcap.open"
+    for _ in range(60):
+        length = rng.choice([1, 8, 200])
+        at = rng.randrange(first, len(whole) - length)
+        damaged = bytearray(whole)
+        damaged[at : at + length] = rng.randbytes(length) if seed % 2 else bytes(length)
+        if damaged == whole:
+            continue
+        opened.write_bytes(damaged)
+        recovered = recover_segment(opened)
+        assert recovered.path is not None
+        with SegmentReader(recovered.path, 0) as reader:
+            summary = reader.summary()
+            found = [reader.read_chunk(place) for place in summary.chunks]
+        kept = {chunk.offset: content_of(chunk)[3:] for chunk in found}
+        want = {chunk.offset: content_of(chunk)[3:] for chunk in chunks}
+        for chunk in chunks:
+            end = chunk.offset + chunk.length + chunk.trailer
+            if whole[chunk.offset : end] == damaged[chunk.offset : end]:
+                # Where it is lost all the same, what defines its channels is.
+                lost = any("is lost" in text for text in recovered.damage)
+                assert kept.get(chunk.offset) == want[chunk.offset] or lost
+        # What is kept is right, but for arrival numbers of a chunk that had lost them.
+        for offset, (rows, payloads, _) in kept.items():
+            assert payloads == want[offset][1]
+            assert [row[:4] for row in rows] == [row[:4] for row in want[offset][0]]
+        if len(kept) < len(chunks):
+            assert recovered.damage or recovered.cut_bytes
+        with SegmentCheck(recovered.path) as check:
+            assert list(check.problems()) == []
+        recovered.path.unlink()
+
+
+def test_a_segment_that_lost_its_metadata_is_not_thrown_away(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    at = whole.index(RECORDING_METADATA.encode()) - 4
+    damaged = bytearray(whole[:-9])
+    damaged[at] ^= 0x80  # the length of its name
+    opened = tmp_path / "000000.mcap.open"
+    opened.write_bytes(damaged)
+    with pytest.raises(SegmentError, match="damaged"):
+        recover_segment(opened)
+    assert opened.read_bytes() == damaged
+    recovered = recover_segment(opened, recording=RECORDING)
+    assert recovered.messages == sum(len(chunk.batch) for chunk in chunks)
+    assert recovered.path is not None
+    with SegmentReader(recovered.path, 0) as reader:
+        summary = reader.summary()
+    assert summary.recording["id"] == RECORDING["id"]
+    assert summary.recording["segment"] == 0
+
+
+def test_cut_bytes_are_those_of_records_that_were_begun(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    last = chunks[-1]
+    opened = tmp_path / "000000.mcap.open"
+    for keep, cut in (
+        (len(whole) - 1, 0),  # the summary, which is made anew
+        (last.offset, 0),
+        (last.offset + 1, 1),
+        (last.offset + 30, 30),
+        (last.offset + last.length, 0),
+        (last.offset + last.length + 4, 4),
+    ):
+        opened.write_bytes(whole[:keep])
+        recovered = recover_segment(opened)
+        assert recovered.cut_bytes == cut, keep
+        assert recovered.path is not None
+        recovered.path.unlink()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.data())
+def test_a_full_disk_costs_nothing_that_was_told_of(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """From any step on; the recorder gives up or dies, and the store is opened again."""
+    directory = tmp_path_factory.mktemp("full")
+    first = data.draw(st.integers(0, 40))
+    gives_up, returns = data.draw(st.booleans()), data.draw(st.booleans())
+    chunks: list[StoredChunk] = []
+    told: dict[str, Sealed] = {}
+    system = Steps(fail_from=first, fail_until=first + 3 if returns else None)
+    with through(system):
+        writer = RecordingWriter(
+            directory,
+            RECORDING,
+            lambda c, _: chunks.append(c),
+            SegmentSettings(chunk_size=1024, segment_size=8000, sync="chunk"),
+            on_sealing=lambda sealed: told.update({sealed.file: sealed}),
+        )
+        try:
+            for n in range(40):
+                writer.append(batch_of([(n % 2, os.urandom(700), n, n, n)]), CHANNELS)
+            writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+        except (DiskFullError, StoreError):
+            try:
+                if gives_up:
+                    writer.give_up([json_metadata(END_METADATA, {"status": "full"})])
+                else:
+                    writer.abort()
+            except (DiskFullError, StoreError):
+                writer.abort()
+    for opened in sorted(directory.glob("*.open")):
+        recover_segment(opened, lambda sealed: told.update({sealed.file: sealed}))
+    found = []
+    for path in sorted(directory.iterdir()):
+        number = int(path.name.removesuffix(".mcap"))
+        with SegmentCheck(path) as check:
+            assert list(check.problems()) == []
+        with SegmentReader(path, number) as reader:
+            summary = reader.summary()
+            assert summary.digest == told[path.name].digest
+            assert summary.size == told[path.name].bytes
+            found += [reader.read_chunk(place) for place in summary.chunks]
+        list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages())
+    have = {(c.segment, c.number): content_of(c) for c in found}
+    assert all(have[c.segment, c.number] == content_of(c) for c in chunks)
+
+
+def test_channels_of_all_chunks_are_bounded_in_a_segment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many topics share a chunk."""
+    monkeypatch.setattr(segment_writer, "_MOST_PARTS", 20)
+    topics = [Channel(f"/{n}", "json", None) for n in range(10)]
+    writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None)
+    for n in range(6):
+        rows = [(channel, b"x", n, n, n) for channel in range(10)]
+        writer.append(batch_of(rows), topics)
+        writer.flush()
+    parts = []
+    for number, path in enumerate(writer.close()):
+        with SegmentReader(path, number) as reader:
+            parts.append(len(reader.summary().table.parts))
+    assert parts == [20, 20, 20, 0]
+
+
+def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
+    whole, chunks = sample(tmp_path / "a")
+    path = tmp_path / "000000.mcap"
+    damaged = bytearray(whole)
+    places = [12, chunks[0].offset + 60, chunks[1].offset + chunks[1].length + 30]
+    for at in places:
+        damaged[at] ^= 1
+    path.write_bytes(damaged)
+    read: list[int] = []
+    with SegmentCheck(path) as check:
+        found = list(check.problems(read.append))
+    assert [start for start, _ in found] == [
+        0,
+        chunks[0].offset,
+        chunks[1].offset + chunks[1].length,
+    ]
+    assert "chunk 0" in found[1][1]
+    assert "chunk 1" in found[2][1]
+    assert read == sorted(read)
+    assert check.summary is not None  # the header is no part of what is said
+    # Without its summary, what has a checksum of its own is still looked at.
+    damaged[-3] ^= 1
+    path.write_bytes(damaged)
+    with SegmentCheck(path) as check:
+        assert check.summary is None
+        starts = [start for start, _ in check.problems()]
+    assert chunks[0].offset in starts
