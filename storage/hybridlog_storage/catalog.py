@@ -1,31 +1,90 @@
-"""The catalog: which recordings, segments, chunks and schemas exist.
+"""The catalog: recordings, channels, chunks and where each lies, in a local file.
 
-Everything in it can be read again from the segments; `reindex` does. A chunk's entry is
-written after its index documents, so a chunk that has an entry is indexed, and what a
-crash left out is found by comparing entries with the segment's own list of chunks.
+All of it is made from journals and from the summaries of segments, and may be deleted at
+any time. It is an SQLite file, so that listing and choosing recordings, and fetching by
+topic and time, open one file and ask no server. Each row carries a checksum, and of each
+recording what its files looked like when the row was made: a row is believed only while
+both still fit.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Final, Self, cast
+import json
+import math
+import os
+import sqlite3
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog_storage.database import Database
+import numpy as np
+
+from hybridlog_storage import durability, files
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.chunk_table import ChunkTable
+from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import ChunkPlace
 
-RECORDINGS: Final = "hybridlog.recordings"
-SCHEMAS: Final = "hybridlog.schemas"
-CHUNKS: Final = "hybridlog.chunks"
-LOSSES: Final = "hybridlog.losses"
-_BRIEF: Final = {
-    **dict.fromkeys(("rec", "seg", "len", "trailer", "first", "last"), 1),
-    **{f"ch.{name}": 1 for name in ("c", "messages", "first", "last")},
-}
-_CHUNK_ENTRIES = 500  # decoded at once; as dictionaries they take some kilobytes each
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CATALOG: Final = "catalog.sqlite"
+"""Name of the file in the store's directory."""
+_VERSION: Final = 2
+_BUSY_S: Final = 20.0
+_NO_DAMAGE: Final = frozenset(
+    {
+        sqlite3.SQLITE_BUSY,
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_FULL,
+        sqlite3.SQLITE_INTERRUPT,
+        sqlite3.SQLITE_IOERR,
+        sqlite3.SQLITE_LOCKED,
+        sqlite3.SQLITE_NOMEM,
+        sqlite3.SQLITE_PERM,
+        sqlite3.SQLITE_READONLY,
+    }
+)
+"""Errors of SQLite that say nothing of the content of the file."""
+_HEAD: Final = b"SQLite format 3\0\x10\0\1\1"
+"""What the file starts with: then the size of a page, and that it has a rollback journal."""
+_CACHED_BYTES: Final = 64 << 20  # of chunk tables
+_STAMPS = np.dtype(
+    [
+        ("unreadable", "<u4"),
+        ("stamped", "<u4"),
+        ("first_stamp", "<i8"),
+        ("last_stamp", "<i8"),
+        ("skew_sum", "<f8"),
+        ("skew_min", "<i8"),
+        ("skew_max", "<i8"),
+    ]
+)
+"""What only the decoded messages tell of a channel in a chunk; a row for each of `parts`."""
+_TABLES: Final = """
+create table meta (key text primary key, value text not null) without rowid;
+create table recordings (
+    id text primary key, files text not null, entry text not null,
+    crc integer not null) without rowid;
+create table segments (
+    id text not null, number integer not null, digest text not null, chunks blob not null,
+    crc integer not null, primary key (id, number));
+create table stamps (
+    id text not null, number integer not null, digest text not null, rows blob not null,
+    crc integer not null, primary key (id, number));
+create table damage (
+    id text primary key, chunks text not null, crc integer not null) without rowid;
+create table schemas (
+    hash text primary key, name text not null, encoding text not null, data blob not null);
+"""
 
 
 @dataclass(slots=True)
@@ -62,14 +121,6 @@ class ChannelStats:
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
-_STATS = tuple(of.name for of in fields(ChannelStats))
-
-
-def _as_dict(stats: ChannelStats) -> dict[str, int | float | None]:
-    """By name, without the copies that `asdict` makes of each value."""
-    return {name: getattr(stats, name) for name in _STATS}
-
-
 @dataclass(slots=True)
 class ChannelEntry:
     """One channel of a recording."""
@@ -91,22 +142,31 @@ class RecordingEntry:
     """One recording.
 
     Attributes:
-        id: Name of its directory, unique in the store.
-        key: Number of the recording, 32 bits, unique in the store.
+        id: 32 hexadecimal digits, drawn when it began; what everything refers to.
+        label: Name of its directory; for people, may change at any time.
         name: As the user calls it.
         tags: As the user gave them.
         source: Where it came from: path, kind, profile, bytes, fingerprint.
         created: When it was recorded, ns.
-        status: `open`, `complete`, `damaged` (the source was), `recovered` (from a crash).
+        status: `open` (being recorded), `unfinished` (cut short by a crash, in a store that
+            cannot be written), `complete`, `recovered` (from a crash), `damaged`
+            (its source was, or a part of it is), `unproven` (its journal was lost, so nobody
+            can say that nothing else was).
         end: How it ended: losses, damage.
         channels: Its channels.
         stored_bytes: Size of its segments.
         segments: Number of segments.
         chunks: Number of chunks.
+        notes: What people wrote about it: `at` (ns) and `text`.
+        marks: Set after it ended: `time` (ns), `text`, `tags`.
+        spans: Number, first and last log time (ns) of each segment that has messages.
+        digests: Of each segment that is believed, by its number as text.
+        is_decoded: Whether it is known what the decoded messages tell. Without, nobody knows
+            which messages do not fit their definition, nor their header stamps.
     """
 
     id: str
-    key: int
+    label: str
     name: str
     tags: dict[str, str]
     source: dict[str, Any]
@@ -117,6 +177,16 @@ class RecordingEntry:
     stored_bytes: int = 0
     segments: int = 0
     chunks: int = 0
+    notes: list[dict[str, Any]] = field(default_factory=list)
+    marks: list[dict[str, Any]] = field(default_factory=list)
+    spans: list[tuple[int, int, int]] = field(default_factory=list)
+    digests: dict[str, str] = field(default_factory=dict)
+    is_decoded: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its first 64 bits, 16 hexadecimal digits: what index documents refer to."""
+        return self.id[:16]
 
     @property
     def messages(self) -> int:
@@ -139,31 +209,46 @@ class RecordingEntry:
         return (min(firsts), max(lasts)) if firsts else None
 
     def to_document(self) -> dict[str, Any]:
-        """As it stands in MongoDB."""
-        document = asdict(self)
-        document["_id"] = document.pop("id")
-        return document
+        """As a mapping of plain values."""
+        return asdict(self)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
-        """From MongoDB."""
+        """From such a mapping."""
         values = dict(document)
-        values["id"] = values.pop("_id")
         values["channels"] = [
             ChannelEntry(**{**c, "stats": ChannelStats(**c["stats"])}) for c in values["channels"]
         ]
+        values["spans"] = [tuple(span) for span in values["spans"]]
         return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkEntry:
-    """One chunk: where it lies and what is in it, by channel id."""
+    """One chunk: where it lies and what is in it, by channel id.
+
+    Attributes:
+        recording: Id of its recording.
+        segment: Number of its segment.
+        number: Its number in the segment, from 0.
+        offset: Byte of the chunk record in the file.
+        length: Bytes of the chunk record.
+        trailer: Bytes of message indexes and arrival numbers behind it.
+        crc: CRC-32 of the chunk record as it is stored; None while the segment is open.
+        trailer_crc: CRC-32 of what is behind it; None while the segment is open.
+        first: Least log time, ns.
+        last: Greatest log time, ns.
+        stats: By channel id.
+    """
 
     recording: str
     segment: int
+    number: int
     offset: int
     length: int
     trailer: int
+    crc: int | None
+    trailer_crc: int | None
     first: int
     last: int
     stats: dict[int, ChannelStats]
@@ -172,7 +257,15 @@ class ChunkEntry:
     def place(self) -> ChunkPlace:
         """Where it lies in its segment, as the segment's reader wants to know it."""
         return ChunkPlace(
-            self.offset, self.length, self.trailer, self.first, self.last, tuple(self.stats)
+            offset=self.offset,
+            length=self.length,
+            trailer=self.trailer,
+            first=self.first,
+            last=self.last,
+            channels=tuple(self.stats),
+            number=self.number,
+            crc=self.crc,
+            trailer_crc=self.trailer_crc,
         )
 
     @property
@@ -188,149 +281,669 @@ class ChunkEntry:
         return (min(firsts), max(lasts)) if firsts and lasts else None
 
 
-class ChannelTotals:
-    """Statistics of channels, summed up chunk by chunk; the order makes no difference."""
+def channel_totals(
+    table: ChunkTable, stamps: NDArray[np.void] | None, silent: Container[int] = ()
+) -> dict[int, ChannelStats]:
+    """Statistics of the channels of a segment.
 
-    def __init__(self) -> None:
-        self._stats: dict[int, ChannelStats] = {}
-        # Of floats the order would: these are exact, since a skew is a number of nanoseconds.
-        self._skews: Counter[int] = Counter()
-
-    @classmethod
-    def of(cls, chunks: Iterable[ChunkEntry]) -> Self:
-        """The totals of some chunks."""
-        totals = cls()
-        for chunk in chunks:
-            totals.add(chunk)
-        return totals
-
-    def add(self, chunk: ChunkEntry) -> None:
-        """Take in a chunk."""
-        for channel, stats in chunk.stats.items():
-            self._stats.setdefault(channel, ChannelStats()).add(stats)
-            self._skews[channel] += int(stats.skew_sum)
-
-    def stats(self, channel: int) -> ChannelStats:
-        """What is known of a channel: nothing, if no chunk had messages of it."""
-        return replace(
-            self._stats.get(channel, ChannelStats()), skew_sum=float(self._skews[channel])
+    Args:
+        table: Its chunks.
+        stamps: What the decoded messages tell, a row for each of `table.parts`; None while
+            nobody has decoded them.
+        silent: Ids of channels whose sender tells no publish time.
+    """
+    parts = table.parts
+    found: dict[int, ChannelStats] = {}
+    order = np.argsort(parts["channel"], kind="stable")
+    ids = parts["channel"][order]
+    begins = np.flatnonzero(np.diff(ids, prepend=-1)) if len(ids) else np.empty(0, np.intp)
+    for begin, end in pairwise([*begins.tolist(), len(ids)]):
+        rows = parts[order[begin:end]]
+        channel = int(ids[begin])
+        stats = found[channel] = ChannelStats(
+            messages=int(rows["messages"].sum()),
+            payload_bytes=int(rows["payload_bytes"].sum()),
+            first=int(rows["first"].min()),
+            last=int(rows["last"].max()),
+            longest=int((rows["last"] - rows["first"]).max()),
         )
+        if channel not in silent:
+            stats.first_publish = int(rows["first_publish"].min())
+            stats.last_publish = int(rows["last_publish"].max())
+        if stamps is not None:
+            _add_stamps(stats, stamps[order[begin:end]])
+    return found
+
+
+def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
+    stats.unreadable = int(rows["unreadable"].sum())
+    rows = rows[rows["stamped"] > 0]
+    if len(rows):
+        stats.stamped = int(rows["stamped"].sum())
+        # Exact, so that the order of segments and chunks makes no difference.
+        stats.skew_sum = math.fsum(rows["skew_sum"].tolist())
+        stats.first_stamp = int(rows["first_stamp"].min())
+        stats.last_stamp = int(rows["last_stamp"].max())
+        stats.skew_min = int(rows["skew_min"].min())
+        stats.skew_max = int(rows["skew_max"].max())
+
+
+def stamps_of(
+    table: ChunkTable, chunks: Mapping[int, Mapping[int, ChannelStats]]
+) -> NDArray[np.void]:
+    """What the decoded messages of a segment's chunks tell, a row for each of `table.parts`.
+
+    Args:
+        table: The segment's chunks.
+        chunks: Statistics of each channel, by number of a chunk that could be decoded.
+    """
+    rows = np.zeros(len(table.parts), _STAMPS)
+    ends = np.cumsum(table.chunks["parts"])
+    starts = ends - table.chunks["parts"]
+    for number, told in chunks.items():
+        for row in range(int(starts[number]), int(ends[number])):
+            stats = told.get(int(table.parts["channel"][row]))
+            if stats is None:
+                continue
+            rows[row] = (
+                stats.unreadable,
+                stats.stamped,
+                stats.first_stamp or 0,
+                stats.last_stamp or 0,
+                stats.skew_sum,
+                stats.skew_min or 0,
+                stats.skew_max or 0,
+            )
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """A recording as its files describe it.
+
+    Attributes:
+        entry: Its entry.
+        files: What the files looked like: the row is believed while they still do.
+        tables: Chunks of each segment that is believed, by number.
+        channels: By id.
+    """
+
+    entry: RecordingEntry
+    files: str
+    tables: Mapping[int, ChunkTable]
+    channels: Mapping[int, Channel]
 
 
 class Catalog:
-    """The catalog collections of a database."""
+    """The catalog of a store. Thread safe.
 
-    def __init__(self, database: Database) -> None:
-        self._db = database
+    Args:
+        store: The store's directory; None for a catalog in memory, of a store that this user
+            cannot write.
+        store_id: The store's id; the catalog of another store is made anew.
+    """
 
-    def prepare(self) -> None:
-        """Make the indexes that questions to the catalog need."""
-        self._db.create_index(CHUNKS, [("rec", 1), ("ch.c", 1), ("ch.first", 1)])
+    def __init__(self, store: Path | None, store_id: str) -> None:
+        self._path = store / CATALOG if store is not None else None
+        self._store_id = store_id
+        self._lock = RLock()
+        self._file: tuple[int, int] | None = None
+        self._tables: OrderedDict[tuple[str, int, str], tuple[ChunkTable, NDArray[np.void] | None]]
+        self._tables = OrderedDict()
+        self._cached = 0
+        self._db = self._open()
 
-    def put_recording(self, entry: RecordingEntry) -> None:
-        """Write or replace a recording."""
-        self._db.replace(RECORDINGS, {"_id": entry.id}, entry.to_document())
+    @property
+    def is_in_memory(self) -> bool:
+        """Whether it is this process's own, and goes with it."""
+        return self._path is None
 
-    def recordings(self) -> list[RecordingEntry]:
-        """All recordings, oldest log time first, empty ones last."""
-        found = [RecordingEntry.from_document(d) for d in self._db.find(RECORDINGS, {})]
-        return sorted(found, key=lambda r: (r.span is None, r.span or (0, 0), r.id))
+    def close(self) -> None:
+        """Give the file back."""
+        with self._lock:
+            self._db.close()
+            self._forget()
 
-    def put_schemas(self, channels: Iterable[Channel]) -> None:
-        """Keep the schemas of channels, each under its hash."""
-        self._db.replace_all(
-            SCHEMAS,
-            [
-                {"_id": schema_hash(s), "name": s.name, "encoding": s.encoding, "data": s.data}
-                for s in {channel.schema for channel in channels}
-                if s is not None
-            ],
+    # Opening.
+
+    def _open(self) -> sqlite3.Connection:
+        try:
+            return self._connect()
+        except sqlite3.Error as error:
+            if not _is_damage(error):
+                raise self._told(error, "opened") from error
+            self._delete()
+        try:
+            return self._connect()
+        except sqlite3.Error as error:
+            raise self._told(error, "made") from error
+
+    def _connect(self) -> sqlite3.Connection:
+        if self._path is None:
+            db = sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None)
+        else:
+            # SQLite itself follows no symlink but one in place of the file.
+            path = Path(os.path.realpath(self._path.parent)) / CATALOG
+            try:
+                # The group may write it where it may write the store.
+                fd = files.open_file(path, os.O_RDWR | os.O_CREAT, depth=files.IN_STORE)
+                try:
+                    self._file = _identity(os.fstat(fd))
+                    head = os.pread(fd, len(_HEAD), 0)
+                finally:
+                    os.close(fd)
+            except OSError as error:
+                raise durability.explain(error, self._path, "opening") from error
+            if head and (head[:16] != _HEAD[:16] or head[18:] != _HEAD[18:]):
+                raise sqlite3.DatabaseError("it is no catalog")
+            db = sqlite3.connect(
+                path, timeout=_BUSY_S, check_same_thread=False, isolation_level=None
+            )
+            ((_, _, opened),) = db.execute("pragma database_list").fetchall()
+            if opened != str(path):
+                db.close()
+                raise StoreError(
+                    f"{self._path} is a symlink. Delete it: the catalog is made again."
+                )
+        try:
+            db.execute("pragma synchronous = off")  # what a power cut breaks is made again
+            db.execute("pragma cell_size_check = on")
+            # Text that is damaged is a row that is left out, not the whole catalog.
+            db.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")
+            if not self._is_ours(db):
+                self._make(db)
+        except BaseException:
+            db.close()
+            raise
+        return db
+
+    def _is_ours(self, db: sqlite3.Connection) -> bool:
+        """Whether the tables are of this version, and of this store."""
+        found = db.execute("select count(*) from sqlite_master where name = 'meta'").fetchone()
+        if not found[0]:
+            return False
+        made = db.execute("select key, value from meta").fetchall()
+        return sorted(made) == [("store", self._store_id), ("version", str(_VERSION))]
+
+    def _make(self, db: sqlite3.Connection, *, anew: bool = False) -> None:
+        """Make the tables, unless another process has just done it."""
+        db.execute("begin immediate")
+        try:
+            if anew or not self._is_ours(db):
+                tables = db.execute("select name from sqlite_master where type = 'table'")
+                for (name,) in tables.fetchall():
+                    db.execute(f'drop table "{name}"')
+                for statement in _TABLES.split(";"):
+                    db.execute(statement)
+                db.executemany(
+                    "insert into meta values (?, ?)",
+                    [("version", str(_VERSION)), ("store", self._store_id)],
+                )
+            db.execute("commit")
+        except BaseException:
+            with suppress(sqlite3.Error):
+                db.execute("rollback")
+            raise
+
+    def _delete(self) -> None:
+        if self._path is not None:
+            for name in (CATALOG, f"{CATALOG}-journal"):
+                with suppress(FileNotFoundError):
+                    files.unlink(self._path.with_name(name), depth=files.IN_STORE)
+
+    def rebuild(self) -> None:
+        """Make the catalog anew, empty.
+
+        Raises:
+            StoreError: It cannot be written.
+        """
+        with self._lock:
+            self._forget()
+            try:
+                if self._is_sound():
+                    # Other processes may have it open, and go on with it.
+                    self._make(self._db, anew=True)
+                    return
+            except sqlite3.Error as error:
+                if not _is_damage(error):
+                    raise self._told(error, "made") from error
+            self._db.close()
+            self._delete()
+            self._db = self._open()
+
+    def mend(self) -> None:
+        """Make the catalog anew, empty, unless only single rows are damaged.
+
+        Rows that are written into a damaged file damage others.
+
+        Raises:
+            StoreError: It cannot be read or written.
+        """
+        with self._lock:
+            try:
+                if self._is_sound():
+                    return
+            except sqlite3.Error as error:
+                if not _is_damage(error):
+                    raise self._told(error, "read") from error
+            self.rebuild()
+
+    def is_sound(self) -> bool:
+        """Whether the file as such is whole; its rows are checked when they are read.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        with self._lock:
+            try:
+                return self._is_sound()
+            except sqlite3.Error as error:
+                if _is_damage(error):
+                    return False
+                raise self._told(error, "read") from error
+
+    def _is_sound(self) -> bool:
+        return bool(self._db.execute("pragma quick_check(1)").fetchone() == ("ok",))
+
+    def _follow(self) -> None:
+        """Open the file again if another process has made a new one."""
+        if self._path is None:
+            return
+        try:
+            now = _identity(files.status(self._path, depth=files.IN_STORE))
+        except OSError:
+            now = None
+        if now != self._file:
+            self._db.close()
+            self._forget()
+            self._db = self._open()
+
+    def _told(self, error: sqlite3.Error, what: str) -> StoreError | DiskFullError:
+        """An error of SQLite's as one of ours."""
+        name = getattr(error, "sqlite_errorname", "")
+        if name == "SQLITE_FULL" or "is full" in str(error):
+            return DiskFullError(
+                f"No space left while writing {self._path}. Free some space and run the "
+                "command again."
+            )
+        if _is_damage(error):
+            return CatalogError(
+                f"The catalog {self._path} is damaged: {error}. `hybridlog reindex` makes it again."
+            )
+        return StoreError(
+            f"The catalog {self._path} cannot be {what}: {error}. It may be deleted while nobody "
+            "uses the store; it is made again."
         )
+
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        """Looking something up.
+
+        Raises:
+            CatalogError: The file is damaged.
+            StoreError: It cannot be read.
+        """
+        with self._lock:
+            try:
+                yield self._db
+            except sqlite3.Error as error:
+                raise self._told(error, "read") from error
+
+    def _change(self, work: Callable[[sqlite3.Connection], None]) -> None:
+        """Make changes of which all are kept, or none; into a new catalog if this is damaged.
+
+        A recording that ends must not fail because of what can be made again.
+
+        Raises:
+            DiskFullError: There is no room.
+            StoreError: They cannot be written.
+        """
+        try:
+            with self._changing() as db:
+                work(db)
+        except CatalogError:
+            self.rebuild()
+            with self._changing() as db:
+                work(db)
+
+    @contextmanager
+    def _changing(self) -> Iterator[sqlite3.Connection]:
+        """Changes of which all are kept, or none.
+
+        Raises:
+            CatalogError: The file is damaged.
+            DiskFullError: There is no room.
+            StoreError: They cannot be written.
+        """
+        try:
+            with self._writing() as db:
+                yield db
+        except sqlite3.Error as error:
+            self._forget()
+            raise self._told(error, "written") from error
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            self._follow()
+            self._db.execute("begin immediate")
+            try:
+                yield self._db
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    self._db.execute("rollback")
+                raise
+            self._db.execute("commit")
+
+    def _forget(self, recording: str | None = None) -> None:
+        for key in [k for k in self._tables if recording in {None, k[0]}]:
+            table, _ = self._tables.pop(key)
+            self._cached -= _size(table)
+
+    # Recordings.
+
+    def put(self, described: Described) -> None:
+        """Write or replace a recording and all its chunks."""
+        entry = described.entry
+        # In ASCII: the name of a directory need not be UTF-8.
+        text = json.dumps(entry.to_document(), separators=(",", ":"))
+        row = (entry.id, described.files, text)
+
+        def work(db: sqlite3.Connection) -> None:
+            self._forget(entry.id)
+            db.execute("delete from segments where id = ?", (entry.id,))
+            for number, table in described.tables.items():
+                part = (entry.id, number, entry.digests[str(number)], table.to_bytes())
+                db.execute("insert into segments values (?, ?, ?, ?, ?)", (*part, _crc(*part)))
+            db.executemany(
+                "insert or replace into schemas values (?, ?, ?, ?)",
+                [
+                    (schema_hash(s), s.name, s.encoding, s.data)
+                    for s in {c.schema for c in described.channels.values()}
+                    if s is not None
+                ],
+            )
+            db.execute("insert or replace into recordings values (?, ?, ?, ?)", (*row, _crc(*row)))
+
+        self._change(work)
+
+    def recordings(self) -> dict[str, tuple[str, RecordingEntry]]:
+        """By id: what the files looked like, and the entry; rows that are damaged are left out.
+
+        Raises:
+            CatalogError: More than single rows is damaged.
+        """
+        found: dict[str, tuple[str, RecordingEntry]] = {}
+        with self._reading():
+            self._follow()
+            asked = "select id, files, entry, crc from recordings"
+            rows = self._db.execute(asked).fetchall()
+            for *row, crc in rows:
+                if _crc(*row) == crc:
+                    with suppress(KeyError, TypeError, ValueError):
+                        found[row[0]] = row[1], RecordingEntry.from_document(json.loads(row[2]))
+            if len(found) < len(rows) and not self._is_sound():
+                raise CatalogError(f"The catalog {self._path} is damaged.")
+        return found
+
+    def remove(self, recording: str) -> None:
+        """Remove a recording."""
+
+        def work(db: sqlite3.Connection) -> None:
+            self._forget(recording)
+            for table in ("recordings", "segments", "stamps", "damage"):
+                db.execute(f"delete from {table} where id = ?", (recording,))  # noqa: S608
+
+        self._change(work)
+
+    # What the decoded messages tell.
+
+    def put_stamps(
+        self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
+    ) -> None:
+        """Keep what decoded messages tell of a recording's segments.
+
+        Args:
+            recording: Its id.
+            stamps: Number and digest of a segment, and a row for each of the `parts` of its
+                chunk table.
+        """
+        rows_of = [(recording, number, digest, rows.tobytes()) for number, digest, rows in stamps]
+
+        def work(db: sqlite3.Connection) -> None:
+            self._forget(recording)
+            db.executemany(
+                "insert or replace into stamps values (?, ?, ?, ?, ?)",
+                [(*row, _crc(*row)) for row in rows_of],
+            )
+
+        self._change(work)
+
+    def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
+        """Keep which chunks of a recording cannot be read, by segment and number, and why."""
+
+        def work(db: sqlite3.Connection) -> None:
+            db.execute("delete from damage where id = ?", (recording,))
+            if damage:
+                rows = [(*place, reason) for place, reason in sorted(damage.items())]
+                row = (recording, json.dumps(rows))
+                db.execute("insert into damage values (?, ?, ?)", (*row, _crc(*row)))
+
+        self._change(work)
+
+    def damage(self, recording: str) -> dict[tuple[int, int], str]:
+        """Which chunks of a recording could not be read, by segment and number, and why.
+
+        Raises:
+            CatalogError: It is not known any more.
+        """
+        with self._reading() as db:
+            row = db.execute(
+                "select id, chunks, crc from damage where id = ?", (recording,)
+            ).fetchone()
+        if row is None:
+            return {}
+        if _crc(*row[:2]) != row[2] or row[0] != recording:
+            raise CatalogError(
+                f"The catalog's list of damaged chunks of recording {recording} is damaged. "
+                "`hybridlog reindex` makes it again."
+            )
+        return {(segment, chunk): reason for segment, chunk, reason in json.loads(row[1])}
+
+    def stamps(
+        self, entry: RecordingEntry, number: int, table: ChunkTable
+    ) -> NDArray[np.void] | None:
+        """What decoded messages tell of a segment; None while nobody has decoded them."""
+        with self._reading() as db:
+            row = db.execute(
+                "select id, number, digest, rows, crc from stamps where id = ? and number = ?",
+                (entry.id, number),
+            ).fetchone()
+        if row is None or _crc(*row[:4]) != row[4] or row[2] != entry.digests.get(str(number)):
+            return None
+        if len(row[3]) != len(table.parts) * _STAMPS.itemsize:
+            return None
+        return np.frombuffer(row[3], _STAMPS)
+
+    # Schemas.
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
-        """Schemas by hash."""
-        return {
-            d["_id"]: Schema(d["name"], d["encoding"], bytes(d["data"]))
-            for d in self._db.find(SCHEMAS, {"_id": {"$in": list(hashes)}})
-        }
+        """Schemas by hash; those that are missing or damaged are left out."""
+        found: dict[str, Schema] = {}
+        with self._reading() as db:
+            for digest in hashes:
+                row = db.execute(
+                    "select name, encoding, data from schemas where hash = ?", (digest,)
+                ).fetchone()
+                if row is not None and list(map(type, row)) == [str, str, bytes]:
+                    schema = Schema(*row)
+                    if schema_hash(schema) == digest:
+                        found[digest] = schema
+        return found
 
-    def put_chunks(self, chunks: Sequence[ChunkEntry]) -> None:
-        """Note that chunks are in their segment and their messages are in the index."""
-        self._db.replace_all(
-            CHUNKS,
-            [
-                {
-                    "_id": {"rec": chunk.recording, "seg": chunk.segment, "off": chunk.offset},
-                    "rec": chunk.recording,
-                    "seg": chunk.segment,
-                    "len": chunk.length,
-                    "trailer": chunk.trailer,
-                    "first": chunk.first,
-                    "last": chunk.last,
-                    "ch": [{"c": c, **_as_dict(stats)} for c, stats in sorted(chunk.stats.items())],
-                }
-                for chunk in chunks
-            ],
-        )
+    # Chunks.
+
+    def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
+        """The chunks of a segment.
+
+        Raises:
+            CatalogError: The catalog has lost them.
+        """
+        return self._table(entry, number)[0]
+
+    def _table(
+        self, entry: RecordingEntry, number: int
+    ) -> tuple[ChunkTable, NDArray[np.void] | None]:
+        key = entry.id, number, entry.digests.get(str(number), "")
+        with self._reading() as db:
+            kept = self._tables.get(key)
+            if kept is not None:
+                self._tables.move_to_end(key)
+                return kept
+            row = db.execute(
+                "select id, number, digest, chunks, crc from segments where id = ? and number = ?",
+                key[:2],
+            ).fetchone()
+            if row is None or _crc(*row[:4]) != row[4] or row[:3] != key:
+                raise CatalogError(
+                    f"The catalog has lost the chunks of segment {number} of recording "
+                    f"{entry.label}. `hybridlog reindex` makes it again."
+                )
+            table = ChunkTable.from_bytes(row[3])
+            kept = table, self.stamps(entry, number, table)
+            if kept[1] is None and entry.is_decoded and len(table.parts):
+                # Without its row the next opening looks at the recording anew.
+                with suppress(sqlite3.Error):
+                    db.execute("delete from recordings where id = ?", (entry.id,))
+            self._tables[key] = kept
+            self._cached += _size(table)
+            while self._cached > _CACHED_BYTES and len(self._tables) > 1:
+                _, (oldest, _) = self._tables.popitem(last=False)
+                self._cached -= _size(oldest)
+            return kept
 
     def chunks(
         self,
-        recording: str,
+        entry: RecordingEntry,
         channels: Sequence[int] | None = None,
         bounds: tuple[int, int] | None = None,
         clock: str = "log",
-        longest: int | None = None,
-        *,
-        brief: bool = False,
     ) -> list[ChunkEntry]:
         """Chunks of a recording that may hold messages of some channels in a time range.
 
         Args:
-            recording: Its id.
+            entry: The recording.
             channels: Channel ids, None for all.
             bounds: `[begin, end)`, ns, None for all times.
-            clock: `log`, `publish` or `header`: which time `bounds` is about.
-            longest: Most log time that a chunk spans, ns, if known: no chunk that begins
-                earlier than that before `bounds` needs to be looked at.
-            brief: Of each channel only how many messages there are, and their first and
-                last log time.
+            clock: `log`, `publish` or `header`: which time `bounds` is about. Where nobody
+                has decoded the messages, every chunk may hold any stamp.
         """
-        of_channel: dict[str, Any] = {}
-        if channels is not None:
-            of_channel["c"] = {"$in": list(channels)}
-        if bounds is not None:
-            suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
-            of_channel[f"first{suffix}"] = {"$lt": bounds[1]}
-            if longest is not None and clock == "log":
-                of_channel["first"]["$gte"] = max(bounds[0] - longest, 0)
-            of_channel[f"last{suffix}"] = {"$gte": bounds[0]}
-        query = {"ch": {"$elemMatch": of_channel}} if of_channel else {}
-        return list(self._chunks({"rec": recording, **query}, brief=brief))
-
-    def every_chunk(self, recording: str) -> Iterator[ChunkEntry]:
-        """All chunks of a recording, one by one: of a long one too many to hold."""
-        return self._chunks({"rec": recording})
-
-    def _chunks(self, query: Mapping[str, Any], *, brief: bool = False) -> Iterator[ChunkEntry]:
-        found = self._db.find(CHUNKS, query, _BRIEF if brief else None, batch_size=_CHUNK_ENTRIES)
-        return map(_chunk_entry, found)
-
-    def remove_recording(self, recording: str, collections: Iterable[str]) -> None:
-        """Remove every trace of a recording from the database."""
-        for collection in collections:
-            self._db.delete(collection, {"_meta.rec": recording})
-        self._db.delete(CHUNKS, {"rec": recording})
-        self._db.delete(LOSSES, {"rec": recording})
-        self._db.delete(RECORDINGS, {"_id": recording})
-
-    def put_losses(self, recording: str, losses: Sequence[Mapping[str, object]]) -> None:
-        """Replace the loss ledger of a recording."""
-        self._db.delete(LOSSES, {"rec": recording})
-        for number, loss in enumerate(losses):
-            key = {"rec": recording, "n": number}
-            self._db.replace(
-                LOSSES, {"_id": key}, {"_id": key, "rec": recording, **dict(sorted(loss.items()))}
+        found: list[ChunkEntry] = []
+        for number, first, last in entry.spans:
+            if (
+                bounds is not None
+                and clock == "log"
+                and not (first < bounds[1] and last >= bounds[0])
+            ):
+                continue
+            table, stamps = self._table(entry, number)
+            found += chunk_entries(
+                entry, number, table, stamps, channels=channels, bounds=bounds, clock=clock
             )
+        return found
+
+
+def chunk_entries(
+    entry: RecordingEntry,
+    segment: int,
+    table: ChunkTable,
+    stamps: NDArray[np.void] | None,
+    *,
+    channels: Sequence[int] | None = None,
+    bounds: tuple[int, int] | None = None,
+    clock: str = "log",
+) -> list[ChunkEntry]:
+    """Entries of a segment's chunks that may hold messages of some channels in a time range."""
+    parts = table.parts
+    wanted = np.ones(len(parts), np.bool_)
+    if channels is not None:
+        wanted &= np.isin(parts["channel"], np.array(channels, np.int64))
+    if bounds is not None:
+        wanted &= _in_bounds(entry, parts, stamps, bounds, clock)
+    if not wanted.any():
+        return []
+    chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
+    ends = np.cumsum(table.chunks["parts"])
+    silent = {c.id for c in entry.channels if not c.has_publish_time}
+    found = []
+    for number in np.unique(chunk_of[wanted]).tolist():
+        chunk = table.chunks[number]
+        rows = slice(int(ends[number]) - int(chunk["parts"]), int(ends[number]))
+        stats = {
+            int(part["channel"]): _stats(part, stamps[row] if stamps is not None else None, silent)
+            for row, part in zip(range(rows.start, rows.stop), parts[rows], strict=True)
+        }
+        found.append(
+            ChunkEntry(
+                entry.id,
+                segment,
+                number,
+                int(chunk["offset"]),
+                int(chunk["length"]),
+                int(chunk["trailer"]),
+                int(chunk["crc"]),
+                int(chunk["trailer_crc"]),
+                int(chunk["first"]),
+                int(chunk["last"]),
+                stats,
+            )
+        )
+    return found
+
+
+def _in_bounds(
+    entry: RecordingEntry,
+    parts: NDArray[np.void],
+    stamps: NDArray[np.void] | None,
+    bounds: tuple[int, int],
+    clock: str,
+) -> NDArray[np.bool_]:
+    begin, end = (max(min(bound, (1 << 63) - 1), -(1 << 63)) for bound in bounds)
+    if clock == "header":
+        if stamps is None:
+            return np.ones(len(parts), np.bool_)
+        inside = (stamps["first_stamp"] < end) & (stamps["last_stamp"] >= begin)
+        return np.asarray(inside & (stamps["stamped"] > 0))
+    suffix = "_publish" if clock == "publish" else ""
+    inside = (parts[f"first{suffix}"] < end) & (parts[f"last{suffix}"] >= begin)
+    if clock == "publish":
+        told = [c.id for c in entry.channels if c.has_publish_time]
+        inside &= np.isin(parts["channel"], np.array(told, np.int64))
+    return np.asarray(inside)
+
+
+def _stats(part: np.void, stamp: np.void | None, silent: Container[int]) -> ChannelStats:
+    first, last = int(part["first"]), int(part["last"])
+    stats = ChannelStats(
+        messages=int(part["messages"]),
+        payload_bytes=int(part["payload_bytes"]),
+        first=first,
+        last=last,
+        longest=last - first,
+    )
+    if int(part["channel"]) not in silent:
+        stats.first_publish = int(part["first_publish"])
+        stats.last_publish = int(part["last_publish"])
+    if stamp is not None:
+        stats.unreadable = int(stamp["unreadable"])
+        if stamp["stamped"]:
+            stats.stamped = int(stamp["stamped"])
+            stats.skew_sum = float(stamp["skew_sum"])
+            stats.first_stamp = int(stamp["first_stamp"])
+            stats.last_stamp = int(stamp["last_stamp"])
+            stats.skew_min = int(stamp["skew_min"])
+            stats.skew_max = int(stamp["skew_max"])
+    return stats
 
 
 def schema_hash(schema: Schema) -> str:
@@ -355,22 +968,31 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
     )
 
 
-def _chunk_entry(document: Mapping[str, Any]) -> ChunkEntry:
-    stats = {}
-    for item in document["ch"]:
-        values = dict(item)
-        channel = cast(int, values.pop("c"))
-        stats[channel] = ChannelStats(**values)
-    return ChunkEntry(
-        document["rec"],
-        document["seg"],
-        document["_id"]["off"],
-        document["len"],
-        document["trailer"],
-        document["first"],
-        document["last"],
-        stats,
-    )
+def _crc(*values: object) -> int:
+    """Checksum of the values of a row."""
+    crc = 0
+    for value in values:
+        # What SQLite takes for another type is another value.
+        kind = type(value).__name__.encode()
+        data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
+        crc = crc32(data, crc32(kind + len(data).to_bytes(8, "little"), crc))
+    return crc
+
+
+def _size(table: ChunkTable) -> int:
+    return int(table.chunks.nbytes + table.parts.nbytes + table.others.nbytes)
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether an error comes from what is in the file."""
+    code = getattr(error, "sqlite_errorcode", None)
+    if code is None:
+        return "is full" not in str(error) and "I/O error" not in str(error)
+    return code & 0xFF not in _NO_DAMAGE
+
+
+def _identity(about: os.stat_result) -> tuple[int, int]:
+    return about.st_dev, about.st_ino
 
 
 def _least(a: int | None, b: int | None) -> int | None:

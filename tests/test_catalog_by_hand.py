@@ -1,0 +1,158 @@
+"""A catalog that somebody changed: nothing wrong is said, and nobody has to ask for the cure."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.test_model import drafts_of, write_mcap
+
+CHANGES = {
+    "entry": "update recordings set entry = replace(entry, 'complete', 'recovered')",
+    "looks": "update recordings set files = 'x'",
+    "count": "update recordings set entry = replace(entry, '\"messages\":', '\"messages\":1')",
+    "recordings": "delete from recordings",
+    "chunks": "update segments set chunks = substr(chunks, 1, length(chunks) - 1) || x'00'",
+    "segments": "delete from segments",
+    "digest": "update segments set digest = 'sha256:00'",
+    "stamps": "update stamps set rows = zeroblob(length(rows))",
+    "no stamps": "delete from stamps",
+    "damage": "update damage set chunks = '[]'",
+    "no damage": "delete from damage",
+    "schemas": "update schemas set data = x'00'",
+    "no schemas": "delete from schemas",
+    "other store": "update meta set value = 'x' where key = 'store'",
+    "other version": "update meta set value = '1' where key = 'version'",
+    "no meta": "delete from meta",
+    "no table": "drop table segments",
+}
+Told = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two recordings with messages that cannot be read; one has a damaged chunk."""
+    base = tmp_path_factory.mktemp("by-hand")
+    path = base / "store"
+    # Held throughout, so that not each opening has to start it.
+    with hl.open(path, create=True) as opened, EmbeddedMongod(path / "mongod") as mongod:
+        mongod.start()
+        for seed in (5, 6):
+            write_mcap(base / f"log{seed}.mcap", drafts_of(seed, 80))
+            opened.record(base / f"log{seed}.mcap", settings=SegmentSettings(chunk_size=2048))
+        entry = opened.entry("log6")
+        chunk = opened.catalog.chunks(entry)[2]
+        segment = opened.directory.recording("log6") / "000000.mcap"
+        content = bytearray(segment.read_bytes())
+        content[chunk.offset + chunk.length - 1] ^= 1
+        segment.write_bytes(content)
+        opened.reindex()
+        opened.close()
+        yield path
+
+
+@pytest.fixture(scope="module")
+def want(store: Path) -> Told:
+    told = tell(store)
+    statuses = {entry["label"]: entry["status"] for entry in told["entries"]}
+    assert statuses == {"log5": "complete", "log6": "damaged"}
+    assert told["damaged"] > 0
+    for entry in told["entries"]:
+        for name in ("unreadable", "stamped"):
+            assert sum(channel["stats"][name] for channel in entry["channels"])
+    assert {recording for recording, _ in found(store)} == {"log6"}
+    return told
+
+
+def tell(store: Path) -> Told:
+    """What a store says, asked in different ways."""
+    with hl.open(store, require_database=True) as opened:
+        topics = opened.topics()
+        whole = opened.query(topics, ["log5"])
+        stamped = opened.query(["/twin"], ["log5"])
+        told: Told = {
+            "entries": [entry.to_document() for entry in opened.recordings()],
+            "messages": [(m.topic, m.seq, m.log_time_ns, m.raw) for m in whole],
+            "decoded": [m.fields for m in opened.query(["/a__b"], ["log5"])],
+            "count": {t: opened.query([t]).count() for t in topics},
+            "where": {t: opened.query([t]).where({"number": {"$gte": 0}}).count() for t in topics},
+            "stamps": sorted(d["header"]["stamp"] for d in stamped.documents() if "header" in d),
+            "damaged": 0,
+        }
+        try:
+            list(opened.query(topics, ["log6"]))
+        except SegmentError:
+            told["damaged"] = 1
+        return told
+
+
+def found(store: Path) -> list[tuple[str, str]]:
+    """What `verify` finds: label and place."""
+    with hl.open(store, require_database=True) as opened:
+        findings = opened.verify().findings
+    return sorted((f.recording, f.place) for f in findings)
+
+
+@pytest.fixture
+def kept(store: Path, want: Told) -> Iterator[Path]:
+    """The catalog, which is as before afterwards."""
+    catalog = store / "catalog.sqlite"
+    before = catalog.read_bytes()
+    yield catalog
+    catalog.write_bytes(before)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_row_that_was_changed_is_made_again(
+    store: Path, kept: Path, want: Told, name: str
+) -> None:
+    findings = found(store)
+    with closing(sqlite3.connect(kept)) as catalog, catalog:
+        assert catalog.execute(CHANGES[name]).rowcount != 0
+    # What only decoding tells is found out at the next opening after it was missed.
+    assert tell(store) == want
+    assert tell(store) == want
+    assert found(store) == findings
+
+
+def test_a_page_that_was_lost_is_made_again(store: Path, kept: Path, want: Told) -> None:
+    findings = found(store)
+    content = kept.read_bytes()
+    size = int.from_bytes(content[16:18], "big")
+    assert len(content) > 8 * size
+    for at in range(0, len(content), size):
+        kept.write_bytes(content[:at] + bytes(size) + content[at + size :])
+        assert tell(store) == want, at
+        if found(store) != findings:
+            # No question has needed it; who reads everything is told, and of the cure.
+            with hl.open(store) as opened:
+                assert [f.place for f in opened.verify().findings if f.place == "catalog"]
+                opened.repair()
+            assert found(store) == findings, at
+        assert tell(store) == want, at
+
+
+@pytest.mark.parametrize("how", ["gone", "empty", "cut", "other file", "directory's journal"])
+def test_a_file_that_is_no_catalog_is_made_again(
+    store: Path, kept: Path, want: Told, how: str
+) -> None:
+    findings = found(store)
+    if how == "gone":
+        kept.unlink()
+    elif how == "directory's journal":
+        shutil.copy(store / "recordings" / "log5" / "journal", kept)
+    else:
+        content = kept.read_bytes()
+        kept.write_bytes({"empty": b"", "cut": content[: len(content) // 2]}.get(how, b"x" * 9999))
+    assert tell(store) == want
+    assert found(store) == findings
