@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,13 +19,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog_storage.catalog import Catalog, ChannelTotals, ChunkEntry
+from hybridlog_storage.catalog import ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
+from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -180,7 +182,7 @@ class Lag:
         self._recording = recording
         self._behind = behind
         self._reader: SegmentReader | None = None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-reread")
+        self._thread = Threads(1, "hybridlog-reread")
         self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
 
     def wait(self) -> None:
@@ -272,14 +274,13 @@ class IndexWriter:
         self.missed = 0
         """Messages that were skipped because the database had failed."""
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
-        self._totals: ChannelTotals | None = ChannelTotals()
         self._indexer = indexer
         self._lag = lag
         self._gatherer = gatherer
         self._spare = lag.spare if lag else nullcontext()
         self._forgotten: deque[_Forgotten] = deque()
         self._database = database
-        self._catalog = Catalog(database)
+        self._state = IndexState(database)
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
@@ -287,8 +288,8 @@ class IndexWriter:
         self._bytes_in_memory = 0
         self._is_asked = False  # for the next forgotten chunk
         self._has_ended = False  # nothing is taken any more
-        self._maker = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-index")
-        self._senders = ThreadPoolExecutor(_SENDERS, thread_name_prefix="hybridlog-send")
+        self._maker = Threads(1, "hybridlog-index")
+        self._senders = Threads(_SENDERS, "hybridlog-send")
         self._idle = threading.BoundedSemaphore(_SENDERS)
         self._few = _Few()
         self._parcel = _Parcel()
@@ -302,15 +303,6 @@ class IndexWriter:
     def database(self) -> Database:
         """Where documents go now."""
         return self._database
-
-    def totals(self) -> ChannelTotals:
-        """Statistics of the channels, of all chunks that are in the index."""
-        if self._totals is None and self.failure is None:
-            try:
-                self._totals = ChannelTotals.of(self._catalog.every_chunk(self._indexer.recording))
-            except DatabaseError as error:
-                self.failure = error
-        return self._totals or ChannelTotals()
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Index a chunk that is in its segment; waits while the backlog is full."""
@@ -399,12 +391,15 @@ class IndexWriter:
     def _forget(self, chunk: StoredChunk, *, is_gathered: bool = False) -> None:
         """Keep only where a chunk lies."""
         place = ChunkPlace(
-            chunk.offset,
-            chunk.length,
-            chunk.trailer,
-            int(chunk.batch.log_time.min()),
-            int(chunk.batch.log_time.max()),
-            (),
+            offset=chunk.offset,
+            length=chunk.length,
+            trailer=chunk.trailer,
+            first=int(chunk.batch.log_time.min()),
+            last=int(chunk.batch.log_time.max()),
+            channels=(),
+            number=chunk.number,
+            crc=chunk.crc,
+            trailer_crc=chunk.trailer_crc,
         )
         if self._gatherer is not None and not is_gathered:
             self._gatherer.expect(chunk.segment, chunk.offset)
@@ -448,24 +443,22 @@ class IndexWriter:
         try:
             database = self._lag.renew()
             self._renewed.append(database)
-            catalog = Catalog(database)
-            chunks = catalog.every_chunk(self._indexer.recording)
-            there = {(chunk.segment, chunk.offset) for chunk in chunks}
+            state = IndexState(database)
+            there = state.places(self._indexer.recording[:16])
         except DatabaseError as error:
             self.failure = error
             self._retry_at = time.monotonic() + _RETRY_S
             return
         with self._lock:
-            self._database, self._catalog = database, catalog
+            self._database, self._state = database, state
             self._collections.clear()
             # A server that was killed has lost what it had not yet in its journal.
             latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
             for entry in latest:
-                if (entry.segment, entry.offset) in there:
+                if there.get((entry.segment, entry.number)) == entry.offset:
                     self._latest.append(entry)
                 else:
                     self.indexed -= self._put_back(entry)
-                    self._totals = None  # what was taken in cannot be taken out
             self.failure, self._is_away = None, False
 
     def _remember_next(self) -> None:
@@ -552,16 +545,13 @@ class IndexWriter:
                     )
                     data = b"".join(table.data for table in tables)
                     self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
-                self._catalog.put_chunks(parcel.entries)
+                self._state.put_chunks(parcel.entries)
         except DatabaseError as error:
             failure = error
         with self._lock:
             if failure is None:
                 self.indexed += parcel.messages
                 self._latest.extend(parcel.entries)
-                if self._totals is not None:
-                    for entry in parcel.entries:
-                        self._totals.add(entry)
                 return
             self.failure = failure
             self._retry_at = time.monotonic() + _RETRY_S

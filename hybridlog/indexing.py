@@ -49,14 +49,13 @@ class ChunkIndexer:
     """Makes the index documents of one recording's chunks. Thread safe.
 
     Args:
-        recording: Recording id.
-        key: The recording's number.
+        recording: Id of the recording, or the key that is its beginning.
         array_limit: Longest array that is kept in the index whole.
     """
 
-    def __init__(self, recording: str, key: int, *, array_limit: int = ARRAY_LIMIT) -> None:
+    def __init__(self, recording: str, *, array_limit: int = ARRAY_LIMIT) -> None:
         self.recording = recording
-        self._key = key
+        self._key = recording[:16]
         self._array_limit = array_limit
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
         self._lock = threading.Lock()
@@ -93,9 +92,12 @@ class ChunkIndexer:
             ChunkEntry(
                 self.recording,
                 chunk.segment,
+                chunk.number,
                 chunk.offset,
                 chunk.length,
                 chunk.trailer,
+                chunk.crc,
+                chunk.trailer_crc,
                 int(chunk.batch.log_time.min()),
                 int(chunk.batch.log_time.max()),
                 of_chunk,
@@ -118,7 +120,7 @@ class ChunkIndexer:
             if part is None:
                 codec = codec_for(channel, array_limit=self._array_limit)
                 stamped = any(path.path == STAMP and path.type == "time" for path in codec.paths())
-                origin = Origin(self.recording, self._key, channel.topic, channel.has_publish_time)
+                origin = Origin(self._key, channel.topic, channel.has_publish_time)
                 part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped
             return part
 

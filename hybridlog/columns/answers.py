@@ -39,7 +39,8 @@ def judged(
         are not worth getting.
     """
     store = query.store
-    if store.database is None or not store.kept.most_bytes or not query.is_by_log_time:
+    has_index = store.database if query.predicates or fields else store.connected
+    if has_index is None or not store.kept.most_bytes or not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)
     asked = Asked(

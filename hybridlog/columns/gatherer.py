@@ -29,7 +29,7 @@ from hybridlog.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import Scalars, Strings, concatenate
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.column_file import ColumnFileWriter, Values, part_of
+from hybridlog_storage.column_file import ColumnFileWriter, Values, part_of, remove
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -238,7 +238,7 @@ class FieldGatherer:
             if self._writer is not None:
                 self._writer.close(whole)
             else:
-                self._path.unlink(missing_ok=True)
+                remove(self._path)
         self.discard()
 
     def discard(self) -> None:
@@ -247,7 +247,7 @@ class FieldGatherer:
             self._writer.discard()
         else:
             with suppress(OSError):
-                part_of(self._path).unlink()  # a crash may have left it
+                remove(part_of(self._path))  # a crash may have left it
         self._ended = True
         self._writer = None
         self._arena = None
@@ -262,6 +262,8 @@ class FieldGatherer:
         except Exception as error:
             _log.warning("no columns in %s: %s", self._path.parent, error or repr(error))
             self.discard()
+            with suppress(OSError):  # those that were there are of other segments
+                remove(self._path)
 
     def _add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         batch, held = chunk.batch, _Held.of(chunk)

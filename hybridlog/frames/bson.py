@@ -45,9 +45,9 @@ INSTANTS: Final[Mapping[str, Literal["time", "duration"]]] = {
     "time": "time",
     "duration": "duration",
 }
-_ID_BYTES = 20
-_KEY = np.dtype([("time", ">u8"), ("recording", ">u4"), ("seq", ">u8")])
-_KEY_HEAD = np.void(b"\x23\0\0\0\x05_id\0\x14\0\0\0\0")
+_ID_BYTES = 24
+_KEY = np.dtype([("time", ">u8"), ("recording", ">u8"), ("seq", ">u8")])
+_KEY_HEAD = np.void(b"\x27\0\0\0\x05_id\0\x18\0\0\0\0")
 """What stands before the key in a document that has nothing else: 35 bytes, binary, 20 bytes."""
 _KEY_DOCUMENT = np.dtype([("head", "V14"), ("key", _KEY), ("end", "u1")])
 _REFERENCE = {"seg": "_meta.ref.seg", "chunk": "_meta.ref.chunk", "off": "_meta.ref.off"}
@@ -61,7 +61,7 @@ class ReferenceColumns:
         t: int64[n], log time, ns.
         seq: int64[n], arrival number in the recording.
         seg: int64[n], segment number; -1 when the documents came without it.
-        chunk: int64[n], file offset of the chunk record; -1 likewise.
+        chunk: int64[n], number of the chunk in the segment; -1 likewise.
         off: int64[n], start of the payload in the uncompressed chunk; -1 likewise.
         length: int64[n], bytes of the payload; -1 likewise.
     """
@@ -95,12 +95,12 @@ class KeyColumns:
 
     Attributes:
         time: int64[n], log time, ns.
-        recording: int64[n], number of the recording.
+        recording: uint64[n], key of the recording.
         seq: int64[n], arrival number in the recording.
     """
 
     time: NDArray[np.int64]
-    recording: NDArray[np.int64]
+    recording: NDArray[np.uint64]
     seq: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -172,7 +172,11 @@ def key_columns(batch: bytes) -> KeyColumns:
     if len(documents) and (documents["head"] != _KEY_HEAD).any():
         raise _strange("_id")
     keys = documents["key"]
-    return KeyColumns(*(keys[name].astype(np.int64) for name in ("time", "recording", "seq")))
+    return KeyColumns(
+        keys["time"].astype(np.int64),
+        keys["recording"].astype(np.uint64),
+        keys["seq"].astype(np.int64),
+    )
 
 
 def records_from_bson(

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog_storage import durability
+from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import StoreError
 
@@ -78,7 +78,7 @@ class ColumnFileWriter:
     """Writes a file of columns under a name of its own until it is whole.
 
     Args:
-        path: Its final name.
+        path: Its final name, in a recording's folder.
 
     Raises:
         OSError: It cannot be made.
@@ -88,9 +88,8 @@ class ColumnFileWriter:
         self._path = path
         self._part = part_of(path)
         # What lies there under that name is a crash's, or nothing to be written to.
-        self._part.unlink(missing_ok=True)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._fd = os.open(self._part, flags, 0o644)
+        remove(self._part)
+        self._fd = files.open_file(self._part, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._end = 0
         self._tables: dict[str, dict[str, str]] = {}
         self._blocks: dict[str, list[_Rows]] = {}
@@ -158,9 +157,9 @@ class ColumnFileWriter:
                 tail = _TAIL.pack(len(told), crc32(told))
                 self._write([part for page in pages.values() for part in page])
                 self._write([told, tail, MAGIC])
-                self._part.replace(self._path)
+                files.rename(self._part, self._path)
             else:
-                self._path.unlink(missing_ok=True)
+                remove(self._path)
         finally:
             self.discard()
 
@@ -177,7 +176,7 @@ class ColumnFileWriter:
             with suppress(OSError):  # of a file that nobody will read
                 os.close(fd)
             with suppress(OSError):
-                self._part.unlink()
+                files.unlink(self._part)
 
     def _write(self, parts: list[Any]) -> None:
         self._end += durability.write_all(self._fd, parts)
@@ -186,6 +185,16 @@ class ColumnFileWriter:
 def part_of(path: Path) -> Path:
     """Name of a file of columns while it is written."""
     return path.with_name(f"{path.name}.part")
+
+
+def remove(path: Path) -> None:
+    """Remove a file of columns, if it is there.
+
+    Raises:
+        OSError: It cannot be removed.
+    """
+    with suppress(FileNotFoundError):
+        files.unlink(path)
 
 
 class ColumnFile:
@@ -204,7 +213,7 @@ class ColumnFile:
         self._fd = -1
         self._tables: dict[str, _Table] = {}
         try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+            self._fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK)
             self._start, self._pages = self._directory(os.fstat(self._fd).st_size)
         except FileNotFoundError:
             raise

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
 
-KEY_BYTES: Final = 20
+KEY_BYTES: Final = 24
 _HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
 _KEY_AT: Final = _HEAD_WIDTH - KEY_BYTES
 _MAX_TIME: Final = (1 << 63) - 1
@@ -31,12 +31,12 @@ _MAX_TIME: Final = (1 << 63) - 1
 
 def key_bound(log_time: int) -> bytes:
     """The smallest key (`_id`) of any message at or after a log time in nanoseconds."""
-    return struct.pack(">QIQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
+    return struct.pack(">QQQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
 
 
-def recording_key(document: bytes) -> int:
-    """Number of the recording that an index document belongs to, from its key."""
-    return int.from_bytes(document[_KEY_AT + 8 : _KEY_AT + 12], "big")
+def recording_key(document: bytes) -> str:
+    """Key of the recording that an index document belongs to, 16 hexadecimal digits."""
+    return document[_KEY_AT + 8 : _KEY_AT + 16].hex()
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,12 @@ class Origin:
     """What all documents of one channel of one recording share.
 
     Attributes:
-        recording: Recording id.
-        key: Number of the recording, 32 bits, unique in the store.
+        key: The first 64 bits of the recording's id, 16 hexadecimal digits.
         topic: As the source spells it.
         has_publish_time: Whether `_meta.pub` is written.
     """
 
-    recording: str
-    key: int
+    key: str
     topic: str
     has_publish_time: bool
 
@@ -64,7 +62,7 @@ class Placed(NamedTuple):
         seq: int64[n], arrival numbers.
         number: intp[n], which of the chunks each is from.
         segment: int32[n], of that chunk.
-        chunk: int64[n], the chunk's place in the segment.
+        chunk: int64[n], the chunk's number in the segment.
         offset: int64[n], the payload's place in the chunk's content.
     """
 
@@ -85,7 +83,7 @@ class Placed(NamedTuple):
             np.concatenate([chunk.seq for chunk in chunks]),
             number,
             np.array([chunk.segment for chunk in chunks], np.int32)[number],
-            np.array([chunk.offset for chunk in chunks], np.int64)[number],
+            np.array([chunk.number for chunk in chunks], np.int64)[number],
             np.concatenate([batch.offset for batch in batches]),
         )
 
@@ -129,8 +127,8 @@ class DocumentAssembler:
         log_time = batch.log_time[rows]
         seq = placed.seq[rows]
         _column(out, _KEY_AT, ">i8")[:] = log_time
-        _column(out, _KEY_AT + 8, ">u4")[:] = self._origin.key
-        _column(out, _KEY_AT + 12, ">i8")[:] = seq
+        _column(out, _KEY_AT + 8, ">u8")[:] = int(self._origin.key, 16)
+        _column(out, _KEY_AT + 16, ">i8")[:] = seq
         out[:, _HEAD_WIDTH : _HEAD_WIDTH + fields] = body
         start = _HEAD_WIDTH + fields
         out[:, start:] = tail.template
@@ -179,7 +177,7 @@ class _Tail:
         number("t", 0x12, 8)
         if origin.has_publish_time:
             number("pub", 0x12, 8)
-        text("rec", origin.recording)
+        text("rec", origin.key)
         text("topic", origin.topic)
         number("seq", 0x12, 8)
         ref = document("ref")

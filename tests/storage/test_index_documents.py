@@ -24,7 +24,7 @@ from hybridlog_storage.index_documents import (
 from hybridlog_storage.messages import Batch
 
 TIMES = st.integers(0, 2**63 - 1)
-ORIGIN = Origin("run-1", 0xFEDCBA98, "/a topic/ä", has_publish_time=True)
+ORIGIN = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=True)
 
 
 def chunk_of(
@@ -48,7 +48,18 @@ def chunk_of(
         np.zeros(count, np.uint32),
     )
     arrivals = np.array(seq if seq is not None else range(count), np.int64)
-    return StoredChunk(*at, 100, 50, batch, arrivals, 90)
+    return StoredChunk(
+        segment=at[0],
+        number=at[1],
+        offset=2**41,
+        length=100,
+        trailer=50,
+        crc=0,
+        trailer_crc=0,
+        batch=batch,
+        seq=arrivals,
+        compressed_size=90,
+    )
 
 
 def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:
@@ -72,7 +83,7 @@ def body_of(values: list[dict[str, Any]]) -> NDArray[np.uint8]:
 )
 def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], publish: bool) -> None:
     chunk = chunk_of([r[0] for r in rows], [r[1] for r in rows], [r[2] for r in rows])
-    origin = Origin("run-1", 0xFEDCBA98, "/a topic/ä", has_publish_time=publish)
+    origin = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=publish)
     chosen = np.arange(0, len(rows), 2)
     body = body_of([{"number": i, "text": "abc"} for i in range(len(chosen))])
     made = documents(DocumentAssembler(origin).assemble(Placed.of([chunk]), chosen, body))
@@ -89,12 +100,12 @@ def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], pub
         assert meta.pop("pub", None) == (time // 2 if publish else None)
         assert meta == {
             "t": time,
-            "rec": "run-1",
+            "rec": "fedcba9876543210",
             "topic": "/a topic/ä",
             "seq": seq,
             "ref": {"seg": 7, "chunk": 2**40, "off": int(chunk.batch.offset[row]), "len": length},
         }
-        assert document["_id"] == struct.pack(">QIQ", time, 0xFEDCBA98, seq)
+        assert document["_id"] == struct.pack(">QQQ", time, 0xFEDCBA9876543210, seq)
 
 
 @given(

@@ -1,0 +1,295 @@
+"""What MongoDB says of the index itself: which recordings are in it, and how far.
+
+`hybridlog.recordings` mirrors the catalog for other programs, and says of each recording
+whether all of its index documents are there and from which segments they were made. A
+recording is believed only when both fit. `hybridlog.chunks` lists the chunks whose
+documents are in, while a recording is being indexed; it is written after them, so a
+server that was killed has not lost documents that it lists.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final, Literal, NamedTuple
+
+from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
+from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.database import Database
+from hybridlog_storage.index_documents import key_bound
+
+RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
+CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
+STORE: Final = f"{CATALOG_PREFIX}store"
+"""Collection that says which store a database belongs to."""
+_AT_ONCE: Final = 500  # entries decoded at once; as dictionaries they take some kilobytes each
+_STATS: Final = tuple(of.name for of in fields(ChannelStats))
+
+State = Literal["open", "clearing", "indexing", "complete", "removing"]
+"""Of a recording in the index: being recorded, documents being removed so that they can be made
+anew, being indexed, all there, being removed for good."""
+_DESTROYS: Final = frozenset({"clearing", "removing"})
+_KEY: Final = re.compile("[0-9a-f]{16}")
+_TURN: Final = {"_id": "turn"}
+_SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
+"""What of an entry may change while its segments stay."""
+
+
+@dataclass(frozen=True, slots=True)
+class Indexed:
+    """What the index says of a recording.
+
+    Attributes:
+        id: The recording.
+        state: How far it is.
+        segments: Digest of each segment of which all documents are there, by its number as text.
+        turn: Counts how often its documents were begun anew or removed.
+        collections: Where its documents are, as far as that was known.
+        has_list: Whether the list of its chunks may still be there although it is complete.
+        shown: What people write about it, as the mirror has it.
+        damage: Chunks that could not be read when their documents were to be made, by segment
+            and number, and why.
+    """
+
+    id: str
+    state: State
+    segments: Mapping[str, str]
+    turn: int
+    collections: tuple[str, ...]
+    has_list: bool = False
+    shown: Mapping[str, Any] = field(default_factory=dict)
+    damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
+
+    def mirrors(self, entry: RecordingEntry) -> bool:
+        """Whether the mirror shows a recording, whose segments are the same, as it is now."""
+        document = _mirrored(entry)
+        return all(self.shown.get(name) == document[name] for name in _SHOWN)
+
+    def is_whole(self, entry: RecordingEntry) -> bool:
+        """Whether all index documents of a recording are there, as it is now."""
+        return self.state == "complete" and dict(self.segments) == entry.digests
+
+
+class Progressed(NamedTuple):
+    """How far a recording is in the index: its turn, and digests of the segments in it."""
+
+    turn: int
+    segments: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class IndexedChunk:
+    """A chunk whose index documents are there."""
+
+    segment: int
+    number: int
+    offset: int
+    stats: dict[int, ChannelStats]
+
+
+class IndexState:
+    """Which recordings are in the index of a database."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
+        """By key of the recording: what the index says of these, or of all."""
+        asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
+        found: dict[str, Indexed] = {}
+        wanted = {"id": 1, "index": 1, "channels.topic": 1, **dict.fromkeys(_SHOWN, 1)}
+        for document in self._db.find(RECORDINGS, asked, wanted, batch_size=_AT_ONCE):
+            index = document.get("index") or {}
+            topics = {str(c.get("topic", "")) for c in document.get("channels") or ()}
+            found[document["_id"]] = Indexed(
+                str(document.get("id", "")),
+                index.get("state", "indexing"),
+                dict(index.get("segments") or {}),
+                int(index.get("turn", 0)),
+                tuple(sorted(collection_of(topic) for topic in topics)),
+                bool(index.get("has_list")),
+                {name: document.get(name) for name in _SHOWN},
+                {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
+            )
+        return found
+
+    def turn(self) -> int:
+        """Counts how often documents of any recording were about to be removed."""
+        found = self._db.find_one(STORE, _TURN)
+        return int(found["turn"]) if found is not None else 0
+
+    def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
+        """How far recordings are, by key; those that are not in the index are left out."""
+        asked, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
+        said = {
+            found["_id"]: found.get("index") or {}
+            for found in self._db.find(RECORDINGS, asked, wanted)
+        }
+        return {
+            key: Progressed(int(index.get("turn", 0)), dict(index.get("segments") or {}))
+            for key, index in said.items()
+        }
+
+    def put(
+        self,
+        entry: RecordingEntry,
+        state: State,
+        *,
+        turn: int,
+        segments: Mapping[str, str] | None = None,
+        has_list: bool = False,
+        damage: Mapping[tuple[int, int], str] | None = None,
+    ) -> None:
+        """Mirror a recording, and say how far its index is.
+
+        Args:
+            entry: The recording.
+            state: How far the index is.
+            turn: Greater than before where documents are about to be removed.
+            segments: Digest of each segment that is in the index, by its number as text.
+            has_list: Whether the list of its chunks is about to be dropped.
+            damage: Chunks that could not be read, by segment and number, and why.
+        """
+        unreadable = [
+            {"seg": segment, "chunk": chunk, "reason": reason}
+            for (segment, chunk), reason in sorted((damage or {}).items())
+        ]
+        document = {
+            **_mirrored(entry),
+            "_id": entry.key,
+            "index": {
+                "state": state,
+                "turn": turn,
+                "segments": dict(segments or {}),
+                **({"has_list": True} if has_list else {}),
+                **({"damage": unreadable} if unreadable else {}),
+            },
+        }
+        self._db.replace(RECORDINGS, {"_id": entry.key}, document)
+        if state in _DESTROYS:
+            # Whoever asks at this moment looks here before and after.
+            self._db.update(STORE, _TURN, {"$inc": {"turn": 1}}, upsert=True)
+
+    def show(self, entry: RecordingEntry) -> None:
+        """Mirror a recording as it is now; what is said of its index stays as it is."""
+        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": _mirrored(entry)})
+
+    def is_mirrored(self, entry: RecordingEntry) -> bool:
+        """Whether the mirror says of a recording what the catalog says, and nothing else."""
+        found = self._db.find_one(RECORDINGS, {"_id": entry.key})
+        if found is None:
+            return False
+        document = {name: found[name] for name in found if name not in {"_id", "index"}}
+        try:
+            return RecordingEntry.from_document(document) == replace(entry, label=_label(entry))
+        except (AttributeError, KeyError, TypeError, ValueError):
+            return False
+
+    def drop_list(self, key: str) -> None:
+        """Drop the list of chunks of a recording that is complete."""
+        self.forget_chunks(key)
+        self._db.update(RECORDINGS, {"_id": key}, {"$unset": {"index.has_list": 1}})
+
+    def put_chunks(self, chunks: Sequence[ChunkEntry]) -> None:
+        """Note that the messages of chunks are in the index."""
+        self._db.replace_all(
+            CHUNKS,
+            [
+                {
+                    "_id": _place(chunk.recording[:16], chunk.segment, chunk.number),
+                    "rec": chunk.recording[:16],
+                    "seg": chunk.segment,
+                    "chunk": chunk.number,
+                    "offset": chunk.offset,
+                    "ch": [
+                        {"c": c, **{name: getattr(stats, name) for name in _STATS}}
+                        for c, stats in sorted(chunk.stats.items())
+                    ],
+                }
+                for chunk in chunks
+            ],
+        )
+
+    def chunks(self, key: str) -> Iterator[IndexedChunk]:
+        """The chunks of a recording whose messages are in the index, in order."""
+        asked = {"_id": _all_of(key)}
+        found = self._db.find(CHUNKS, asked, sort=[("_id", 1)], batch_size=_AT_ONCE)
+        for document in found:
+            stats = {}
+            for item in document["ch"]:
+                values = dict(item)
+                channel = int(values.pop("c"))
+                stats[channel] = ChannelStats(**values)
+            yield IndexedChunk(document["seg"], document["chunk"], document["offset"], stats)
+
+    def places(self, key: str) -> dict[tuple[int, int], int]:
+        """Offset of each chunk whose messages are in the index, by segment and number."""
+        asked = {"_id": _all_of(key)}
+        found = self._db.find(CHUNKS, asked, {"seg": 1, "chunk": 1, "offset": 1})
+        return {(d["seg"], d["chunk"]): d["offset"] for d in found}
+
+    def forget_chunks(self, key: str) -> None:
+        """Drop the list of chunks: the recording is complete, or gone."""
+        self._db.delete(CHUNKS, {"_id": _all_of(key)})
+
+    def clear(
+        self,
+        key: object,
+        collections: Iterable[str],
+        span: tuple[int, int] | None = None,
+        but: Collection[int] = (),
+    ) -> None:
+        """Remove the index documents of a recording, and the list of its chunks.
+
+        Args:
+            key: Of the recording; what documents of none may have in its place.
+            collections: Where they may be.
+            span: First and last log time that they may have, ns; None for any.
+            but: Segments whose documents stay.
+        """
+        asked: dict[str, object] = {"_meta.rec": key}
+        if but:
+            asked["_meta.ref.seg"] = {"$nin": sorted(but)}
+        if span is not None:
+            asked["_id"] = {"$gte": key_bound(span[0]), "$lt": key_bound(span[1] + 1)}
+        if isinstance(key, str) and _KEY.fullmatch(key):
+            self.forget_chunks(key)
+        for collection in collections:
+            self._db.delete(collection, asked)
+
+    def remove(self, key: str) -> None:
+        """Remove a recording from the mirror; the last step of its removal."""
+        self._db.delete(RECORDINGS, {"_id": key})
+
+    def topic_collections(self) -> list[str]:
+        """The collections of topics."""
+        return [c for c in self._db.list_collections() if not c.startswith(CATALOG_PREFIX)]
+
+    def mark(self) -> Mapping[str, Any] | None:
+        """Which store the database belongs to, and where that lies; None for nobody's."""
+        return self._db.find_one(STORE, {"_id": "store"})
+
+    def claim(self, values: Mapping[str, Any]) -> None:
+        """Say which store the database belongs to."""
+        self._db.replace(STORE, {"_id": "store"}, {"_id": "store", **values})
+
+
+def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
+    """An entry as MongoDB takes it: the name of a directory need not be UTF-8."""
+    return {**entry.to_document(), "label": _label(entry)}
+
+
+def _label(entry: RecordingEntry) -> str:
+    return os.fsencode(entry.label).decode("utf-8", "backslashreplace")
+
+
+def _place(key: str, segment: int, chunk: int) -> bytes:
+    return bytes.fromhex(key) + struct.pack(">II", segment, chunk)
+
+
+def _all_of(key: str) -> dict[str, bytes]:
+    """The ids of all chunks of a recording; MongoDB orders binary values by length first."""
+    return {"$gte": _place(key, 0, 0), "$lte": _place(key, 0xFFFFFFFF, 0xFFFFFFFF)}

@@ -1,0 +1,388 @@
+"""What MongoDB says of the index itself, in a real MongoDB."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, channel_entry
+from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.database import Database
+from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, Indexed, IndexState
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.mongod import EmbeddedMongod
+
+ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
+DIGESTS = {"0": "sha256:a", "1": "sha256:b", "10": "sha256:c"}
+
+
+@pytest.fixture(scope="module")
+def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    base = tmp_path_factory.mktemp("index_state")
+    with EmbeddedMongod(base / "mongod", linger_s=0) as running:
+        yield running.start()
+
+
+@pytest.fixture
+def database(mongod: str, request: pytest.FixtureRequest) -> Iterator[Database]:
+    with Database.connect(mongod, f"test{abs(hash(request.node.name))}") as connected:
+        yield connected
+        connected.drop_all()
+
+
+@pytest.fixture
+def state(database: Database) -> IndexState:
+    return IndexState(database)
+
+
+def recording(of: str = ONE, topics: tuple[str, ...] = ("/ä b", "/b")) -> RecordingEntry:
+    schema = Schema("x/msg/Y", "ros2msg", b"int8 x")
+    channels = [
+        channel_entry(n, Channel(topic, "cdr", schema, {"a": "b.c", "$d": ""}), None)
+        for n, topic in enumerate(topics)
+    ]
+    channels[0].stats = ChannelStats(messages=2, first=5, last=9, skew_sum=0.5, stamped=1)
+    return RecordingEntry(
+        id=of,
+        label="run",
+        name="run näme",
+        tags={"a.b": "c", "$x": "y", "": "z"},
+        source={"path": "/x", "bytes": 2**40},
+        created=2**62,
+        status="complete",
+        end={"losses": []},
+        channels=channels,
+        stored_bytes=2**50,
+        segments=3,
+        chunks=2,
+        notes=[{"at": 5, "text": "ö"}],
+        marks=[{"time": 1, "text": "m", "tags": {"k": "v"}, "segment": 1}],
+        spans=[(0, 5, 7), (1, 8, 9)],
+        digests=dict(DIGESTS),
+    )
+
+
+def chunk(segment: int, number: int, of: str = ONE) -> ChunkEntry:
+    told = ChannelStats(
+        messages=segment * 100 + number,
+        payload_bytes=7,
+        unreadable=1,
+        first=-5,
+        last=2**62,
+        first_stamp=3,
+        last_stamp=4,
+        stamped=2,
+        skew_sum=0.1,
+        skew_min=-3,
+        skew_max=9,
+        longest=2**62,
+    )
+    each = {3: told, 1: ChannelStats(messages=1)}
+    return ChunkEntry(of, segment, number, number * 1000, 90, 10, 1, 2, -5, 2**62, each)
+
+
+def document(of: str, at: int, segment: int, number: int) -> dict[str, object]:
+    key = bytes.fromhex(of[:16])
+    _id = key_bound(at)[:8] + key + number.to_bytes(8, "big")
+    return {"_id": _id, "_meta": {"rec": of[:16], "ref": {"seg": segment, "chunk": 0}}}
+
+
+def indexed(state: IndexState, of: str = ONE) -> Indexed | None:
+    found = state.of([of[:16]])
+    assert found.keys() <= {of[:16]}
+    return found.get(of[:16])
+
+
+# How far a recording is.
+
+
+@pytest.mark.parametrize("step", ["open", "clearing", "indexing", "complete", "removing"])
+def test_a_state_comes_back(state: IndexState, step: str) -> None:
+    entry = recording()
+    assert indexed(state) is None
+    state.put(entry, step, turn=3, segments={"0": "sha256:a"})  # type: ignore[arg-type]
+    found = indexed(state)
+    assert found is not None
+    assert (found.id, found.state, found.turn) == (ONE, step, 3)
+    assert dict(found.segments) == {"0": "sha256:a"}
+    assert found.collections == tuple(sorted(map(collection_of, ("/ä b", "/b"))))
+    assert (found.has_list, dict(found.damage)) == (False, {})
+    assert found.mirrors(entry)
+    assert not found.is_whole(entry)
+
+
+def test_a_recording_is_whole_only_when_state_and_all_digests_fit(state: IndexState) -> None:
+    entry = recording()
+    state.put(entry, "complete", turn=1, segments=DIGESTS)
+    found = indexed(state)
+    assert found is not None
+    assert found.is_whole(entry)
+    for digests in (
+        {**DIGESTS, "1": "sha256:x"}, {"0": "sha256:a"}, {**DIGESTS, "2": "sha256:d"}, {},
+    ):  # fmt: skip
+        assert not found.is_whole(replace(entry, digests=digests))
+    for step in ("open", "clearing", "indexing", "removing"):
+        state.put(entry, step, turn=1, segments=DIGESTS)  # type: ignore[arg-type]
+        again = indexed(state)
+        assert again is not None
+        assert not again.is_whole(entry), step
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("label", "other"), ("name", "other"), ("tags", {"a": "b"}), ("status", "damaged"),
+        ("notes", []), ("marks", []),
+    ],
+)  # fmt: skip
+def test_the_mirror_shows_a_recording_as_it_was_or_as_it_is(
+    state: IndexState, name: str, value: object
+) -> None:
+    entry = recording()
+    state.put(entry, "complete", turn=4, segments=DIGESTS, damage={(0, 1): "x"}, has_list=True)
+    changed = replace(entry, **{name: value})
+    before = indexed(state)
+    assert before is not None
+    assert before.mirrors(entry)
+    assert not before.mirrors(changed)
+    state.show(changed)
+    after = indexed(state)
+    assert after is not None
+    assert after.mirrors(changed)
+    # What is said of the index stays.
+    assert replace(after, shown=before.shown) == before
+    assert after.is_whole(changed)
+
+
+def test_the_mirror_is_what_other_programs_read(state: IndexState, database: Database) -> None:
+    entry = recording()
+    state.put(entry, "complete", turn=1, segments=DIGESTS)
+    (found,) = database.find(RECORDINGS, {})
+    assert found["_id"] == ONE[:16]
+    assert found.pop("index") == {"state": "complete", "turn": 1, "segments": DIGESTS}
+    del found["_id"]
+    assert RecordingEntry.from_document(found) == entry
+
+
+def test_what_the_mirror_says_otherwise_is_seen(state: IndexState, database: Database) -> None:
+    entry = recording()
+    assert not state.is_mirrored(entry)
+    for change in (
+        {"$set": {"extra": 1}}, {"$unset": {"name": 1}}, {"$inc": {"channels.0.stats.first": 1}},
+        {"$set": {"channels": 5}}, {"$set": {"spans": [[0, 5]]}}, {"$push": {"notes": "x"}},
+        {"$set": {"end.losses": [{"cause": "x"}]}}, {"$unset": {"channels.0.stats.skew_sum": 1}},
+    ):  # fmt: skip
+        state.put(entry, "complete", turn=1, segments=DIGESTS, has_list=True, damage={(0, 1): "x"})
+        assert state.is_mirrored(entry)
+        database.update(RECORDINGS, {"_id": ONE[:16]}, change)
+        assert not state.is_mirrored(entry), change
+    other = replace(entry, label=os.fsdecode(b"r\xff"))
+    state.put(other, "complete", turn=1)
+    assert state.is_mirrored(other)
+
+
+def test_a_directory_may_have_any_name(state: IndexState) -> None:
+    entry = replace(recording(), label=os.fsdecode(b"r\xff"))
+    state.put(entry, "complete", turn=1, segments=DIGESTS)
+    found = indexed(state)
+    assert found is not None
+    assert found.shown["label"] == "r\\xff"
+    assert found.mirrors(entry)
+    state.show(replace(entry, label=os.fsdecode(b"r\xfe")))
+    found = indexed(state)
+    assert found is not None
+    assert not found.mirrors(entry)
+
+
+def test_chunks_without_documents_are_known(state: IndexState) -> None:
+    damage = {(0, 1): "unreadable", (12, 3): "gone"}
+    state.put(recording(), "complete", turn=1, segments=DIGESTS, damage=damage)
+    found = indexed(state)
+    assert found is not None
+    assert found.damage == damage
+    state.put(recording(), "complete", turn=1, segments=DIGESTS)
+    found = indexed(state)
+    assert found is not None
+    assert found.damage == {}
+
+
+def test_only_the_recordings_that_are_asked_for(state: IndexState) -> None:
+    state.put(recording(), "complete", turn=1, segments=DIGESTS)
+    state.put(recording(OTHER), "open", turn=2)
+    assert state.of().keys() == {ONE[:16], OTHER[:16]}
+    assert state.of([OTHER[:16], "0" * 16]).keys() == {OTHER[:16]}
+    assert state.of([]) == {}
+    both = [ONE[:16], OTHER[:16]]
+    assert state.progress(both) == {ONE[:16]: (1, DIGESTS), OTHER[:16]: (2, {})}
+    assert state.progress([OTHER[:16], "0" * 16]) == {OTHER[:16]: (2, {})}
+
+
+def test_what_another_program_has_put_there_is_not_whole(
+    state: IndexState, database: Database
+) -> None:
+    database.replace(RECORDINGS, {"_id": ONE[:16]}, {"_id": ONE[:16]})
+    found = indexed(state)
+    assert found is not None
+    assert (found.state, found.turn, found.collections) == ("indexing", 0, ())
+    assert state.progress([ONE[:16]]) == {ONE[:16]: (0, {})}
+    assert not found.is_whole(recording())
+    assert not found.mirrors(recording())
+
+
+def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) -> None:
+    entry = recording()
+    assert state.turn() == 0
+    for step, turn in (
+        ("open", 0), ("indexing", 0), ("complete", 0), ("clearing", 1), ("indexing", 1),
+        ("complete", 1), ("removing", 2),
+    ):  # fmt: skip
+        state.put(entry, step, turn=turn)  # type: ignore[arg-type]
+        assert state.turn() == turn, step
+    state.put(recording(OTHER), "clearing", turn=1)
+    assert state.turn() == 3
+
+
+# The list of chunks, while a recording is being indexed.
+
+
+def test_chunks_come_back_in_order(state: IndexState) -> None:
+    places = [(1, 0), (0, 2), (0, 10), (300, 70000), (0, 0), (1, 256)]
+    state.put_chunks([chunk(*place) for place in places])
+    state.put_chunks([chunk(5, 5, OTHER)])
+    found = list(state.chunks(ONE[:16]))
+    assert [(c.segment, c.number) for c in found] == sorted(places)
+    for one in found:
+        want = chunk(one.segment, one.number)
+        assert (one.offset, one.stats) == (want.offset, want.stats)
+    assert state.places(ONE[:16]) == {(s, n): n * 1000 for s, n in places}
+    assert state.places(OTHER[:16]) == {(5, 5): 5000}
+    assert state.places("0" * 16) == {}
+
+
+def test_a_chunk_that_is_noted_again_is_noted_once(state: IndexState) -> None:
+    state.put_chunks([])
+    state.put_chunks([chunk(0, 0), chunk(0, 1)])
+    state.put_chunks([replace(chunk(0, 1), offset=5)])
+    assert state.places(ONE[:16]) == {(0, 0): 0, (0, 1): 5}
+
+
+@pytest.mark.parametrize("other", ["0123456789abcdee", "0123456789abcdf0", "00" * 8, "ff" * 8])
+def test_the_lists_of_others_are_left_alone(state: IndexState, other: str) -> None:
+    """Of those whose keys stand next to it, too."""
+    key = other + "5" * 16
+    for of in (ONE, key):
+        state.put_chunks([chunk(0, 0, of), chunk(0xFFFFFFFF, 0xFFFFFFFF, of)])
+    state.forget_chunks(ONE[:16])
+    assert state.places(ONE[:16]) == {}
+    assert len(state.places(other)) == 2
+    assert len(list(state.chunks(other))) == 2
+
+
+def test_the_list_goes_when_the_recording_is_complete(
+    state: IndexState, database: Database
+) -> None:
+    state.put_chunks([chunk(0, 0), chunk(0, 0, OTHER)])
+    state.put(recording(), "complete", turn=1, segments=DIGESTS, has_list=True)
+    found = indexed(state)
+    assert found is not None
+    assert found.has_list
+    state.drop_list(ONE[:16])
+    again = indexed(state)
+    assert again == replace(found, has_list=False)
+    assert [d["rec"] for d in database.find(CHUNKS, {})] == [OTHER[:16]]
+
+
+# Documents.
+
+
+@pytest.fixture
+def filled(state: IndexState, database: Database) -> IndexState:
+    """Two recordings with documents in two collections, at times 0 to 4, segment by segment."""
+    for name in ("one", "two"):
+        database.ensure_collection(name)
+        for of in (ONE, OTHER):
+            for at in range(5):
+                made = document(of, at, at, at)
+                database.replace(name, {"_id": made["_id"]}, made)
+    state.put_chunks([chunk(0, 0), chunk(0, 0, OTHER)])
+    return state
+
+
+def left(database: Database, of: str, name: str = "one") -> list[int]:
+    found = database.find(name, {"_meta.rec": of[:16]}, sort=[("_id", 1)])
+    return [d["_meta"]["ref"]["seg"] for d in found]
+
+
+def test_clearing_removes_the_documents_of_one_recording(
+    filled: IndexState, database: Database
+) -> None:
+    filled.clear(ONE[:16], ["one", "not there"])
+    assert left(database, ONE) == []
+    assert left(database, ONE, "two") == list(range(5))
+    assert left(database, OTHER) == list(range(5))
+    assert (filled.places(ONE[:16]), len(filled.places(OTHER[:16]))) == ({}, 1)
+
+
+def test_clearing_leaves_the_segments_that_are_to_stay(
+    filled: IndexState, database: Database
+) -> None:
+    filled.clear(ONE[:16], ["one"], but=[1, 3])
+    assert left(database, ONE) == [1, 3]
+    assert left(database, OTHER) == list(range(5))
+
+
+def test_clearing_looks_at_some_times_only(filled: IndexState, database: Database) -> None:
+    filled.clear(ONE[:16], ["one"], (1, 3))
+    assert left(database, ONE) == [0, 4]
+    filled.clear(ONE[:16], ["one"], (4, 2**63 - 1))
+    assert left(database, ONE) == [0]
+    assert left(database, OTHER) == list(range(5))
+
+
+@pytest.mark.parametrize("key", ["other", "", "0123", None, 5, {"a": 1}])
+def test_documents_of_what_is_no_recording_can_be_cleared(
+    filled: IndexState, database: Database, key: Any
+) -> None:
+    made = {"_id": b"x" * 24, "_meta": {"rec": key}}
+    database.replace("one", {"_id": made["_id"]}, made)
+    filled.clear(key, ["one"])
+    assert database.count("one", {"_id": made["_id"]}) == 0
+    assert left(database, ONE) == left(database, OTHER) == list(range(5))
+    assert len(filled.places(ONE[:16])) == 1
+
+
+def test_a_recording_leaves_the_mirror_last_and_alone(
+    filled: IndexState, database: Database
+) -> None:
+    filled.put(recording(), "removing", turn=1)
+    filled.put(recording(OTHER), "complete", turn=1)
+    filled.remove(ONE[:16])
+    assert filled.of().keys() == {OTHER[:16]}
+    assert left(database, ONE) == list(range(5))
+
+
+def test_collections_of_topics_are_not_ours(filled: IndexState, database: Database) -> None:
+    filled.put(recording(), "complete", turn=1)
+    filled.claim({"id": "x"})
+    assert sorted(filled.topic_collections()) == ["one", "two"]
+    assert {RECORDINGS, CHUNKS, STORE} <= set(database.list_collections())
+    assert all(name.startswith(CATALOG_PREFIX) for name in (RECORDINGS, CHUNKS, STORE))
+
+
+# Whose it is.
+
+
+def test_a_database_says_whose_it_is(state: IndexState) -> None:
+    assert state.mark() is None
+    state.put(recording(), "clearing", turn=1)
+    assert state.mark() is None
+    state.claim({"id": "a", "host": "h", "path": "/p"})
+    assert state.mark() == {"_id": "store", "id": "a", "host": "h", "path": "/p"}
+    state.claim({"id": "b"})
+    assert state.mark() == {"_id": "store", "id": "b"}
+    assert state.turn() == 1
