@@ -7,27 +7,35 @@ or takes back that it was ever there.
 
 from __future__ import annotations
 
-import os
+import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.gatherer import FieldGatherer
-from hybridlog.entries import build_entry, new_key, recording_metadata
+from hybridlog.entries import new_id, recording_metadata, sealed_event, text
 from hybridlog.index_writer import IndexWriter, Lag
 from hybridlog.indexing import ChunkIndexer
-from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog.maintenance.index import finish
+from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
+from hybridlog_storage import journal
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import DatabaseError, StoreError
+from hybridlog_storage.errors import DatabaseError, HybridlogError, StoreError
+from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
+    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.segment_file import Sealed
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +70,7 @@ class Capture:
 
     Args:
         directory: The store.
+        catalog: Its catalog.
         database: The index.
         name: Name of the recording.
         tags: Kept with it.
@@ -80,6 +89,7 @@ class Capture:
     def __init__(
         self,
         directory: StoreDirectory,
+        catalog: Catalog,
         database: Database,
         *,
         name: str,
@@ -89,17 +99,20 @@ class Capture:
         pace: Pace | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
-        self.catalog = Catalog(database)
+        self.catalog = catalog
         self._directory = directory
+        self._sync = settings.sync != "never"
+        self._end: Mapping[str, Any] | None = None
+        self._turn = 1
         self._held = ExitStack()
         with self._held, directory.alone():
             # Who records the same at this moment is refused, or refuses us.
             if check is not None:
                 check(self.catalog)
-            self.entry = self._begin(name, tags, source)
+            self.entry = self._begin(name, tags, source, IndexState(database))
             self._held = self._held.pop_all()
-        self.indexer = ChunkIndexer(self.entry.id, self.entry.key)
-        recording = directory.recording(self.entry.id)
+        self.indexer = ChunkIndexer(self.entry.id)
+        recording = directory.recording(self.entry.label)
         lag = Lag(recording, pace.behind, pace.has_room, pace.renew, pace.spare) if pace else None
         self._gatherer = FieldGatherer(recording)
         self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
@@ -109,6 +122,7 @@ class Capture:
             recording_metadata(self.entry),
             self.index.submit,
             settings,
+            on_sealing=self._announce,
             hurry=pace.hurry if pace else None,
             next_chunk_size=pace.next_chunk_size if pace else None,
             spare=pace.spare if pace else None,
@@ -124,6 +138,9 @@ class Capture:
         Returns:
             Why the index is not complete, None when it is.
         """
+        # Only the last segment announces the end, and no other is sealed from here on.
+        self.writer.flush()
+        self._end = end
         self.writer.close(json_metadata(END_METADATA, end))
         return self._finish()
 
@@ -142,24 +159,32 @@ class Capture:
         Raises:
             DiskFullError: There is not even room for that.
         """
+        self._end = end  # what was lost at last says the segment
         self.writer.give_up(
             [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
         )
         return self._finish()
 
+    def _announce(self, sealed: Sealed) -> None:
+        """List a segment in the journal before it gets its final name."""
+        lines = [sealed_event(sealed)]
+        if self._end is not None:
+            lines.append(journal.event(journal.ENDED, end=dict(self._end)))
+        self._journal.append(*lines)
+
     def _finish(self) -> DatabaseError | None:
         self.index.close()
-        self.entry = build_entry(self._directory, self.indexer, self.entry.id, self.index.totals())
         failure = self.index.failure
-        if failure is None:
-            self._gatherer.close(self.entry)
-            self.catalog = Catalog(self.index.database)
-            try:
-                self.catalog.put_losses(self.entry.id, self.entry.end.get("losses", []))
-                self.catalog.put_schemas(self.writer.channels.values())
-                self.catalog.put_recording(self.entry)
-            except DatabaseError as error:
-                failure = error
+        label = self.entry.label
+        try:
+            if failure is None:
+                database = self.index.database
+                self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
+                self._gatherer.close(self.entry)
+        except DatabaseError as error:
+            failure = error
+        if failure is not None:
+            self.entry = put_entry(self._directory, self.catalog, label)
         self._gatherer.discard()
         self._held.close()
         return failure
@@ -172,43 +197,68 @@ class Capture:
         self._held.close()
 
     def forget(self) -> None:
-        """Take the whole recording back."""
+        """Take the whole recording back; what cannot be done now, the next opening does."""
+        label, entry = self.entry.label, self.entry
+        with suppress(HybridlogError):  # the directory's new name says it, too
+            announce_removal(self._directory, label)
         self.writer.abort()
         self.index.abandon()
         self._gatherer.discard()
-        # If the database is away too, the next opening finds an entry without files.
-        with suppress(DatabaseError):
-            collections = {collection_of(c.topic) for c in self.writer.channels.values()}
-            self.catalog.remove_recording(self.entry.id, collections)
-        self._directory.remove_recording(self.entry.id)
+        with suppress(HybridlogError):
+            remove_files(self._directory, label)
+        with suppress(HybridlogError):
+            self.catalog.remove(entry.id)
+        # If the database is away, the next connection finds an entry without files.
+        with suppress(HybridlogError):
+            state = IndexState(self.index.database)
+            state.clear(entry.key, {collection_of(c.topic) for c in self.writer.channels.values()})
+            state.remove(entry.key)
         self._held.close()
 
     def _begin(
-        self, name: str, tags: Mapping[str, str], source: Mapping[str, Any]
+        self, name: str, tags: Mapping[str, str], source: Mapping[str, Any], state: IndexState
     ) -> RecordingEntry:
-        """The recording's directory, locked, and its first entry."""
+        """The recording's directory, locked, its journal, and its place in the index."""
         name = text(name)
-        recording_id = self._directory.new_recording(name)
+        label = self._directory.new_recording(name)
         try:
-            if not self._held.enter_context(self._directory.writing(recording_id)):
-                where = self._directory.recording(recording_id)
-                raise StoreError(f"Another process is writing {where}.")
+            path = self._directory.recording(label)
+            if not self._held.enter_context(self._directory.writing(label)):
+                raise StoreError(f"Another process is writing {path}.")
             entry = RecordingEntry(
-                id=recording_id,
-                key=new_key(r.key for r in self.catalog.recordings()),
+                id=new_id(),
+                label=label,
                 name=name,
                 tags={text(key): text(value) for key, value in tags.items()},
                 source=dict(source),
                 created=time.time_ns(),
                 status="open",
             )
-            self.catalog.put_recording(entry)
+            self._journal = Journal(path, sync=self._sync)
+            self._journal.append(
+                journal.event(
+                    journal.BEGUN,
+                    id=entry.id,
+                    store=self._directory.settings.store_id,
+                    name=entry.name,
+                    tags=entry.tags,
+                    source=entry.source,
+                    created=entry.created,
+                    origin=origin(),
+                )
+            )
+            put_entry(self._directory, self.catalog, label, is_open=True)
+            state.put(entry, "open", turn=self._turn)
         except BaseException:
-            self._directory.remove_recording(recording_id)
+            self._directory.sweep(self._directory.hide(label))
             raise
         return entry
 
 
-def text(name: str) -> str:
-    """A name as text that MongoDB and JSON take: what is no UTF-8 in it as escapes."""
-    return os.fsencode(name).decode("utf-8", "backslashreplace")
+def origin() -> dict[str, Any]:
+    """Where a recording is made: host, boot, recorder, clock."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        boot = ""
+    return {"host": platform.node(), "boot": boot, "recorder": "hybridlog", "clock": "realtime"}

@@ -1,48 +1,54 @@
-"""Catalog entries of recordings, made from segments and chunk entries alone.
+"""Catalog entries of recordings, made from their journals and segments alone.
 
-`record` and `reindex` both end here, which is why their entries are equal.
+Recording, recovery, reindexing and opening all end here, which is why their entries are
+equal. What the journal lists and does not lie there as it was written is a row of the
+loss ledger; nothing that differs from the journal is believed.
 """
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from hybridlog.losses import joined
+from hybridlog.losses import Cause, joined
+from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
-    ChannelEntry,
     ChannelStats,
-    ChannelTotals,
+    Described,
     RecordingEntry,
     channel_entry,
+    channel_totals,
 )
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from numpy.typing import NDArray
 
-    from hybridlog.indexing import ChunkIndexer
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.directory import Listing, StoreDirectory
+    from hybridlog_storage.journal import JournalState, SealedSegment
+    from hybridlog_storage.segment_file import Sealed
+
+    Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
+    Reason = Callable[[int, Channel], str | None]
 
 
-def new_key(taken: Iterable[int]) -> int:
-    """A random 32-bit number that no other recording of the store has."""
-    used = set(taken)
-    while True:
-        key = secrets.randbits(32)
-        if key not in used:
-            return key
+def new_id() -> str:
+    """A random id of a recording: 32 hexadecimal digits."""
+    return secrets.token_hex(16)
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
     """What each segment keeps of its recording."""
     return {
         "id": entry.id,
-        "key": entry.key,
         "name": entry.name,
         "tags": entry.tags,
         "source": entry.source,
@@ -50,24 +56,326 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
     }
 
 
-def entry_of(recording: Mapping[str, object]) -> RecordingEntry:
-    """The entry of a recording as its segments describe it, without statistics.
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """A file of a recording that is not what the journal says.
+
+    Attributes:
+        segment: Number in the file's name.
+        file: Its name; empty for one that is missing.
+        reason: What is wrong, in words.
+        is_unlisted: Whether it is whole and of this recording, and only the journal lacks it.
+        belongs: Number under which the journal lists this very content; None if it does not.
+    """
+
+    segment: int
+    file: str
+    reason: str
+    is_unlisted: bool = False
+    belongs: int | None = None
+
+
+@dataclass(slots=True)
+class Inventory:
+    """What lies in a recording's directory, held against its journal.
+
+    Attributes:
+        label: Name of the directory.
+        listing: What lies there.
+        state: What the journal says; None when there is none.
+        summaries: Of the segments that are believed, by number.
+        misfits: What is not as it should be.
+        lost: What the journal lists and is not there, or not as it was written.
+    """
+
+    label: str
+    listing: Listing
+    state: JournalState | None
+    summaries: dict[int, SegmentSummary] = field(default_factory=dict)
+    misfits: list[Misfit] = field(default_factory=list)
+    lost: list[SealedSegment] = field(default_factory=list)
+
+    @property
+    def id(self) -> str:
+        """The recording's id; empty when nothing says it."""
+        if self.state is not None and self.state.id:
+            return self.state.id
+        ids = Counter(str(s.recording.get("id", "")) for s in self.summaries.values())
+        return ids.most_common(1)[0][0] if ids else ""
+
+    @property
+    def end(self) -> Mapping[str, Any] | None:
+        """How the recording ended: by its journal, else by the last segment that says it."""
+        if self.state is not None and self.state.end is not None:
+            return self.state.end
+        ends = [summary.end for _, summary in sorted(self.summaries.items()) if summary.end]
+        return ends[-1] if ends else None
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether the journal lists all that there was, and all of it is there."""
+        return (
+            self.state is not None
+            and self.state.is_proof
+            and not self.lost
+            and not any(misfit.is_unlisted for misfit in self.misfits)
+        )
+
+
+def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
+    """Hold the sealed segments of a recording against its journal.
 
     Raises:
-        SegmentError: the description is damaged.
+        StoreError: Directory or journal cannot be read.
     """
+    path = directory.recording(label)
+    listing = directory.listing(label)
+    state = journal.read(path) if listing.journal else None
+    found = Inventory(label, listing, state)
+    listed = state.sealed if state is not None else {}
+    numbers = {sealed.digest: number for number, sealed in listed.items()}
+    for number, name in listing.sealed.items():
+        try:
+            found.summaries[number] = read_summary(path / name, number)
+        except SegmentError as error:
+            found.misfits.append(Misfit(number, name, str(error)))
+    recording = found.id
+    for number, summary in list(found.summaries.items()):
+        name = listing.sealed[number]
+        problem = _difference(summary, number, listed.get(number), recording)
+        if problem is not None:
+            del found.summaries[number]
+            belongs = numbers.get(summary.digest)
+            found.misfits.append(Misfit(number, name, problem, belongs=belongs))
+        elif number not in listed and state is not None:
+            reason = "the journal does not list it"
+            found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
+    for number, sealed in listed.items():
+        # One that is listed and still has its old name is about to get the new one.
+        if number not in found.summaries and number not in listing.open:
+            found.lost.append(sealed)
+            if number not in listing.sealed:
+                found.misfits.append(Misfit(number, "", f"{sealed.file} is missing"))
+    found.misfits.sort(key=lambda misfit: misfit.segment)
+    return found
+
+
+def _difference(
+    summary: SegmentSummary, number: int, sealed: SealedSegment | None, recording: str
+) -> str | None:
+    """Why a whole segment is not the one that should lie there; None when it is."""
+    its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
+    if its_id != recording:
+        return f"it is a segment of another recording, {its_id}"
+    if its_number != number:
+        return f"it is segment {its_number} of this recording"
+    if sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
+        return "it is not the segment that the journal lists: an older or a changed one"
+    return None
+
+
+def read_summary(path: Path, number: int) -> SegmentSummary:
+    """The summary of a sealed segment.
+
+    Raises:
+        SegmentError: It has none that can be read, or cannot be opened.
+    """
+    with SegmentReader(path, number) as reader:
+        return reader.summary()
+
+
+def describe(
+    inventory: Inventory,
+    *,
+    is_open: bool,
+    reason: Reason,
+    stamps: Stamps,
+    damage: Mapping[tuple[int, int], str],
+) -> Described:
+    """The whole entry of a recording.
+
+    Args:
+        inventory: What there is of it.
+        is_open: Whether somebody writes it at this moment.
+        reason: Says why a channel's fields are not in the index, None when they are.
+        stamps: Gives what decoded messages tell of a segment, None while that is not known.
+        damage: Chunks that are known to be unreadable, by segment and number.
+
+    Raises:
+        SegmentError: Neither journal nor segments say what recording it is.
+    """
+    entry = _base(inventory)
+    channels: dict[int, Channel] = {}
+    lost: list[dict[str, Any]] = []
+    end = inventory.end
+    for summary in inventory.summaries.values():
+        channels.update(summary.channels)
+        lost += summary.losses
+        entry.stored_bytes += summary.size
+        entry.chunks += len(summary.table.chunks)
+    entry.segments = len(inventory.summaries)
+    entry.end = dict(end) if end is not None else {}
+    ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
+    ours += _losses_of_crash(inventory)
+    ours += _losses_of_chunks(inventory, damage)
+    entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
+    if lost or ours:
+        entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
+    entry.digests = {str(number): summary.digest for number, summary in inventory.summaries.items()}
+    entry.spans = [
+        (number, int(summary.table.chunks["first"].min()), int(summary.table.chunks["last"].max()))
+        for number, summary in inventory.summaries.items()
+        if len(summary.table.chunks)
+    ]
+    entry.channels = [
+        channel_entry(channel_id, channel, reason(channel_id, channel))
+        for channel_id, channel in sorted(channels.items())
+    ]
+    _fill_stats(entry, inventory, stamps)
+    tables = {number: summary.table for number, summary in inventory.summaries.items()}
+    return Described(entry, inventory.listing.print, tables, channels)
+
+
+def _base(inventory: Inventory) -> RecordingEntry:
+    state = inventory.state
+    said: Mapping[str, Any] | None = None
+    if state is not None and state.begun:
+        said = {**state.begun, "name": state.name, "tags": state.tags}
+    elif inventory.summaries:
+        first = inventory.summaries[min(inventory.summaries)]
+        said = first.recording
+        if state is not None:  # the first line is lost, not those behind it
+            said = {**said, "tags": {**cast("dict[str, str]", said.get("tags", {})), **state.tags}}
+            said["name"] = state.name or said.get("name")
+    if said is None:
+        raise SegmentError(
+            f"Recording {inventory.label!r} has neither a journal nor a segment that can be read."
+        )
     try:
-        return RecordingEntry(
-            id=str(recording["id"]),
-            key=int(cast(int, recording["key"])),
-            name=str(recording["name"]),
-            tags=dict(cast("Mapping[str, str]", recording["tags"])),
-            source=dict(cast("Mapping[str, Any]", recording["source"])),
-            created=int(cast(int, recording["created"])),
+        entry = RecordingEntry(
+            id=inventory.id,
+            label=inventory.label,
+            name=str(said["name"]),
+            tags=dict(cast("Mapping[str, str]", said["tags"])),
+            source=dict(cast("Mapping[str, Any]", said["source"])),
+            created=int(cast(int, said["created"])),
             status="open",
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise SegmentError(f"the description of a recording is damaged: {error!r}") from error
+        raise SegmentError(
+            f"The description of recording {inventory.label!r} is damaged: {error!r}"
+        ) from error
+    if len(entry.id) != 32 or set(entry.id) - set("0123456789abcdef"):
+        raise SegmentError(f"The id of recording {inventory.label!r} is damaged: {entry.id!r}")
+    if state is not None:
+        entry.notes = list(state.notes)
+        entry.marks = list(state.marks)
+    return entry
+
+
+def _status(
+    inventory: Inventory, end: Mapping[str, Any] | None, *, is_open: bool, has_losses: bool
+) -> str:
+    # Whoever holds one that has ended does something else with it than record.
+    if is_open and (end is None or inventory.listing.open):
+        return "open"
+    if inventory.listing.open:
+        return "unfinished"
+    if has_losses:
+        return "damaged"
+    if not inventory.is_proven:
+        return "unproven"
+    return str(end.get("status", "complete")) if end is not None else "recovered"
+
+
+def _losses_of_segment(inventory: Inventory, sealed: SealedSegment) -> list[dict[str, Any]]:
+    """Rows of the loss ledger for a segment that the journal lists and nobody can read."""
+    reasons = [m.reason for m in inventory.misfits if m.segment == sealed.segment]
+    row = {
+        "cause": Cause.SEGMENT.value,
+        "file": sealed.file,
+        "offset": None,
+        "length": sealed.bytes,
+        "reason": "; ".join(reasons) or "it cannot be read",
+    }
+    rows = [
+        {
+            **row,
+            "count": channel["messages"],
+            "topic": channel["topic"],
+            "from": channel["first"],
+            "to": channel["last"],
+        }
+        for channel in sealed.channels
+        if channel["messages"]
+    ]
+    return rows or [{**row, "count": 0, "topic": None, "from": None, "to": None}]
+
+
+def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
+    """Rows for what was listed before a crash and did not come out of it."""
+    rows = []
+    for before, after in inventory.state.replaced if inventory.state is not None else ():
+        left = {channel["id"]: channel["messages"] for channel in after.channels}
+        for channel in before.channels:
+            count = channel["messages"] - left.get(channel["id"], 0)
+            if count > 0:
+                rows.append(
+                    {
+                        "cause": Cause.SEGMENT.value,
+                        "file": before.file,
+                        "offset": None,
+                        "length": None,
+                        "reason": "a crash took what was written last",
+                        "count": count,
+                        "topic": channel["topic"],
+                        "from": channel["first"],
+                        "to": channel["last"],
+                    }
+                )
+    return rows
+
+
+def _losses_of_chunks(
+    inventory: Inventory, damage: Mapping[tuple[int, int], str]
+) -> list[dict[str, Any]]:
+    """Rows for chunks that cannot be read."""
+    rows = []
+    for (segment, number), reason in sorted(damage.items()):
+        summary = inventory.summaries.get(segment)
+        if summary is None or number >= len(summary.table.chunks):
+            continue
+        chunk = summary.table.chunks[number]
+        last = int(summary.table.chunks["parts"][: number + 1].sum())
+        for part in summary.table.parts[last - int(chunk["parts"]) : last]:
+            channel = summary.channels.get(int(part["channel"]))
+            rows.append(
+                {
+                    "cause": Cause.SEGMENT.value,
+                    "file": inventory.listing.sealed[segment],
+                    "offset": int(chunk["offset"]),
+                    "length": int(chunk["length"]),
+                    "reason": reason,
+                    "count": int(part["messages"]),
+                    "topic": channel.topic if channel is not None else None,
+                    "from": int(part["first"]),
+                    "to": int(part["last"]),
+                }
+            )
+    return rows
+
+
+def _fill_stats(entry: RecordingEntry, inventory: Inventory, stamps: Stamps) -> None:
+    silent = {c.id for c in entry.channels if not c.has_publish_time}
+    totals: dict[int, ChannelStats] = {}
+    entry.is_decoded = True
+    for number, summary in inventory.summaries.items():
+        told = stamps(entry, number, summary.table)
+        entry.is_decoded &= told is not None or not summary.chunks
+        for channel_id, stats in channel_totals(summary.table, told, silent).items():
+            totals.setdefault(channel_id, ChannelStats()).add(stats)
+    for channel in entry.channels:
+        channel.stats = totals.get(channel.id, ChannelStats())
 
 
 def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
@@ -78,93 +386,98 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
     return channels
 
 
-class StoredSummaries:
-    """Summaries of a recording's sealed segments, in order; of a long one too many to hold."""
+def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> list[journal.Event]:
+    """The lines of a journal that is written again from what lies there.
 
-    def __init__(self, directory: StoreDirectory, recording_id: str) -> None:
-        self._segments = directory.segments(recording_id)
-
-    def __iter__(self) -> Iterator[SegmentSummary]:
-        """Read one after the other."""
-        for number, path in self._segments:
-            yield _summary(number, path)
-
-
-def read_summaries(directory: StoreDirectory, recording_id: str) -> dict[int, SegmentSummary]:
-    """The summaries of a recording's sealed segments, by segment number."""
-    return {number: _summary(number, path) for number, path in directory.segments(recording_id)}
-
-
-def _summary(number: int, path: Path) -> SegmentSummary:
-    with SegmentReader(path, number) as reader:
-        return reader.summary()
-
-
-def build_entry(
-    directory: StoreDirectory,
-    indexer: ChunkIndexer,
-    recording_id: str,
-    totals: ChannelTotals,
-    summaries: Iterable[SegmentSummary] | None = None,
-) -> RecordingEntry:
-    """The whole entry of a sealed recording.
-
-    Args:
-        directory: The store.
-        indexer: Knows which channels are indexed.
-        recording_id: The recording.
-        totals: Statistics of its channels, as far as its chunks are indexed.
-        summaries: Summaries of its segments, in order, if they are at hand; may be gone
-            through twice.
+    Whole lines of the old one are kept; segments that it did not list are added.
 
     Raises:
-        SegmentError: a segment cannot be read, or there is none.
+        SegmentError: Neither journal nor segments say what recording it is.
     """
-    if summaries is None:
-        summaries = StoredSummaries(directory, recording_id)
-    entry: RecordingEntry | None = None
-    channels: dict[int, Channel] = {}
-    counts: Counter[int] = Counter()
-    end: Mapping[str, Any] | None = None
-    lost: list[dict[str, Any]] = []
-    segments = chunks = 0
-    for summary in summaries:
-        entry = entry or entry_of(summary.recording)
-        channels.update(summary.channels)
-        counts.update(summary.counts)
-        end = summary.end if summary.end is not None else end
-        lost += summary.losses
-        segments += 1
-        chunks += len(summary.chunks)
-    if entry is None:
-        raise SegmentError(f"Recording {recording_id!r} has no sealed segment.")
-    entry.id = recording_id
-    entry.status = str(end.get("status", "complete")) if end is not None else "recovered"
-    entry.end = dict(end) if end is not None else {}
-    if lost:
-        entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost])
-    for channel_id, channel in sorted(channels.items()):
-        reason = indexer.reason(channel_id, channel)
-        entry.channels.append(channel_entry(channel_id, channel, reason))
-        entry.channels[-1].stats = totals.stats(channel_id)
-    _fill_unindexed(entry.channels, counts, summaries)
-    entry.segments, entry.chunks = segments, chunks
-    entry.stored_bytes = sum(p.stat().st_size for _, p in directory.segments(recording_id))
-    return entry
+    entry = _base(inventory)
+    state = inventory.state
+    lines: list[journal.Event] = [
+        journal.event(journal.BEGUN, store=store_id, **_begun(entry, state)),
+        journal.event(journal.REBUILT, reason=reason),
+    ]
+    listed = dict(state.sealed) if state is not None else {}
+    for number in sorted(listed.keys() | inventory.summaries.keys()):
+        sealed = listed.get(number)
+        if sealed is not None:
+            before = [old for old, _ in state.replaced if old.segment == number] if state else []
+            lines += map(_sealed_again, [*before, sealed])
+        else:
+            lines.append(sealed_line(inventory, number))
+    if state is not None:
+        lines += [
+            journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
+        ]
+        lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
+    if inventory.end is not None:
+        lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
+    return lines
 
 
-def _fill_unindexed(
-    channels: Iterable[ChannelEntry],
-    counts: Mapping[int, int],
-    summaries: Iterable[SegmentSummary],
-) -> None:
-    """Where chunks have no entries (yet), say at least what the segments' summaries say."""
-    short = {c.id: c.stats for c in channels if counts.get(c.id, 0) > c.stats.messages}
-    if not short:
-        return
-    for summary in summaries:
-        for chunk in summary.chunks:
-            for channel_id in short.keys() & chunk.channels:
-                short[channel_id].add(ChannelStats(first=chunk.first, last=chunk.last))
-    for channel_id, stats in short.items():
-        stats.messages = counts[channel_id]
+def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
+    origin = state.begun.get("origin", {}) if state is not None else {}
+    return {
+        "id": entry.id,
+        "name": entry.name,
+        "tags": entry.tags,
+        "source": entry.source,
+        "created": entry.created,
+        "origin": origin,
+    }
+
+
+def _sealed_again(sealed: SealedSegment) -> journal.Event:
+    return journal.event(
+        journal.SEALED,
+        segment=sealed.segment,
+        file=sealed.file,
+        bytes=sealed.bytes,
+        digest=sealed.digest,
+        channels=[dict(channel) for channel in sealed.channels],
+    )
+
+
+def sealed_line(inventory: Inventory, number: int) -> journal.Event:
+    """The line that lists a segment which lies there."""
+    summary = inventory.summaries[number]
+    totals = channel_totals(summary.table, None)
+    return journal.event(
+        journal.SEALED,
+        segment=number,
+        file=inventory.listing.sealed[number],
+        bytes=summary.size,
+        digest=summary.digest,
+        channels=[
+            {
+                "id": channel_id,
+                "topic": summary.channels[channel_id].topic,
+                "messages": stats.messages,
+                "payload_bytes": stats.payload_bytes,
+                "first": stats.first,
+                "last": stats.last,
+            }
+            for channel_id, stats in sorted(totals.items())
+            if channel_id in summary.channels
+        ],
+    )
+
+
+def sealed_event(sealed: Sealed) -> journal.Event:
+    """The line that announces that a segment is about to get its final name."""
+    return journal.event(
+        journal.SEALED,
+        segment=sealed.segment,
+        file=sealed.file,
+        bytes=sealed.bytes,
+        digest=sealed.digest,
+        channels=[asdict(channel) for channel in sealed.channels],
+    )
+
+
+def text(name: str) -> str:
+    """A name as text that MongoDB and JSON take: what is no UTF-8 in it as escapes."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")

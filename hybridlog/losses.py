@@ -9,10 +9,13 @@ on one another again.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
 
 _JOINED_NS = 12_000_000_000
 _SLOW_NS = 10_000_000_000  # rows of what the user wants are written so often
@@ -41,6 +44,9 @@ class Cause(StrEnum):
 
     DISK = "disk"
     """No space."""
+
+    SEGMENT = "segment"
+    """They were stored, and what held them is missing from the store, or damaged."""
 
 
 @dataclass(slots=True)
@@ -121,6 +127,26 @@ def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
             latest[key] = row
             found.append(row)
     return [dict(row) for row in rows if row.get("from") is None] + found
+
+
+def topics_of(entry: RecordingEntry) -> set[str]:
+    """Topics of a recording, those included of which all stored messages are lost.
+
+    A question about such a topic must miss the recording, and say so.
+    """
+    lost = {row["topic"] for row in _lost_from_store(entry)} - {None}
+    return lost | {channel.topic for channel in entry.channels}
+
+
+def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
+    """First and last log time (ns) of stored messages that are lost, a row of the ledger each."""
+    for row in _lost_from_store(entry):
+        if row["from"] is not None:
+            yield row["from"], row["to"]
+
+
+def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
+    return (row for row in entry.end.get("losses", ()) if row["cause"] == Cause.SEGMENT)
 
 
 def _sum(one: int | None, other: int | None) -> int | None:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.capture import Capture, text
-from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog.capture import Capture
+from hybridlog.entries import text
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.sources.base import Damage, Source
+    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
 
@@ -84,6 +86,7 @@ class RecordReport:
 def record(
     source: Source,
     directory: StoreDirectory,
+    catalog: Catalog,
     database: Database,
     *,
     fingerprint: str,
@@ -95,6 +98,7 @@ def record(
     Args:
         source: Open, not yet read.
         directory: The store.
+        catalog: Its catalog.
         database: The index.
         fingerprint: Of the source's content.
         options: What and how.
@@ -113,6 +117,7 @@ def record(
 
     capture = Capture(
         directory,
+        catalog,
         database,
         name=options.name or _name_of(source.path),
         tags=options.tags,
@@ -222,11 +227,11 @@ def _end_of(source: Source) -> dict[str, Any]:
 
 
 def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:
-    for known in catalog.recordings():
+    for _, known in catalog.recordings().values():
         if known.source.get("fingerprint") == fingerprint:
             state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
             raise AlreadyRecordedError(
-                f"{source.path} is in the store already, as {known.id!r}"
+                f"{source.path} is in the store already, as {known.label!r}"
                 f"{state.get(known.status, '')}. "
                 "Use --again to record it once more."
             )

@@ -4,45 +4,57 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from hybridlog import field_indexes, maintenance
+from hybridlog import consent, field_indexes
 from hybridlog.columns.kept import KeptColumns
 from hybridlog.columns.stored import FieldColumns
+from hybridlog.entries import channels_of, take_inventory, text
 from hybridlog.field_indexes import FieldIndex
+from hybridlog.guarded import Belief, GuardedIndex
+from hybridlog.losses import topics_of
+from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
+from hybridlog.maintenance.report import Progress, RepairReport, being_written
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
+from hybridlog.query.intervals import span_of
 from hybridlog.query.plan import Lane
 from hybridlog.query.predicate import Predicate
 from hybridlog.query.recent_chunks import RecentChunks
+from hybridlog.query.times import parse_time
 from hybridlog.query.topics import resolve
 from hybridlog.reader import Query
-from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage import journal
+from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
 from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import (
+    CatalogError,
     DatabaseError,
+    DiskFullError,
     HybridlogError,
-    MissingDependencyError,
     StoreError,
     TopicError,
+    UsageError,
 )
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.settings import EMBEDDED, NAME, with_password
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
+    from hybridlog.maintenance.imports import ImportReport
+    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.times import TimeLike
     from hybridlog.recorder import RecordOptions, RecordReport
-    from hybridlog.segment_catalog import SegmentCatalog
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
     from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
-EMBEDDED = "embedded"  # in place of a URI: the MongoDB that comes with hybridlog
 _MOST_OPEN = 256  # segments, and files of columns
 _MOST_WORDS = 128  # topics and predicates whose meaning is remembered
 
@@ -57,45 +69,43 @@ def open_store(
     *,
     mongo: str | None = None,
     create: bool = False,
+    shared: bool = False,
     require_database: bool = False,
-    progress: maintenance.Progress | None = None,
+    progress: Progress | None = None,
 ) -> Store:
     """Open a store; what a crash has left is mended first.
+
+    MongoDB is connected to when a question needs it.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index, or `embedded`; without,
             `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Make the store if there is none.
-        require_database: Fail when MongoDB is away, rather than read by time only.
+        shared: Let the group write the store; when it is made.
+        require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
 
     Raises:
-        StoreError: there is no store there, or it is of a newer format.
+        StoreError: there is no store there, or it is of another format.
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
     wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     if create:
-        directory = StoreDirectory.create(where, mongo=None if mongo == EMBEDDED else mongo)
+        own = None if mongo in {None, EMBEDDED} else mongo
+        is_new = not os.path.lexists(where / NAME)
+        directory = StoreDirectory.create(where, mongo=own, shared=shared)
         directory.check_writable()
+        if is_new and own is not None:
+            with suppress(StoreError):  # without a home, each command names it again
+                consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
-    store = Store(directory)
+    store = Store(directory, mongo=wanted, progress=progress)
     try:
-        store.connect(wanted or directory.settings.mongo or EMBEDDED)
-        # What is read of the catalog here, the first question need not ask for.
-        database, recordings = store.database_for("This"), store.recordings()
-        store.learn_schemas()
-        store.tended = maintenance.tend(directory, database, recordings, progress)
-        if store.tended != maintenance.Tended():
-            store.refresh()
-    except (DatabaseError, MissingDependencyError) as error:
         if require_database:
-            store.close()
-            raise
-        store.disconnect()
-        store.without_database = error
+            store.connect()
     except BaseException:
         store.close()
         raise
@@ -108,24 +118,39 @@ class Store:
     Use `hybridlog.open`; a store is a context manager. One store may be used by several
     threads for reading.
 
+    Args:
+        directory: Where it lies.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one that
+            the store names.
+        progress: Called while an index is brought up to date.
+
     Attributes:
         directory: Where it lies.
-        database: The index; None while MongoDB is away.
-        without_database: Why it is away.
-        tended: What had to be mended when it was opened.
+        without_database: Why MongoDB is unavailable; None while it is not known to be.
+        repairs: What had to be mended when it was opened.
         kept: Columns of what is asked for again and again.
         recent_chunks: Chunks that single messages were read from.
     """
 
-    def __init__(self, directory: StoreDirectory) -> None:
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        *,
+        mongo: str | None = None,
+        progress: Progress | None = None,
+    ) -> None:
         self.directory = directory
-        self.database: Database | None = None
         self.without_database: HybridlogError | None = None
-        self.tended = maintenance.Tended()
+        self.repairs = RepairReport()
+        self._database: Database | None = None
         self._mongod: EmbeddedMongod | None = None
-        self._uri = EMBEDDED
-        self._catalog: Catalog | SegmentCatalog | None = None
+        self._wanted = mongo
+        self._uri: str | None = None
+        self._progress = progress
+        self._connecting = threading.RLock()
+        self._is_indexed = False  # the recordings that are known are in the index
         self._recordings: list[RecordingEntry] | None = None
+        self._belief: Belief | None = None
         self._schemas: dict[str, Schema] = {}
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
@@ -134,7 +159,13 @@ class Store:
         self.kept = KeptColumns(self)
         self.recent_chunks = RecentChunks()
         self._lock = threading.Lock()
+        self.catalog = open_catalog(directory)
         self._learn()
+        try:
+            self.recordings()
+        except BaseException:
+            self.catalog.close()
+            raise
 
     def __enter__(self) -> Self:
         """The store itself."""
@@ -149,18 +180,57 @@ class Store:
 
     # Connection.
 
-    def connect(self, uri: str) -> None:
-        """Connect to the MongoDB at a URI, or to the embedded one (`embedded`).
+    @property
+    def connected(self) -> Database | None:
+        """The index, if a question has needed it already."""
+        return self._database
+
+    @property
+    def database(self) -> Database | None:
+        """The index; None if MongoDB is unavailable. It is connected to when first asked for."""
+        if self.without_database is None and not (self._database and self._is_indexed):
+            with suppress(HybridlogError):
+                self.connect()
+        return self._database
+
+    def connect(self) -> Database:
+        """Connect to the index, and bring it up to date.
 
         Raises:
-            DatabaseError: it does not answer, or holds the index of another store.
+            DatabaseError: MongoDB does not answer.
+            StoreError: it holds the index of another store, or this store is a copy.
         """
-        self._uri = uri
-        self.database = self._another_database()
-        self._claim(self.database)
-        catalog = Catalog(self.database)
-        catalog.prepare()
-        self._catalog = catalog
+        from hybridlog.maintenance import index
+
+        with self._connecting:
+            if self._database is not None and self._is_indexed:
+                return self._database
+            try:
+                if self._database is None:
+                    self._database = self._another_database()
+                    self._claim(self._database)
+                repairs = RepairReport()
+                has_changed = index.bring_up_to_date(
+                    self.directory,
+                    self.catalog,
+                    self._database,
+                    self.recordings(),
+                    report=repairs,
+                    progress=self._progress,
+                )
+            except BaseException as error:
+                self.disconnect()
+                if isinstance(error, HybridlogError):
+                    self.without_database = error
+                raise
+            self.without_database = None
+            self.repairs.indexed.update(repairs.indexed)
+            self.repairs.unreadable.update(repairs.unreadable)
+            self.repairs.removed += repairs.removed
+            if has_changed:
+                self.refresh()
+            self._is_indexed = True
+            return self._database
 
     def _another_database(self) -> Database:
         """A connection; the embedded MongoDB is started if it is not there (any more).
@@ -170,6 +240,10 @@ class Store:
         """
         from hybridlog_storage.database import Database
 
+        if self._uri is None:
+            self._uri = self._wanted or consent.trusted_uri(
+                self.directory.settings, self.directory.path
+            )
         uri = self._uri
         if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
@@ -180,14 +254,28 @@ class Store:
             except StoreError as error:
                 # A store that cannot be written has no embedded MongoDB; its segments do.
                 raise DatabaseError(str(error)) from error
+        else:
+            uri = with_password(uri)
         return Database.connect(uri)
+
+    @property
+    def index_place(self) -> str:
+        """Where the index is, without asking it."""
+        if self._database is not None:
+            return f"database {self._database.name} at {self._database.address}"
+        uri = self._wanted or self.directory.settings.mongo or EMBEDDED
+        if uri == EMBEDDED:
+            return "the MongoDB that comes with hybridlog"
+        from hybridlog_storage.database import without_secrets
+
+        return without_secrets(uri)
 
     def disconnect(self) -> None:
         """Leave the database; what remains is reading by time."""
-        if self.database is not None:
-            self.database.close()
-        self.database = None
-        self._catalog = None
+        if self._database is not None:
+            self._database.close()
+        self._database = None
+        self._belief = None
         if self._mongod is not None:
             self._mongod.stop()
         self._mongod = None
@@ -201,41 +289,74 @@ class Store:
         self._columns.clear()
         self.recent_chunks.clear()
         self.disconnect()
+        self.catalog.close()
 
     def database_for(self, purpose: str) -> Database:
         """The database.
 
         Raises:
-            DatabaseError: it is away; says what it was needed for and why it is away.
+            DatabaseError: it is unavailable; says what it was needed for, and why it is.
         """
         if self.database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self.without_database or ''}".strip())
         return self.database
 
-    @property
-    def catalog(self) -> Catalog | SegmentCatalog:
-        """The catalog, out of MongoDB, or out of the segments while that is away."""
-        if self._catalog is None:
-            from hybridlog.segment_catalog import SegmentCatalog
+    def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
+        """The index, to ask about some recordings.
 
-            self._catalog = SegmentCatalog(self.directory)
-        return self._catalog
+        Raises:
+            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+            IndexChangedError: another process removes documents of these recordings.
+        """
+        return GuardedIndex(self, self.database_for(purpose), recordings)
+
+    def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
+        """What the index has said of some recordings, since the catalog was read.
+
+        Args:
+            database: The index.
+            keys: Of the recordings.
+            anew: Ask it now.
+        """
+        found = self._belief = Belief.of(database, keys, None if anew else self._belief)
+        return found
 
     # What is in it.
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first."""
         if self._recordings is None:
-            self._recordings = self.catalog.recordings()
+            try:
+                self._recordings = repair_on_open(self.directory, self.catalog, self.repairs)
+            except DiskFullError as error:
+                # What is there can be read all the same, and removed.
+                self.repairs.disk_full = error
+                self.catalog.close()
+                self.catalog = open_catalog(self.directory, in_memory=True)
+                self._recordings = repair_on_open(self.directory, self.catalog, self.repairs)
         return self._recordings
+
+    def entry(self, recording: str) -> RecordingEntry:
+        """The entry of a recording, by its id or its label.
+
+        Raises:
+            TopicError: there is none.
+        """
+        for entry in self.recordings():
+            if recording in {entry.id, entry.label}:
+                return entry
+        raise TopicError(f"Recording {recording!r} is not in the store any more.")
 
     def refresh(self) -> None:
         """Forget what was read of the catalog."""
         self._recordings = None
+        self._is_indexed = False
+        self._belief = None
         self._schemas = {}
         self._lanes.clear()
         with self._lock:
             self._columns.clear()  # closed by the last thread that reads from them
+            self._segments.clear()
         self._chunk_lists.clear()
         self.kept.clear()
         self.recent_chunks.clear()
@@ -250,21 +371,23 @@ class Store:
         self._compiled = lru_cache(_MOST_WORDS)(self._compile)
 
     def select(self, names: Sequence[str]) -> list[RecordingEntry]:
-        """Recordings by id, by name, or by the beginning of an id when it is unambiguous.
+        """Recordings by label, by name, by id, or by the beginning of one of these.
 
         Raises:
             TopicError: there is no such recording, or there are several.
         """
         everything = self.recordings()
         chosen: list[RecordingEntry] = []
-        for name in names:
+        for given in names:
+            name = self.repairs.copies.get(given, given)
             found = (
-                [r for r in everything if r.id == name]
+                [r for r in everything if name in {r.label, r.id}]
                 or [r for r in everything if r.name == name]
-                or [r for r in everything if r.id.startswith(name)]
+                or [r for r in everything if r.label.startswith(name)]
+                or [r for r in everything if len(name) >= 4 and r.id.startswith(name)]
             )
             if len(found) != 1:
-                candidates = ", ".join(r.id for r in (found or everything)[:10]) or "none"
+                candidates = ", ".join(r.label for r in (found or everything)[:10]) or "none"
                 problem = "is ambiguous" if found else "is not in the store"
                 raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
             if found[0] not in chosen:
@@ -272,8 +395,8 @@ class Store:
         return chosen
 
     def topics(self) -> list[str]:
-        """Names of all topics, sorted."""
-        return sorted({c.topic for r in self.recordings() for c in r.channels})
+        """Names of all topics, sorted; also of those of which all messages are lost."""
+        return sorted({topic for r in self.recordings() for topic in topics_of(r)})
 
     def lanes(self, recording: RecordingEntry) -> list[Lane]:
         """The channels of a recording, with what reads them."""
@@ -285,43 +408,27 @@ class Store:
         return lanes
 
     def _channels(self, recording: RecordingEntry) -> dict[int, Channel]:
-        """The channels of a recording, by id; out of its segments when MongoDB lacks a schema."""
-        schemas = self._schemas_for(recording)
-        if not all(c.schema is None or c.schema in schemas for c in recording.channels):
-            from hybridlog.segment_catalog import channels_of_recording
-
-            return channels_of_recording(self.directory, recording.id)
+        """The channels of a recording, by id."""
+        wanted = {c.schema for c in recording.channels if c.schema is not None}
+        if not wanted <= self._schemas.keys():
+            # Recordings have most of them in common.
+            entries = (*self.recordings(), recording)
+            used = {c.schema for r in entries for c in r.channels if c.schema is not None}
+            with suppress(CatalogError):
+                self._schemas = self.catalog.schemas(used)
+        if not wanted <= self._schemas.keys():
+            # The catalog has lost one.
+            return channels_of(take_inventory(self.directory, recording.label).summaries.values())
         return {
             c.id: Channel(
                 c.topic,
                 c.message_encoding,
-                schemas[c.schema] if c.schema is not None else None,
+                self._schemas[c.schema] if c.schema is not None else None,
                 c.metadata,
                 has_publish_time=c.has_publish_time,
             )
             for c in recording.channels
         }
-
-    def _schemas_for(self, recording: RecordingEntry) -> dict[str, Schema]:
-        """Schemas by hash: those of a recording, as far as MongoDB has them, and of others."""
-        wanted = {c.schema for c in recording.channels if c.schema is not None}
-        if self.database is not None and not wanted <= self._schemas.keys():
-            self.learn_schemas(recording)
-        return self._schemas
-
-    def learn_schemas(self, *others: RecordingEntry) -> None:
-        """Fetch the schemas of all recordings at once: they have most of them in common.
-
-        Args:
-            others: Recordings that may have come since the catalog was read.
-
-        Raises:
-            DatabaseError: MongoDB is away.
-        """
-        entries = (*self.recordings(), *others)
-        used = {c.schema for r in entries for c in r.channels if c.schema is not None}
-        if used:  # of a new store there is nothing to ask for
-            self._schemas = Catalog(self.database_for("A schema")).schemas(used)
 
     # Asking.
 
@@ -350,11 +457,11 @@ class Store:
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all."""
         wanted = set(topics)
+        named = None if recordings is None else {r.id for r in self.select(recordings)}
         chosen = tuple(
             r.id
             for r in self.recordings()
-            if (recordings is None or r.id in recordings)
-            and any(c.topic in wanted for c in r.channels)
+            if (named is None or r.id in named) and not wanted.isdisjoint(topics_of(r))
         )
         if wanted and not chosen:
             raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
@@ -416,23 +523,22 @@ class Store:
         bounds: tuple[int, int] | None,
         clock: str = "log",
     ) -> list[ChunkEntry]:
-        longest = None
-        if recording.status != "open":
-            wanted = set(channels)
-            longest = max(
-                (c.stats.longest for c in recording.channels if c.id in wanted), default=0
-            )
-        return self.catalog.chunks(recording.id, channels, bounds, clock, longest, brief=True)
+        try:
+            return self.catalog.chunks(recording, channels, bounds, clock)
+        except CatalogError:
+            put_again(self.directory, self.catalog, recording)
+            return self.catalog.chunks(recording, channels, bounds, clock)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
-        """The reader of a sealed segment, kept open. Thread safe."""
+        """The reader of a sealed segment of a recording, by id or label, kept open. Thread safe."""
         key = (recording, number)
         with self._lock:
             reader = self._segments.get(key)
             if reader is None:
                 _make_room(self._segments)
-                path = self.directory.recording(recording) / f"{number:06d}.mcap"
-                reader = self._segments[key] = SegmentReader(path, number)
+                path = self.directory.recording(self.entry(recording).label)
+                reader = SegmentReader(path / f"{number:06d}.mcap", number)
+                self._segments[key] = reader
             return reader
 
     def columns(self, recording: str) -> FieldColumns | None:
@@ -441,8 +547,9 @@ class Store:
             if recording not in self._columns:
                 _make_room(self._columns)
                 self._columns[recording] = None
-                with suppress(FileNotFoundError, StoreError):  # the index has the same
-                    found = FieldColumns(self.directory.recording(recording))
+                with suppress(FileNotFoundError, StoreError, TopicError):  # the index has the same
+                    path = self.directory.recording(self.entry(recording).label)
+                    found = FieldColumns(path)
                     self._columns[recording] = found
             return self._columns[recording]
 
@@ -471,13 +578,11 @@ class Store:
         from hybridlog.sources.detect import open_source
         from hybridlog.sources.fingerprint import fingerprint
 
-        with (
-            open_source(Path(log)) if isinstance(log, str | Path) else log as source,
-            self.directory.using_index(),
-        ):
+        with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
             report = record(
                 source,
                 self.directory,
+                self.catalog,
                 self.database_for("Recording a log"),
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
@@ -500,6 +605,7 @@ class Store:
 
         return LiveRecording(
             self.directory,
+            self.catalog,
             self.database_for("Starting a recording"),
             name,
             options or LiveOptions(**choices),
@@ -509,39 +615,60 @@ class Store:
 
     def _after(self, report: RecordReport) -> None:
         """A recording has ended."""
-        if report.failure is not None:
-            self._catch_up(report)
-        elif self.database is not None and not self.database.ping():
-            # It has ended meanwhile, and the recording has found another connection.
-            self.disconnect()
-            try:
-                self.connect(self._uri)
-            except DatabaseError as error:
-                self.without_database = error
         self.refresh()
-
-    def _catch_up(self, report: RecordReport) -> None:
-        """MongoDB failed while a log was recorded: index the rest, if it can be had again."""
-        try:
-            self.disconnect()
-            self.connect(self._uri)
-            maintenance.catch_up(self.directory, self.database_for("The index"), report.entry.id)
-            self.refresh()
-            (report.entry,) = self.select([report.entry.id])
-        except DatabaseError as error:
-            report.failure = error
-            self.disconnect()  # what it does not know of, the segments do
-            self.without_database = error
+        if report.failure is None and (self._database is None or self._database.ping()):
             return
-        report.indexed, report.missed, report.failure = report.entry.messages, 0, None
+        # MongoDB has ended meanwhile. If it can be had again, the rest is indexed.
+        self.disconnect()
+        try:
+            self.connect()
+        except HybridlogError as error:
+            if report.failure is not None:
+                report.failure = error if isinstance(error, DatabaseError) else report.failure
+            return
+        if report.failure is not None:
+            report.entry = self.entry(report.entry.id)
+            report.indexed, report.missed, report.failure = report.entry.messages, 0, None
 
-    def reindex(self, progress: maintenance.Progress | None = None) -> list[RecordingEntry]:
-        """Drop the index and make it again from the segments."""
+    def reindex(
+        self,
+        recordings: Sequence[str] | None = None,
+        progress: Progress | None = None,
+    ) -> list[RecordingEntry]:
+        """Make the index again from the segments, recording by recording.
+
+        Args:
+            recordings: Which; None for all, and then what belongs to no recording is removed.
+            progress: Called after each chunk.
+
+        Returns:
+            Those that were indexed.
+
+        Raises:
+            StoreError: one that was named is being written.
+        """
+        from hybridlog.maintenance import index
+
         database = self.database_for("reindex")
-        with self.directory.using_index(rebuild=True):
-            found = maintenance.reindex(self.directory, database, progress)
+        if recordings is None:
+            self.catalog.mend()
         self.refresh()
-        return found
+        chosen = self.recordings() if recordings is None else self.select(recordings)
+        left = index.reindex(
+            self.directory,
+            self.catalog,
+            database,
+            [entry.label for entry in chosen],
+            progress,
+            everything=recordings is None,
+        )
+        if recordings is None:
+            index.remove_rest(self.directory, self.catalog, database, self.recordings(), progress)
+        elif left:
+            raise being_written(left[0])
+        self.refresh()
+        done = {entry.id for entry in chosen if entry.label not in left}
+        return [entry for entry in self.recordings() if entry.id in done]
 
     def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
         """Let MongoDB find messages by the values of fields without looking at all of them.
@@ -561,8 +688,7 @@ class Store:
         query = self.topic(topic)
         database = self.database_for("An index")
         query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
-        with self.directory.using_index():
-            field_indexes.add(database, query.topics, fields)
+        field_indexes.add(database, query.topics, fields)
         return field_indexes.of_topics(database, query.topics)
 
     def remove_index(self, topic: str, *fields: str) -> int:
@@ -573,8 +699,7 @@ class Store:
         """
         query = self.topic(topic)
         database = self.database_for("An index")
-        with self.directory.using_index():
-            return field_indexes.remove(database, query.topics, fields)
+        return field_indexes.remove(database, query.topics, fields)
 
     def indexes(self, *topics: str) -> list[FieldIndex]:
         """The indexes on fields, of these topics or of all."""
@@ -583,65 +708,190 @@ class Store:
         return field_indexes.of_topics(database, names)
 
     def verify(
-        self,
-        recordings: Sequence[str] | None = None,
-        progress: maintenance.Progress | None = None,
-    ) -> maintenance.Verification:
-        """Read everything, check checksums, compare the index with the segments."""
-        database = self.database_for("verify")
-        with self.directory.using_index():
-            chosen = (
-                self.directory.recording_ids()
-                if recordings is None
-                else [r.id for r in self.select(recordings)]
-            )
-            return maintenance.verify(self.directory, database, chosen, progress)
+        self, recordings: Sequence[str] | None = None, progress: Progress | None = None
+    ) -> Verification:
+        """Read everything, check checksums, compare catalog and index with the segments.
+
+        Args:
+            recordings: Which; None for all.
+            progress: Called after each chunk.
+        """
+        from hybridlog.maintenance.verify import verify
+
+        self.refresh()
+        labels = None if recordings is None else [r.label for r in self.select(recordings)]
+        return verify(
+            self.directory,
+            self.catalog,
+            self.database,
+            self.repairs,
+            labels=labels,
+            progress=progress,
+        )
 
     def remove(self, recording: str) -> None:
-        """Delete a recording: first from the catalog, then its files."""
-        database = self.database_for("Removing a recording")
-        with ExitStack() as held:
-            held.enter_context(self.directory.using_index())
-            self.refresh()
-            entry = self.select([recording])[0]
-            if not held.enter_context(self.directory.writing(entry.id)):
-                raise maintenance.being_written(entry.id)
-            Catalog(database).remove_recording(
-                entry.id, {collection_of(c.topic) for c in entry.channels}
-            )
-            with self._lock:
-                for key in [k for k in self._segments if k[0] == entry.id]:
-                    self._segments.pop(key).close()
-            self.directory.remove_recording(entry.id)
+        """Delete a recording: its intent is on the disk first, then everything goes.
+
+        Args:
+            recording: Label, name, or id. The label of a copy removes that copy alone.
+
+        Raises:
+            StoreError: it is being written.
+        """
+        from hybridlog.maintenance import removal
+
         self.refresh()
+        self.recordings()
+        try:
+            if recording in self.repairs.copies:
+                removal.remove_copy(self.directory, recording)
+            else:
+                (entry,) = self.select([recording])
+                removal.remove(self.directory, self.catalog, self.database, entry)
+        finally:
+            self.refresh()
+
+    def rename(self, recording: str, name: str) -> RecordingEntry:
+        """Give a recording another name; its directory gets a label made from it."""
+        return self._edit(recording, journal.event(journal.RENAMED, name=text(name)))
+
+    def tag(self, recording: str, **tags: str) -> RecordingEntry:
+        """Keep tags with a recording; those of the same keys are replaced."""
+        lines = [journal.event(journal.TAGGED, key=text(k), value=text(v)) for k, v in tags.items()]
+        return self._edit(recording, *lines)
+
+    def untag(self, recording: str, *keys: str) -> RecordingEntry:
+        """Remove tags of a recording.
+
+        Raises:
+            UsageError: it has no such tag.
+        """
+        (entry,) = self.select([recording])
+        for key in keys:
+            if key not in entry.tags:
+                known = ", ".join(sorted(entry.tags)) or "none"
+                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
+        return self._edit(recording, *[journal.event(journal.UNTAGGED, key=key) for key in keys])
+
+    def note(self, recording: str, note: str) -> RecordingEntry:
+        """Write a note about a recording; `info` shows it."""
+        return self._edit(recording, journal.event(journal.NOTED, text=text(note)))
+
+    def _edit(self, recording: str, *lines: journal.Event) -> RecordingEntry:
+        from hybridlog.maintenance import edit, index
+
+        self.refresh()
+        (entry,) = self.select([recording])
+        edit.append(self.directory, self.catalog, entry, lines)
+        if self.connected is not None:
+            index.mirror(self.catalog, self.connected, entry.id)
+        self.refresh()
+        return self.entry(entry.id)
+
+    def mark(
+        self, recording: str, moment: TimeLike, note: str, tags: Mapping[str, str] | None = None
+    ) -> RecordingEntry:
+        """Set a mark at a time of a recording that has ended; questions find it like others.
+
+        Args:
+            recording: Label, name, or id.
+            moment: Log time, as for `Query.between`.
+            note: What happened.
+            tags: Kept with it.
+
+        Raises:
+            TimeError: `moment` is no time.
+            StoreError: the recording is being written: mark it while it runs.
+        """
+        from hybridlog.maintenance import edit
+
+        self.refresh()
+        (entry,) = self.select([recording])
+        start, end = span_of(entry)
+        time = parse_time(moment, start=start, end=end)
+        edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=tags or {})
+        self.refresh()
+        return self.entry(entry.id)
+
+    def import_from(
+        self,
+        other: str | Path,
+        recordings: Sequence[str] | None = None,
+        progress: Progress | None = None,
+    ) -> ImportReport:
+        """Copy recordings in from another store; what was copied before is not copied again.
+
+        Args:
+            other: The other store's directory.
+            recordings: Which; None for all.
+            progress: Called while files are copied and checked.
+
+        Raises:
+            StoreError: there is no store, or a recording of it is damaged or being written.
+        """
+        from hybridlog.maintenance import imports
+
+        with Store(StoreDirectory(Path(other)), mongo=EMBEDDED) as source:
+            chosen = source.recordings() if recordings is None else source.select(recordings)
+            report = imports.run(source.directory, self.directory, chosen, progress)
+        self.refresh()
+        return report
+
+    def repair(
+        self, recordings: Sequence[str] | None = None, progress: Progress | None = None
+    ) -> list[Repaired]:
+        """Apply the cures that lose nothing; returns what was done.
+
+        Args:
+            recordings: Which; None for all.
+            progress: Called after each chunk.
+        """
+        from hybridlog.maintenance.repair import repair, repair_index
+
+        self.refresh()
+        labels = None if recordings is None else [r.label for r in self.select(recordings)]
+        done = repair(self.directory, self.catalog, self.repairs, labels)
+        self.refresh()
+        database = self.database
+        if database is not None:
+            done += repair_index(
+                self.directory,
+                self.catalog,
+                database,
+                self.recordings(),
+                labels=labels,
+                progress=progress,
+            )
+            self.refresh()
+        return done
+
+    def take_over(self) -> None:
+        """Say that this store lies here now: it was moved, and its index comes along.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+            StoreError: the database holds the index of another store.
+        """
+        from hybridlog.maintenance import lease
+        from hybridlog_storage.index_state import IndexState
+
+        self.disconnect()
+        with self._another_database() as database:
+            state = IndexState(database)
+            place = lease.place_of(self.directory)
+            lease.check(state.mark(), place, database, embedded=True)
+            state.claim(place)
+        self.without_database = None
 
     def _claim(self, database: Database) -> None:
         """Make sure that the database is this store's, and nobody else's."""
-        mine = self.directory.settings.store_id
-        if not check_claim(database, mine):
-            database.replace(maintenance.STORE_MARK, {"_id": "store"}, {"_id": "store", "id": mine})
+        from hybridlog.maintenance import lease
+        from hybridlog_storage.index_state import IndexState
 
-
-def check_claim(database: Database, store_id: str | None = None) -> bool:
-    """Check that a database holds no index but that of one store.
-
-    Args:
-        database: Connected.
-        store_id: The store; None for one that is yet to be made.
-
-    Returns:
-        Whether it is that store's already.
-
-    Raises:
-        StoreError: it holds the index of another one.
-    """
-    mark = database.find_one(maintenance.STORE_MARK, {"_id": "store"})
-    if mark is not None and mark.get("id") != store_id:
-        raise StoreError(
-            f"The database {database.name!r} at {database.address} holds the index of "
-            "another store. Name a database of its own in the URI: mongodb://host/NAME."
-        )
-    return mark is not None
+        state = IndexState(database)
+        place = lease.place_of(self.directory)
+        if lease.check(state.mark(), place, database, embedded=self._uri == EMBEDDED):
+            state.claim(place)
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

@@ -7,7 +7,6 @@ the ledger says.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -24,9 +23,10 @@ from hybridlog.live.recording import LiveOptions, LiveRecording, indexed_within_
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
+from hybridlog.marks import mark_channel, mark_payload
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordReport
     from hybridlog.store import Store
-
-MARKS = "/hybridlog/marks"
-"""Topic of the marks that are set while recording."""
 
 _LOOK_S = 1.0
 _JUMP_S = 0.5
@@ -93,7 +90,7 @@ class RecorderState:
     """A recorder at one look.
 
     Attributes:
-        name: Of the recorder: the id of its recording.
+        name: Of the recorder: the label of its recording.
         elapsed_s: Since it was started.
         topics: Each topic that has publishers or has said something, by name.
         messages: Received so far.
@@ -171,9 +168,7 @@ class Recorder:
         self._room = options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
-        self._marks = Channel(
-            MARKS, "json", Schema("hybridlog.Mark", "jsonschema", _MARK_SCHEMA), {}
-        )
+        self._marks = mark_channel()
         self._started = time.monotonic()
         self._offset = time.time() - self._started
         self._looked = self._started
@@ -184,7 +179,7 @@ class Recorder:
         self._target: LiveRecording | Snapshots
         if options.snapshots is None:
             self._target = self._begin(store, {})
-            self.name = self._target.id
+            self.name = self._target.label
         else:
             self.name = f"{options.name}-ring-{os.getpid()}"
             self._target = Snapshots(
@@ -332,10 +327,7 @@ class Recorder:
 
     def mark(self, text: str, tags: Mapping[str, str]) -> None:
         """Set a mark: a message on `MARKS` that questions and triggers can use."""
-        content = json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False)
-        # What came as bytes that are no UTF-8 stands in it as JSON's own escapes.
-        payload = content.encode("utf-8", "backslashreplace")
-        self.take(self._marks, payload, received=time.time_ns())
+        self.take(self._marks, mark_payload(text, tags), received=time.time_ns())
 
     def fire(self, reason: str) -> None:
         """Write a snapshot.
@@ -658,12 +650,6 @@ class Recorder:
 
 def _megabytes(count: float) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
-_MARK_SCHEMA = (
-    b'{"type":"object","properties":{"text":{"type":"string"},'
-    b'"tags":{"type":"object","additionalProperties":{"type":"string"}}}}'
-)
 
 
 def summary_of(state: RecorderState) -> dict[str, Any]:

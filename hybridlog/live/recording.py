@@ -40,6 +40,7 @@ from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
@@ -127,6 +128,7 @@ class LiveRecording:
 
     Args:
         directory: The store.
+        catalog: Its catalog.
         database: The index.
         name: Name of the recording.
         options: How.
@@ -137,6 +139,7 @@ class LiveRecording:
     def __init__(
         self,
         directory: StoreDirectory,
+        catalog: Catalog,
         database: Database,
         name: str,
         options: LiveOptions,
@@ -176,10 +179,10 @@ class LiveRecording:
         self._provision = Provision(options.settings.chunk_size, options.budget_bytes)
         self._held = ExitStack()
         with self._held:
-            self._held.enter_context(directory.using_index())
             self._held.enter_context(spared_objects)
             self._capture = Capture(
                 directory,
+                catalog,
                 database,
                 name=name,
                 tags=options.tags,
@@ -198,6 +201,8 @@ class LiveRecording:
             self._held = self._held.pop_all()
         self.id = self._capture.entry.id
         """Recording id."""
+        self.label = self._capture.entry.label
+        """Name of the recording's directory."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
 
@@ -359,7 +364,7 @@ class LiveRecording:
         """Begin to close or to abort, by who holds `_closing`; that is done once."""
         if self._is_closing:
             raise UsageError(
-                f"The recording {self.id!r} is being closed, or that was broken off; the next "
+                f"The recording {self.label!r} is being closed, or that was broken off; the next "
                 "opening of the store seals what was flushed."
             )
         self._is_closing = True
@@ -450,7 +455,7 @@ class LiveRecording:
         if self._failure is not None:
             raise self._failure
         if self._ended:
-            raise UsageError(f"The recording {self.id!r} was closed.")
+            raise UsageError(f"The recording {self.label!r} was closed.")
 
     def _is_under(self, strain: _Strain) -> bool:
         return strain.is_felt(self._unwritten()) and not self._ended

@@ -13,11 +13,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog.live.ring import Held, Ring
 from hybridlog.losses import Cause, Ledger
-from hybridlog.query.evaluate import holds, numbers_at
+from hybridlog.query.evaluate import compiled, numbers_at
 from hybridlog.query.mongo_filter import to_filter
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.query.where import Expression, parse
@@ -26,6 +26,7 @@ from hybridlog_storage.errors import HybridlogError, UsageError, WhereError
 
 if TYPE_CHECKING:
     from hybridlog.live.recording import LiveRecording
+    from hybridlog.query.evaluate import Test
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.messages import Channel
 
@@ -61,7 +62,14 @@ class Trigger:
         topic = topic.strip().removesuffix(":")
         if not topic:
             raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
-        return cls(text, matcher([topic]), parse(predicate) if predicate.strip() else None)
+        fits = matcher([topic])
+        expression = parse(predicate) if predicate.strip() else None
+        for path in [] if expression is None else expression.fields():
+            if path.split(".", 1)[0] in {"_id", "_meta"}:
+                raise WhereError(
+                    f"a trigger is asked of a message before it is stored: {path} is not there yet"
+                )
+        return cls(text, fits, expression)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +96,18 @@ class SnapshotOptions:
             raise UsageError("--before cannot be longer than --ring")
         if not 0 <= self.after_s <= 86_400:
             raise UsageError("--after must last between 0 and a day")
+
+
+class _Watch(NamedTuple):
+    """A trigger as it is asked of the messages of one channel.
+
+    Attributes:
+        reason: The trigger's text.
+        test: Of a message's fields; None when any message fires it.
+    """
+
+    reason: str
+    test: Test | None
 
 
 class Snapshots:
@@ -130,7 +150,7 @@ class Snapshots:
         self._reports: list[RecordReport] = []
         self._stored = (0, 0)
         self._failure: HybridlogError | None = None
-        self._watched: dict[Channel, tuple[Trigger, ...]] = {}
+        self._watched: dict[Channel, tuple[_Watch, ...]] = {}
         self._told_short = False
 
     id = ""
@@ -148,9 +168,9 @@ class Snapshots:
     ) -> bool:
         """Take a message; see `LiveRecording.write`."""
         held = Held(channel, payload, log_time, publish_time, sequence)
-        triggers = self._watched.get(channel)
-        if triggers is None:
-            triggers = self._watched[channel] = tuple(self._fitting(channel))
+        watches = self._watched.get(channel)
+        if watches is None:
+            watches = self._watched[channel] = tuple(self._watches(channel))
         with self._lock:
             self._ring.add(held)
             active = self._active
@@ -168,9 +188,8 @@ class Snapshots:
                     sequence=sequence,
                     wait=wait,
                 )
-        for trigger in triggers:
-            if self._happened(trigger, held):
-                self.fire(trigger.text, log_time)
+        for reason in _happened(watches, held):
+            self.fire(reason, log_time)
         return taken
 
     def fire(self, reason: str, at: int | None = None) -> None:
@@ -289,23 +308,22 @@ class Snapshots:
             for number in numbers_at(codec_for(held.channel).fields(held.payload), path)
         ]
 
-    def _fitting(self, channel: Channel) -> Iterator[Trigger]:
+    def _watches(self, channel: Channel) -> Iterator[_Watch]:
         """The triggers for a channel; says which of them can never fire."""
         for trigger in self._options.triggers:
             if not trigger.fits(channel.topic):
                 continue
             self._unmet.pop(trigger.text, None)
-            fault = "" if trigger.predicate is None else _fault(trigger.predicate, channel)
-            if fault:
-                self._say(f"trigger {trigger.text!r} can never fire on {channel.topic}: {fault}")
+            if trigger.predicate is None:
+                yield _Watch(trigger.text, None)
+                continue
+            types = {path.path: path.type for path in codec_for(channel).paths()} or None
+            try:
+                to_filter(trigger.predicate, types)
+            except WhereError as error:
+                self._say(f"trigger {trigger.text!r} can never fire on {channel.topic}: {error}")
             else:
-                yield trigger
-
-    @staticmethod
-    def _happened(trigger: Trigger, held: Held) -> bool:
-        if trigger.predicate is None:
-            return True
-        return holds(trigger.predicate, codec_for(held.channel).fields(held.payload))
+                yield _Watch(trigger.text, compiled(trigger.predicate, types))
 
     def _write_out(self, reason: str, at: int) -> None:
         """Start a recording with what the ring holds; runs on the worker."""
@@ -333,7 +351,7 @@ class Snapshots:
                     last=row["to"],
                     detail=row["reason"],
                 )
-        self._say(f"snapshot {recording.id} because of {reason!r}")
+        self._say(f"snapshot {recording.label} because of {reason!r}")
         try:
             for held in kept:
                 while recording.filled > _HALF and recording.failure is None:
@@ -347,7 +365,7 @@ class Snapshots:
                 )
         except HybridlogError as error:
             self._failure = error
-            self._say(f"snapshot {recording.id} is not complete: {error}")
+            self._say(f"snapshot {recording.label} is not complete: {error}")
 
     def _end(self, recording: LiveRecording) -> None:
         """Let the worker close a snapshot. Holds the lock."""
@@ -362,17 +380,17 @@ class Snapshots:
             self.cut_off.update(recording.cut_off)
         except HybridlogError as error:
             self._failure = error
-            self._say(f"snapshot {recording.id} is not complete: {error}")
+            self._say(f"snapshot {recording.label} is not complete: {error}")
             return
         self._reports.append(report)
         self._stored = (self._stored[0] + stored[0], self._stored[1] + stored[1])
 
 
-def _fault(predicate: Expression, channel: Channel) -> str:
-    """Why a predicate can never hold for a channel, as far as its type tells; else empty."""
-    types = {path.path: path.type for path in codec_for(channel).paths()}
-    try:
-        to_filter(predicate, types or None)
-    except WhereError as error:
-        return str(error)
-    return ""
+def _happened(watches: tuple[_Watch, ...], held: Held) -> Iterator[str]:
+    """The triggers that fire for a message."""
+    fields: dict[str, object] | None = None
+    for reason, test in watches:
+        if test is not None and fields is None:
+            fields = codec_for(held.channel).fields(held.payload)
+        if test is None or (fields is not None and test(fields)):
+            yield reason

@@ -3,65 +3,84 @@
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
-  recordings/<id>/      segments of one recording, and columns; writer.lock while it is written
-  mongod/               data of the embedded MongoDB
+  recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
+  catalog.sqlite        derived: which recordings, channels and chunks there are
+  mongod/               derived: data of the embedded MongoDB
 ```
+
+The label of a recording is for people. Which recording it is says the journal.
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
+import hashlib
 import os
 import re
 import secrets
-import shutil
-import time
-import tomllib
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hybridlog_storage import durability
-from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage import durability, files
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
+from hybridlog_storage.settings import NAME as SETTINGS
+from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
+from hybridlog_storage.sharing import make_shared
 
-FORMAT: Final = 1
-_SETTINGS: Final = "hybridlog.toml"
-_LOCK: Final = "writer.lock"
-_MAX_SETTINGS: Final = 1 << 20
-_FRESH_S: Final = 600.0
+LOCK: Final = "writer.lock"
+REMOVED: Final = ".removed-"
+"""Beginning of the name of a recording that is being deleted."""
+IMPORTING: Final = ".importing-"
+"""Beginning of the name of a recording that is being copied in from another store."""
+_RECORDINGS: Final = "recordings"
 
 
 @dataclass(frozen=True, slots=True)
-class StoreSettings:
-    """What `hybridlog.toml` says.
+class Listing:
+    """What lies in a recording's directory.
 
     Attributes:
-        store_id: Drawn at random when the store was made.
-        mongo: URI of the MongoDB to use instead of the embedded one, None for that.
+        journal: Whether there is a journal.
+        sealed: Names of sealed segments, by number.
+        open: Names of segments that were never sealed, by number.
+        others: All other names.
+        print: Changes whenever a file that matters does.
     """
 
-    store_id: str
-    mongo: str | None = None
+    journal: bool
+    sealed: Mapping[int, str]
+    open: Mapping[int, str]
+    others: tuple[str, ...]
+    print: str
 
 
 class StoreDirectory:
     """A store's directory.
 
     Raises:
-        StoreError: there is no store, it is of a newer format, or cannot be read.
+        StoreError: there is no store, it is of another format, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.settings = _read_settings(path)
+        self.settings = read_settings(path)
 
     @classmethod
-    def create(cls, path: Path, *, mongo: str | None = None) -> StoreDirectory:
+    def create(
+        cls, path: Path, *, mongo: str | None = None, shared: bool = False
+    ) -> StoreDirectory:
         """Make a store, or open the one that is there.
+
+        Args:
+            path: Where.
+            mongo: URI of the MongoDB to use instead of the embedded one; without a password.
+            shared: Whether a group may write it; of a new store only.
 
         Raises:
             StoreError: the directory holds something else, or cannot be written.
@@ -69,32 +88,43 @@ class StoreDirectory:
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
         try:
-            if not (path / _SETTINGS).exists():
+            if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes one makes the store, and the others open it.
-                with _alone(path):
-                    cls._make(path, mongo)
+                with _alone(path, depth=0):
+                    cls._make(path, mongo, shared=shared)
             store = cls(path)
-            (path / "recordings").mkdir(exist_ok=True)
+            try:
+                files.make_folder(path / _RECORDINGS, depth=files.IN_STORE)
+            except FileExistsError:
+                pass
+            else:
+                files.sync_folder(path, depth=0)
         except OSError as error:
             raise durability.explain(error, path, "making the store") from error
         return store
 
     @staticmethod
-    def _make(path: Path, mongo: str | None) -> None:
+    def _make(path: Path, mongo: str | None, *, shared: bool) -> None:
         names = {entry.name for entry in path.iterdir()}
-        if _SETTINGS in names:
+        if SETTINGS in names:
             return
         # What a crash in here has left of the settings is no file of anybody's.
-        if any(not name.startswith(f".{_SETTINGS}.") for name in names):
+        if any(not name.startswith(f".{SETTINGS}.") for name in names):
             raise StoreError(
                 f"{path} holds files and is no hybridlog store. "
                 "Choose an empty or a new directory with --store."
             )
-        lines = [f"format = {FORMAT}", f'store_id = "{secrets.token_hex(8)}"']
-        if mongo is not None:
-            lines.append(f"mongo = {json.dumps(mongo)}")
-        durability.write_new(path / _SETTINGS, ("\n".join(lines) + "\n").encode())
+        write_settings(path, StoreSettings(secrets.token_hex(16), mongo=mongo, shared=shared))
+        if shared:
+            make_shared(path)
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether this user may change the store."""
+        return os.access(self.path / _RECORDINGS, os.W_OK | os.X_OK) and os.access(
+            self.path, os.W_OK | os.X_OK
+        )
 
     def check_writable(self) -> None:
         """Refuse a store that cannot be written, before anything is tried.
@@ -102,119 +132,181 @@ class StoreDirectory:
         Raises:
             StoreError: it is read-only for this user.
         """
-        if not os.access(self.path / "recordings", os.W_OK | os.X_OK):
+        if not self.is_writable:
             raise StoreError(
                 f"The store {self.path} is read-only. Check its owner and mount, or choose "
                 "another with --store."
             )
 
     @property
-    def mongod(self) -> Path:
-        """Directory of the embedded MongoDB."""
-        return self.path / "mongod"
+    def recordings(self) -> Path:
+        """Directory of all recordings."""
+        return self.path / _RECORDINGS
 
-    def recording(self, recording_id: str) -> Path:
+    def recording(self, label: str) -> Path:
         """Directory of a recording."""
-        return self.path / "recordings" / recording_id
+        return self.recordings / label
 
-    def recording_ids(self) -> list[str]:
-        """Ids of all recordings that have a directory, sorted."""
+    def labels(self) -> list[str]:
+        """Labels of all recordings that have a directory, sorted."""
+        return [name for name in self._folders() if not name.startswith(".")]
+
+    def has(self, label: str) -> bool:
+        """Whether there is something of this name below `recordings`."""
         try:
-            with os.scandir(self.path / "recordings") as entries:
-                return sorted(
-                    e.name for e in entries if e.is_dir(follow_symlinks=False) and e.name[0] != "."
-                )
+            files.status(self.recording(label), depth=files.IN_FOLDER)
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+        return True
+
+    def hidden(self, beginning: str) -> list[str]:
+        """Names of directories of recordings that are being removed or copied in, sorted."""
+        return [name for name in self._folders() if name.startswith(beginning)]
+
+    def _folders(self) -> list[str]:
+        try:
+            found = files.names(self.recordings, depth=files.IN_STORE)
         except FileNotFoundError:
             return []
         except OSError as error:
             raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+        return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
+
+    def listing(self, label: str) -> Listing:
+        """What lies in a recording's directory.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        path = self.recording(label)
+        try:
+            found = files.names(path, depth=files.IN_FOLDER)
+        except FileNotFoundError:
+            found = {}
+        except OSError as error:
+            raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+        sealed: dict[int, str] = {}
+        opened: dict[int, str] = {}
+        others = []
+        looks = hashlib.blake2b(digest_size=16)
+        for name, about in sorted(found.items()):
+            number, kind = _numbered(name)
+            if kind == OPEN_SUFFIX:
+                opened[number] = name
+                looks.update(f"{name}\n".encode())
+            elif kind == SEALED_SUFFIX:
+                sealed[number] = name
+            elif name != JOURNAL:
+                others.append(name)
+                continue
+            if kind != OPEN_SUFFIX:
+                looks.update(
+                    f"{name} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns} "
+                    f"{about.st_ino}\n".encode()
+                )
+        return Listing(
+            JOURNAL in found,
+            dict(sorted(sealed.items())),
+            dict(sorted(opened.items())),
+            tuple(others),
+            looks.hexdigest(),
+        )
+
+    def segments(self, label: str) -> list[tuple[int, Path]]:
+        """Number and path of the sealed segments of a recording, in order."""
+        path = self.recording(label)
+        return [(number, path / name) for number, name in self.listing(label).sealed.items()]
+
+    def open_segments(self, label: str) -> list[tuple[int, Path]]:
+        """Number and path of segments that were never sealed, in order."""
+        path = self.recording(label)
+        return [(number, path / name) for number, name in self.listing(label).open.items()]
+
+    @property
+    def mongod(self) -> Path:
+        """Directory of the embedded MongoDB."""
+        return self.path / "mongod"
 
     def new_recording(self, name: str) -> str:
-        """Make a directory for a new recording; returns its id, made from the name."""
-        base = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:80] or "recording"
+        """Make a directory for a new recording; returns its label, made from the name."""
+        base = label_of(name)
         number = 1
         while True:
-            recording_id = base if number == 1 else f"{base}-{number}"
+            label = base if number == 1 else f"{base}-{number}"
             try:
-                self.recording(recording_id).mkdir(parents=True)
+                files.make_folder(self.recording(label), depth=files.IN_FOLDER)
             except FileExistsError:
                 number += 1
             except OSError as error:
                 raise durability.explain(error, self.path, "starting a recording in") from error
             else:
-                durability.sync_directory(self.path / "recordings")
-                return recording_id
+                self._sync()
+                return label
 
-    def is_beginning(self, recording_id: str) -> bool:
-        """Whether an empty recording may be one that somebody is just about to lock."""
-        path = self.recording(recording_id)
+    def is_beginning(self, label: str) -> bool:
+        """Whether an empty recording may be one that somebody is just about to lock.
+
+        Who begins one keeps all others from it until it is locked; so where nobody does, it
+        is what a crash has left.
+        """
         try:
-            return not (path / _LOCK).exists() and time.time() - path.stat().st_mtime < _FRESH_S
-        except FileNotFoundError:
+            with _alone(self.recordings, depth=files.IN_STORE, wait=False):
+                return False
+        except OSError:
             return True
 
-    def remove_recording(self, recording_id: str) -> None:
-        """Delete a recording's files: first out of sight, then from the disk."""
-        source = self.recording(recording_id)
-        hidden = source.with_name(f".removed-{recording_id}-{secrets.token_hex(4)}")
+    def free_label(self, name: str, *, but: str = "") -> str:
+        """A label made from a name that no recording has, but perhaps one."""
+        base = label_of(name)
+        taken = set(self._folders()) - {but}
+        number = 1
+        while (label := base if number == 1 else f"{base}-{number}") in taken:
+            number += 1
+        return label
+
+    def move(self, old: str, new: str) -> None:
+        """Give a directory below `recordings` another name, durably."""
         try:
-            source.rename(hidden)
-            shutil.rmtree(hidden)
+            files.rename(self.recording(old), self.recording(new), depth=files.IN_FOLDER)
+            self._sync()
         except OSError as error:
-            raise durability.explain(error, source, "removing") from error
+            raise durability.explain(error, self.recording(old), "renaming") from error
 
-    def segments(self, recording_id: str) -> list[tuple[int, Path]]:
-        """Number and path of the sealed segments of a recording, in order."""
-        return _numbered(self.recording(recording_id), SEALED_SUFFIX)
+    def hide(self, label: str) -> str:
+        """Take a recording out of sight, durably; returns the name of what is to be swept."""
+        hidden = f"{REMOVED}{label}-{secrets.token_hex(4)}"
+        self.move(label, hidden)
+        return hidden
 
-    def open_segments(self, recording_id: str) -> list[tuple[int, Path]]:
-        """Number and path of segments that were never sealed."""
-        return _numbered(self.recording(recording_id), OPEN_SUFFIX)
+    def sweep(self, name: str) -> None:
+        """Delete a directory below `recordings` that is out of sight."""
+        path = self.recording(name)
+        try:
+            files.remove_tree(path, depth=files.IN_FOLDER)
+            self._sync()
+        except OSError as error:
+            raise durability.explain(error, path, "removing") from error
+
+    def _sync(self) -> None:
+        files.sync_folder(self.recordings, depth=files.IN_STORE)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Keep other processes from starting a recording meanwhile; for moments only."""
         try:
-            with _alone(self.path / "recordings"):
+            with _alone(self.recordings, depth=files.IN_STORE):
                 yield
         except OSError as error:
             raise durability.explain(error, self.path, "locking") from error
 
     @contextmanager
-    def using_index(self, *, rebuild: bool = False) -> Iterator[None]:
-        """Keep the index from being made anew meanwhile; or, to do just that, be alone.
-
-        Raises:
-            StoreError: Another process makes it anew, or uses it.
-        """
-        path = self.path / _SETTINGS
-        try:
-            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except OSError as error:
-            raise durability.explain(error, path, "locking") from error
-        try:
-            fcntl.flock(fd, (fcntl.LOCK_EX if rebuild else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(fd)
-            doing = (
-                "a recording is being written, checked or removed"
-                if rebuild
-                else "its index is being made anew"
-            )
-            raise StoreError(
-                f"The store {self.path} is in use: {doing}. Run the command again after that."
-            ) from error
-        try:
-            yield
-        finally:
-            os.close(fd)
-
-    @contextmanager
-    def writing(self, recording_id: str) -> Iterator[bool]:
+    def writing(self, label: str) -> Iterator[bool]:
         """Hold a recording for writing; False when another process does."""
-        path = self.recording(recording_id) / _LOCK
+        path = self.recording(label) / LOCK
         try:
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
         except OSError as error:
             raise durability.explain(error, path, "locking") from error
         try:
@@ -227,63 +319,44 @@ class StoreDirectory:
         finally:
             os.close(fd)
 
+    def is_held(self, label: str) -> bool:
+        """Whether somebody holds a recording for writing at this moment."""
+        try:
+            fd = files.open_file(self.recording(label) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(fd)
+        return False
+
 
 @contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Keep other processes that do the same out of a directory."""
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX)
+def _alone(directory: Path, *, depth: int, wait: bool = True) -> Iterator[None]:
+    """Keep other processes that do the same out of a directory.
+
+    Raises:
+        BlockingIOError: Another process does, and `wait` is not set.
+    """
+    with files.folder(directory, depth) as fd:
+        fcntl.flock(fd, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
-    finally:
-        os.close(fd)
 
 
-def check_recording_id(recording_id: str) -> str:
-    """Refuse an id that is no plain directory name."""
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", recording_id):
-        raise UsageError(f"{recording_id!r} is no recording id; see `hybridlog ls`.")
-    return recording_id
+def label_of(name: str) -> str:
+    """A name as that of a directory."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:80] or "recording"
 
 
-def _numbered(directory: Path, suffix: str) -> list[tuple[int, Path]]:
-    found = []
-    for path in directory.glob(f"*{suffix}"):
-        stem = path.name.removesuffix(suffix)
-        if stem.isascii() and stem.isdigit():
-            found.append((int(stem), path))
-    return sorted(found)
-
-
-def _read_settings(path: Path) -> StoreSettings:
-    file = path / _SETTINGS
-    try:
-        if file.stat().st_size > _MAX_SETTINGS:
-            raise StoreError(f"{file} is too large to be settings.")
-        values = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        reason = "there is no such directory" if not path.exists() else "it has no hybridlog.toml"
-        raise StoreError(
-            f"{path} is no hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
-            "makes one; --store or HYBRIDLOG_STORE says where to look."
-        ) from None
-    except NotADirectoryError:
-        raise StoreError(f"{path} is a file; a store is a directory.") from None
-    except OSError as error:
-        raise StoreError(f"{file} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
-    version = values.get("format")
-    if not isinstance(version, int) or version < 1:
-        raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
-    if version > FORMAT:
-        raise StoreError(
-            f"The store {path} has format {version}, this hybridlog knows up to {FORMAT}. "
-            "Install a newer hybridlog."
-        )
-    store_id, mongo = values.get("store_id"), values.get("mongo")
-    if not isinstance(store_id, str) or not store_id:
-        raise StoreError(f"{file} names no store_id.")
-    if mongo is not None and not isinstance(mongo, str):
-        raise StoreError(f"{file}: mongo must be a URI in quotes.")
-    return StoreSettings(store_id, mongo)
+def _numbered(name: str) -> tuple[int, str]:
+    """Number and suffix of a segment's file; no suffix for other files."""
+    for suffix in (OPEN_SUFFIX, SEALED_SUFFIX):
+        stem = name.removesuffix(suffix)
+        if stem != name and stem.isascii() and stem.isdigit() and len(stem) <= 9:
+            if f"{int(stem):06d}" == stem:
+                return int(stem), suffix
+            return 0, ""
+    return 0, ""

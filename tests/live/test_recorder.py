@@ -23,10 +23,11 @@ import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live.door import choose, running, visit
 from hybridlog.live.policy import priority_rule, throttle_rule
-from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
+from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveRecording
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.losses import Cause
+from hybridlog.marks import MARKS
 from hybridlog.query.topics import matcher
 from hybridlog_storage import append_file
 from hybridlog_storage.collection_names import collection_of
@@ -336,6 +337,23 @@ def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Stor
     (report,) = robot.recorder.stop()
     assert len(report.entry.channels) == 1
     assert report.entry.messages == 10_000
+
+
+def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store) -> None:
+    running = Running(store)
+    assert running.speaker.sink is not None
+    for number in (7, (1 << 32) + 8, (1 << 40) - 1, None):
+        running.speaker.sink.take(
+            text_channel(), text("x"), received=time.time_ns(), sequence=number
+        )
+    (report,) = running.recorder.stop()
+    assert report.entry.messages == 4
+    assert not report.entry.end["losses"]
+    with (store.directory.path / "recordings" / report.entry.label / "000000.mcap").open(
+        "rb"
+    ) as file:
+        found = [m.sequence for _, _, m in make_reader(file).iter_messages()]
+    assert found == [7, 8, 0xFFFFFFFF, 0]
 
 
 def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:

@@ -10,10 +10,10 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,14 +27,15 @@ from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording, provision
 from hybridlog.live import recording as live
+from hybridlog.maintenance import index
 from hybridlog_storage import append_file, chunk_builder, segment_writer
 from hybridlog_storage.buffers import SLAB, Buffers
-from hybridlog_storage.catalog import CHUNKS, Catalog
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
+from hybridlog_storage.index_state import CHUNKS, IndexedChunk, IndexState
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
@@ -86,7 +87,9 @@ def test_many_threads_one_recording(store: hl.Store) -> None:
     assert (report.indexed, report.missed, report.failure) == (180, 0, None)
     assert report.entry.status == "complete"
     assert report.entry.tags == {"who": "six"}
-    assert Counter(in_segments(store, recording.id)) == Counter(m for one in written for m in one)
+    assert Counter(in_segments(store, recording.label)) == Counter(
+        m for one in written for m in one
+    )
     for number in range(6):
         fetched = store.topic(f"/topic{number}")
         assert [(m.log_time_ns, m.raw) for m in fetched] == [
@@ -163,7 +166,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
         thread.join()
     for topic in ("/talk", "/other"):
         assert [m.raw for m in store.topic(topic)] == payloads
-        found = [m for m in in_segments(store, recording.id) if m[0] == topic]
+        found = [m for m in in_segments(store, recording.label) if m[0] == topic]
         assert [data for *_, data in found] == payloads
     assert store.verify().findings == []
 
@@ -317,7 +320,7 @@ def test_the_index_falls_behind_and_catches_up(
     with store.start("talk", settings=settings, flush_interval_s=0.2) as recording:
         for number, payload in enumerate(payloads):
             recording.write(own, payload, log_time=number)
-        wait_for(lambda: len(in_segments_so_far(store, recording.id)) >= 2)
+        wait_for(lambda: len(in_segments_so_far(store, recording.label)) >= 2)
         assert store.database is not None
         assert store.database.count("talk", {}) == 0
         # Chunks of segments that were sealed meanwhile are read back as well.
@@ -384,6 +387,8 @@ def test_chunks_are_let_go_only_beyond_the_backlog(
     """So many bytes of them; and nothing is made or read before the disk can spare it."""
     busy = True
     monkeypatch.setattr(LiveRecording, "_is_under", lambda *_: busy)
+    # What memory the process has at hand depends on the tests before.
+    monkeypatch.setattr(provision.buffers, "is_short", lambda *_: False)
     read, made = [], []
     real = Lag.read
 
@@ -634,6 +639,27 @@ with hl.open(sys.argv[1], create=True) as store:
 """
 
 
+def test_chunks_are_flushed_within_the_interval(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The age at which they are, and the pause between two looks, are no more together."""
+    ages: list[float] = []
+    real = RecordingWriter.flush_older
+
+    def seen(self: RecordingWriter, seconds: float) -> None:
+        ages.append(seconds)
+        real(self, seconds)
+
+    monkeypatch.setattr(RecordingWriter, "flush_older", seen)
+    for interval in (0.05, 0.4):
+        ages.clear()
+        with store.start("talk", flush_interval_s=interval) as recording:
+            recording.write(channel("/talk"), text(b"x"))
+            wait_for(lambda: recording._capture.writer.totals.chunks == 1)
+        tick = min(live._TICK_S, interval / 10)
+        assert {0 < age <= interval - 2 * tick for age in ages} == {True}
+
+
 def test_kill_costs_no_more_than_the_flush_interval(tmp_path: Path) -> None:
     place = tmp_path / "store"
     process = subprocess.Popen(
@@ -693,7 +719,7 @@ def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store
             recording.write("/talk", b"")
         for number, memory in enumerate((bytearray, memoryview, bytes)):
             recording.write(own, memory(text(b"after")), log_time=np.int64(3 + number))
-    assert [s[1] for s in in_segments(store, recording.id)] == [1, 3, 4, 5]
+    assert [s[1] for s in in_segments(store, recording.label)] == [1, 3, 4, 5]
     assert store.topic("/talk").where("data == 'after'").count() == 3
     assert not store.verify().findings
 
@@ -779,7 +805,7 @@ def test_abort_leaves_nothing(store: hl.Store) -> None:
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"gone"))
     recording.abort()
-    assert store.directory.recording_ids() == []
+    assert store.directory.labels() == []
     store.refresh()
     assert store.recordings() == []
 
@@ -824,16 +850,18 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
     recording = store.start("talk")
     with monkeypatch.context() as broken:
         broken.setattr(Database, "insert_raw", refused)
-        recording.write(own, text(b"kept"), log_time=1)
+        for number in range(5):
+            recording.write(own, text(b"kept"), log_time=number)
+        recording.write(channel("/more"), text(b"kept"), log_time=9)
         report = recording.close()
-        assert (report.indexed, report.missed) == (0, 1)
+        assert (report.indexed, report.missed) == (0, 6)
         assert isinstance(report.failure, DatabaseError)
     assert store.database is None
-    assert [m.raw for m in store.topic("/talk")] == [text(b"kept")]
+    assert [m.raw for m in store.topic("/talk")] == [text(b"kept")] * 5
     with pytest.raises(DatabaseError, match="refuses it"):
         store.topic("/talk").where("data == 'kept'").count()
     with hl.open(store.directory.path) as again:
-        assert again.topic("/talk").where("data == 'kept'").count() == 1
+        assert again.topic("/talk").where("data == 'kept'").count() == 5
         assert again.verify().findings == []
 
 
@@ -844,9 +872,9 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-        database = store.database_for("This")
-        assert database.delete(CHUNKS, {"rec": recording.id}) == 1
-        assert database.delete(collection_of("/speech"), {"_meta.rec": recording.id}) == 1
+        database, key = store.database_for("This"), recording.id[:16]
+        assert database.delete(CHUNKS, {"rec": key}) == 1
+        assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)
         recording.write(speech, text(b"after"), log_time=2)
         wait_for(lambda: recording.index_failure is not None)
@@ -858,23 +886,43 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     assert not store.verify().findings
 
 
-def test_the_end_of_a_recording_asks_for_none_of_its_chunks(
+def test_the_end_of_a_recording_asks_for_the_chunks_of_one_segment_at_a_time(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a day's recording they are more than the memory holds."""
+    handed: list[int] = []
+    made: list[tuple[int, int]] = []
+    real_chunks, real_stamps = IndexState.chunks, index.stamps_of
 
-    def asked(*_: object, **__: object) -> NoReturn:
-        raise AssertionError("the chunks of the whole recording")
+    def chunks(self: IndexState, key: str) -> Iterator[IndexedChunk]:
+        for chunk in real_chunks(self, key):
+            handed.append(chunk.segment)
+            yield chunk
 
-    recording = store.start("talk", flush_interval_s=0.05)
-    with monkeypatch.context() as patch:
-        patch.setattr(Catalog, "_chunks", asked)
-        speech = channel("/speech")
-        for number in range(1, 6):
-            recording.write(speech, text(b"word"), log_time=number)
-            wait_for(lambda n=number: (recording.stored[0], recording.lag) == (n, 0))
-        report = recording.close()
-    assert (report.entry.messages, report.entry.chunks) == (5, 5)
+    def stamps(table: Any, told: Any) -> Any:
+        made.append((len(told), len(handed)))
+        return real_stamps(table, told)
+
+    monkeypatch.setattr(IndexState, "chunks", chunks)
+    monkeypatch.setattr(index, "stamps_of", stamps)
+    settings = SegmentSettings(chunk_size=4000, segment_size=20_000)
+    recording = store.start("talk", flush_interval_s=0.05, settings=settings)
+    speech = channel("/speech")
+    for number in range(1, 31):
+        recording.write(speech, text(os.urandom(4000)), log_time=number)
+        wait_for(lambda n=number: (recording.stored[0], recording.lag) == (n, 0))
+    assert not handed
+    report = recording.close()
+    assert (report.entry.messages, report.entry.chunks) == (30, 30)
+    # One that only says how the recording ended has no messages.
+    assert len(report.entry.spans) == len(made) > 3
+    assert sum(count for count, _ in made) == 30
+    # The first of the next segment tells that one is whole.
+    done = 0
+    for count, seen in made:
+        done += count
+        assert count < 15
+        assert seen <= done + 1
     assert not store.verify().findings
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import struct
 import time
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -10,17 +13,19 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.live.door import visit
-from hybridlog.live.recorder import MARKS, Recorder, RecorderOptions
+from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import Held, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Trigger
 from hybridlog.losses import Cause
+from hybridlog.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import TEXT, Speaker, scan, scan_channel, text, text_channel
 from tests.test_faults import wait_for
 
 SECOND = 1_000_000_000
 T = 1_700_000_000 * SECOND
+PARTS_TEXT = b"Part[] part\n" + b"=" * 80 + b"\nMSG: test_msgs/Part\nuint8 v\n"
 LATCHED = Channel("/map", "ros1", TEXT, {"latching": "1"}, has_publish_time=False)
 
 
@@ -149,7 +154,13 @@ def test_a_ring_that_does_not_fit_says_so(store: hl.Store) -> None:
 
 @pytest.mark.parametrize(
     ("text", "error"),
-    [("", UsageError), (": x > 1", UsageError), ("re:(: x", TopicError), ("/a: x >", WhereError)],
+    [
+        ("", UsageError),
+        (": x > 1", UsageError),
+        ("re:(: x", TopicError),
+        ("/a: x >", WhereError),
+        ("/a: _meta.seq > 1", WhereError),
+    ],
 )
 def test_a_trigger_that_is_none(text: str, error: type[Exception]) -> None:
     with pytest.raises(error):
@@ -182,6 +193,30 @@ def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
     assert """'/scan: near == "x"' can never fire on /scan: """ in said
     assert "no topic fits the trigger '/nowhere: a == 1'" in said
     assert said.count("near > 1") == 1  # the snapshot itself
+
+
+PARTS = Schema("test_msgs/Parts", "ros1msg", PARTS_TEXT)
+
+
+@pytest.mark.parametrize(
+    ("channel", "spell"),
+    [
+        (Channel("/parts", "json", None), lambda n: json.dumps({"part": [{"v": 0}] * n}).encode()),
+        (Channel("/parts", "ros1", PARTS), lambda n: struct.pack("<I", n) + bytes(n)),
+    ],
+)
+def test_a_trigger_counts_the_elements_of_any_array(
+    store: hl.Store, channel: Channel, spell: Callable[[int], bytes]
+) -> None:
+    where = "part.n >= 2"
+    robot = Robot(store, SnapshotOptions(60, 60, 60, (Trigger.of(f"/parts: {where}"),)))
+    now = time.time_ns()
+    for second, count in enumerate([0, 1, 40, 2]):
+        robot.speaker.say(channel, spell(count), now + second * SECOND)
+        robot.recorder.look()
+        assert bool(robot.recorder._target._reasons) is (second >= 2)
+    robot.recorder.stop()
+    assert store.topic("/parts").where(where).count() == 2
 
 
 def test_fields_of_the_ring_can_be_watched(store: hl.Store) -> None:

@@ -1,0 +1,77 @@
+"""What only decoded messages tell, for a catalog that has lost it: found out again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from hybridlog.entries import take_inventory
+from hybridlog.indexing import ChunkIndexer
+from hybridlog.maintenance.opening import put_entry
+from hybridlog_storage.catalog import stamps_of
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
+    from hybridlog_storage.directory import StoreDirectory
+
+
+def decode_again(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    progress: Progress | None = None,
+) -> RecordingEntry:
+    """Decode all segments of which the catalog does not know what is in the messages.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording, which this process holds for writing.
+        progress: Called after each chunk.
+
+    Returns:
+        The recording's whole entry.
+
+    Raises:
+        SegmentError: A segment cannot be opened.
+    """
+    inventory = take_inventory(directory, entry.label)
+    found = _decoded(directory, catalog, entry, inventory, progress)
+    catalog.put_stamps(entry.id, found)
+    return put_entry(directory, catalog, entry.label)
+
+
+def _decoded(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    inventory: Inventory,
+    progress: Progress | None,
+) -> Iterator[tuple[int, str, NDArray[Any]]]:
+    indexer = ChunkIndexer(entry.id)
+    total = sum(summary.size for summary in inventory.summaries.values())
+    before = 0
+    for number, summary in inventory.summaries.items():
+        if catalog.stamps(entry, number, summary.table) is None:
+            told: dict[int, dict[int, ChannelStats]] = {}
+            path = directory.recording(entry.label) / inventory.listing.sealed[number]
+            with SegmentReader(path, number) as reader:
+                for place in summary.chunks:
+                    # Of one that cannot be read nobody knows more; who asks for it is told.
+                    with suppress(SegmentError):
+                        chunk = reader.read_chunk(place)
+                        _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
+                        told[place.number] = of_chunk.stats
+                    if progress is not None:
+                        progress(entry.label, before + place.offset + place.length, total)
+            yield number, summary.digest, stamps_of(summary.table, told)
+        before += summary.size

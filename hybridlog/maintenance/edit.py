@@ -1,0 +1,182 @@
+"""What people write about a recording that has ended: names, tags, notes and marks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from hybridlog.entries import (
+    recording_metadata,
+    sealed_event,
+    take_inventory,
+)
+from hybridlog.maintenance.opening import finish_renaming, put_entry
+from hybridlog.maintenance.report import being_written
+from hybridlog.marks import mark_channel, mark_payload
+from hybridlog_storage import files, journal
+from hybridlog_storage.chunk import pack
+from hybridlog_storage.chunk_builder import ChunkBuilder
+from hybridlog_storage.compression import Compressor
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_file import SegmentFile
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from hybridlog.entries import Inventory
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.chunk import PackedChunk
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.segment_file import Sealed
+
+
+def append(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    lines: Sequence[journal.Event],
+) -> None:
+    """Add lines to the journal of a recording; a new name gives its directory a new label.
+
+    Raises:
+        StoreError: It is being written, or has no journal that can be written.
+    """
+    with directory.writing(entry.label) as mine:
+        if not mine:
+            raise being_written(entry.label)
+        path = directory.recording(entry.label)
+        Journal(path).append(*[_with_labels(directory, entry.label, line) for line in lines])
+        put_entry(directory, catalog, finish_renaming(directory, entry.label, journal.read(path)))
+
+
+def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> journal.Event:
+    """A line; one that renames says which label the directory has, and which it is to get."""
+    if line["event"] != journal.RENAMED:
+        return line
+    new = directory.free_label(str(line["name"]), but=label)
+    return line if new == label else {**line, "from": label, "to": new}
+
+
+def mark(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    moment: int,
+    *,
+    text: str,
+    tags: Mapping[str, str],
+) -> None:
+    """Set a mark: a segment of one message, and a line of the journal.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording.
+        moment: Log time of the mark, ns.
+        text: What happened.
+        tags: Kept with it.
+
+    Raises:
+        StoreError: The recording is being written, or a segment of it cannot be read.
+    """
+    with directory.writing(entry.label) as mine:
+        if not mine:
+            raise StoreError(
+                f"Recording {entry.label!r} is being written. Mark it without --at, or wait "
+                "until it has ended."
+            )
+        path = directory.recording(entry.label)
+        inventory = take_inventory(directory, entry.label)
+        numbers = {*inventory.listing.sealed, *inventory.listing.open}
+        numbers.update(inventory.state.sealed if inventory.state is not None else ())
+        number = max(numbers, default=-1) + 1
+        channel, channel_id, schema_id = _channel(inventory)
+        payload = mark_payload(text, tags)
+        seq = _next_seq(directory, entry.label, inventory)
+        segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
+        marked = journal.event(
+            journal.MARKED, time=moment, text=text, tags=dict(tags), segment=number
+        )
+
+        def announce(sealed: Sealed) -> None:
+            # In this order: of a mark whose segment is not listed there is nothing.
+            Journal(path).append(marked, sealed_event(sealed))
+
+        try:
+            segment.define(channel_id, schema_id, channel)
+            segment.append_chunks([_chunk(channel_id, moment, payload, seq)], segment.position + 1)
+            segment.seal(sync=True, on_sealing=announce)
+        except BaseException:
+            segment.abandon()
+            _take_back(segment)
+            raise
+        put_entry(directory, catalog, entry.label)
+
+
+def _take_back(segment: SegmentFile) -> None:
+    """Remove a segment that came to nothing, unless the journal lists it.
+
+    What is not done here, or is listed, the next opening finishes.
+    """
+    with suppress(StoreError, OSError):
+        state = journal.read(segment.path.parent)
+        if state is not None and segment.number not in state.sealed:
+            files.unlink(segment.path)
+
+
+def _channel(inventory: Inventory) -> tuple[Channel, int, int]:
+    """The channel of marks, its id and its schema's: those of the recording, or new ones."""
+    wanted = mark_channel()
+    known: dict[int, Channel] = {}
+    schemas = 0
+    for summary in inventory.summaries.values():
+        known.update(summary.channels)
+        schemas = max([schemas, *summary.schema_ids.values()])
+        for channel_id, channel in summary.channels.items():
+            same = channel.topic == wanted.topic and channel.schema == wanted.schema
+            if same and channel.message_encoding == wanted.message_encoding:
+                return channel, channel_id, summary.schema_ids[channel_id]
+    return wanted, max(known, default=-1) + 1, schemas + 1
+
+
+def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> int:
+    """One more than the greatest arrival number of a recording.
+
+    Raises:
+        SegmentError: A segment cannot be read.
+    """
+    following = 0
+    for number, summary in sorted(inventory.summaries.items(), reverse=True):
+        if not summary.chunks:
+            continue
+        path = directory.recording(label) / inventory.listing.sealed[number]
+        with SegmentReader(path, number) as reader:
+            starts = summary.table.part_bounds()[:-1]
+            messages = np.add.reduceat(summary.table.parts["messages"], starts)
+            for place, count in zip(summary.chunks, messages.tolist(), strict=True):
+                following = max(following, int(reader.read_arrivals(place, count).max()) + 1)
+        if following >= int(cast(int, summary.recording.get("next_seq", 0))):
+            break
+    # Those of a lost segment are not given again: it may come back out of a copy.
+    return following + sum(sealed.messages for sealed in inventory.lost)
+
+
+def _chunk(channel_id: int, moment: int, payload: bytes, seq: int) -> PackedChunk:
+    """A chunk of one message."""
+    one = np.ones(1, np.int64)
+    batch = Batch(
+        payload,
+        np.zeros(1, np.int64),
+        one * len(payload),
+        np.full(1, channel_id, np.int32),
+        one * moment,
+        one * moment,
+        np.zeros(1, np.uint32),
+    )
+    builder = ChunkBuilder(1 << 10)
+    builder.append(batch, one * seq)
+    return pack(Compressor("none"), *builder.take())

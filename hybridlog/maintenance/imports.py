@@ -1,0 +1,187 @@
+"""Copying recordings in from another store: checked, and resumed after an interruption."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybridlog.entries import Inventory, take_inventory
+from hybridlog.maintenance.opening import clear_away
+from hybridlog_storage import durability, files, journal
+from hybridlog_storage.directory import IMPORTING
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.journal import JOURNAL, Journal
+from hybridlog_storage.segment_check import SegmentCheck
+
+if TYPE_CHECKING:
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.directory import StoreDirectory
+
+_PIECE = 8 << 20  # bytes copied at once
+
+
+@dataclass(slots=True)
+class ImportReport:
+    """What an import did.
+
+    Attributes:
+        imported: Labels here of the recordings that were copied.
+        known: Labels of those that were here already.
+        bytes_copied: Bytes copied now; what an interrupted import had copied is not among them.
+    """
+
+    imported: list[str] = field(default_factory=list)
+    known: list[str] = field(default_factory=list)
+    bytes_copied: int = 0
+
+
+def run(
+    source: StoreDirectory,
+    target: StoreDirectory,
+    entries: Iterable[RecordingEntry],
+    progress: Progress | None = None,
+) -> ImportReport:
+    """Copy recordings from one store into another.
+
+    Each is copied into a directory out of sight, every byte is checked there, and only then
+    it gets its name. Segments that an interrupted import has copied are checked, not copied
+    again.
+
+    Args:
+        source: The store to read.
+        target: The store to write.
+        entries: Recordings of `source`.
+        progress: Called with bytes copied and checked.
+
+    Raises:
+        StoreError: A recording is damaged, or being written; those before it are imported.
+        DiskFullError: There is no room; the import can be run again.
+    """
+    target.check_writable()
+    report = ImportReport()
+    present = _present(target)
+    for entry in entries:
+        if entry.id in present:
+            report.known.append(present[entry.id])
+            continue
+        if entry.status == "open":
+            raise StoreError(
+                f"Recording {entry.label!r} of {source.path} is being written. Import it when "
+                "it has ended."
+            )
+        if entry.status == "unfinished":
+            raise StoreError(
+                f"Recording {entry.label!r} of {source.path} was cut short by a crash. Open that "
+                "store once with the right to write, so that it is recovered, and import it then."
+            )
+        report.imported.append(_import_one(source, target, entry, report, progress))
+    return report
+
+
+def _present(directory: StoreDirectory) -> dict[str, str]:
+    """Labels of the recordings of a store, by id."""
+    found = {}
+    for label in directory.labels():
+        try:
+            found[take_inventory(directory, label).id] = label
+        except StoreError:
+            continue
+    return found
+
+
+def _import_one(
+    source: StoreDirectory,
+    target: StoreDirectory,
+    entry: RecordingEntry,
+    report: ImportReport,
+    progress: Progress | None,
+) -> str:
+    inventory = take_inventory(source, entry.label)
+    if inventory.misfits or not inventory.is_proven:
+        raise StoreError(
+            f"Recording {entry.label!r} of {source.path} is not whole: "
+            f"`hybridlog verify --store {source.path} {entry.label}` says what is wrong. "
+            "Nothing of it was imported."
+        )
+    hidden = f"{IMPORTING}{entry.id}"
+    path = target.recording(hidden)
+    try:
+        files.make_folder(path, depth=files.IN_FOLDER)
+    except FileExistsError:
+        pass  # an import was interrupted
+    except OSError as error:
+        raise durability.explain(error, path, "importing into") from error
+    with target.writing(hidden) as mine:
+        if not mine:
+            raise StoreError(f"Another process imports {entry.label!r} at this moment.")
+        clear_away(target, hidden)
+        _copy_segments(source, path, inventory, report, progress)
+        data = files.read_file(source.recording(entry.label) / JOURNAL, journal.MAX_JOURNAL)
+        whole = data[: data.rfind(b"\n") + 1]
+        durability.write_new(path / JOURNAL, whole, depth=files.IN_RECORDING)
+        Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))
+        with target.alone():
+            label = target.free_label(entry.label)
+            target.move(hidden, label)
+    return label
+
+
+def _copy_segments(
+    source: StoreDirectory,
+    path: Path,
+    inventory: Inventory,
+    report: ImportReport,
+    progress: Progress | None,
+) -> None:
+    total = sum(summary.size for summary in inventory.summaries.values())
+    done = 0
+    for number, summary in inventory.summaries.items():
+        name = inventory.listing.sealed[number]
+        if not _is_there(path / name, summary.digest, summary.size):
+            _copy(source.recording(inventory.label) / name, path / name)
+            report.bytes_copied += summary.size
+            if not _is_there(path / name, summary.digest, summary.size):
+                raise StoreError(
+                    f"{source.recording(inventory.label) / name} is damaged: what was copied "
+                    "does not fit its checksums. `hybridlog verify` says where."
+                )
+        done += summary.size
+        if progress is not None:
+            progress(inventory.label, done, total)
+
+
+def _is_there(path: Path, digest: str, size: int) -> bool:
+    """Whether a copy is whole, byte for byte."""
+    try:
+        with SegmentCheck(path) as check:
+            if check.summary is None or (check.summary.digest, check.summary.size) != (
+                digest,
+                size,
+            ):
+                return False
+            return not any(True for _ in check.problems())
+    except SegmentError:
+        return False
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file; it gets its name only whole and on the disk.
+
+    Raises:
+        StoreError: The source cannot be read.
+        DiskFullError: There is no room.
+    """
+    try:
+        fd = files.open_file(source, os.O_RDONLY | os.O_NONBLOCK)
+    except OSError as error:
+        raise durability.explain(error, source, "reading") from error
+    try:
+        with durability.new_file(target, depth=files.IN_RECORDING) as out:
+            while piece := os.read(fd, _PIECE):
+                durability.write_all(out, [piece])
+    finally:
+        os.close(fd)

@@ -1,0 +1,476 @@
+"""What happens when a store is opened: crashes are recovered, the catalog is brought up to date.
+
+No server is asked. A recording whose files look as they did when its catalog row was made
+is believed without opening them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.entries import (
+    describe,
+    journal_from_segments,
+    sealed_event,
+    take_inventory,
+)
+from hybridlog.indexing import ChunkIndexer
+from hybridlog_storage import durability, files, journal
+from hybridlog_storage.catalog import Catalog
+from hybridlog_storage.directory import LOCK, REMOVED
+from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.recovery import recover_segment
+from hybridlog_storage.segment_file import sealed_name
+
+if TYPE_CHECKING:
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import RepairReport
+    from hybridlog_storage.catalog import Described, RecordingEntry
+    from hybridlog_storage.directory import Listing, StoreDirectory
+    from hybridlog_storage.journal import JournalState
+    from hybridlog_storage.recovery import Recovered
+    from hybridlog_storage.segment_file import Sealed
+
+_OURS = frozenset({LOCK, "fields.columns", "fields.columns.part"})
+"""Names in a recording's directory that hold nothing that could be lost."""
+_LEFT_OVER = re.compile(
+    r"\.(journal(\.old)?|\d{6}\.mcap)\.([0-9a-f]{16}|rebuilt)|fields\.columns\.part"
+)
+"""Names of files that were being written, and were to get another name when they were whole."""
+_MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
+_TRIES = 10
+
+
+def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catalog:
+    """The catalog of a store; one in memory where the store cannot be written.
+
+    Args:
+        directory: The store.
+        in_memory: Because its disk is full.
+    """
+    store_id = directory.settings.store_id
+    if in_memory or not directory.is_writable:
+        return Catalog(None, store_id)
+    try:
+        return Catalog(directory.path, store_id)
+    except DiskFullError:
+        return Catalog(None, store_id)
+
+
+def repair_on_open(
+    directory: StoreDirectory, catalog: Catalog, report: RepairReport
+) -> list[RecordingEntry]:
+    """Bring files and catalog in order; returns all recordings, oldest log time first.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        report: Gets what was found and mended.
+    """
+    try:
+        return _repair_on_open(directory, catalog, report)
+    except CatalogError:
+        catalog.rebuild()
+        return _repair_on_open(directory, catalog, report)
+
+
+def _repair_on_open(
+    directory: StoreDirectory, catalog: Catalog, report: RepairReport
+) -> list[RecordingEntry]:
+    if not catalog.is_in_memory:
+        for name in directory.hidden(REMOVED):
+            directory.sweep(name)
+    known = {entry.label: (looks, entry) for looks, entry in catalog.recordings().values()}
+    for _ in range(_TRIES):
+        labels = directory.labels()
+        report.unreadable.clear()
+        found = _find(directory, catalog, labels, known, report)
+        # One that got another name meanwhile must not be missed.
+        if directory.labels() == labels:
+            break
+    report.copies.clear()
+    entries = [_one_of(directory, copies, known, report) for copies in found.values()]
+    for recording, (_, entry) in catalog.recordings().items():
+        # What is known of one that cannot be read now may fit again later.
+        if recording not in found and entry.label not in report.unreadable:
+            catalog.remove(recording)
+    for entry in entries:
+        if len(found[entry.id]) > 1:  # the row may be the copy's
+            put_entry(directory, catalog, entry.label)
+    return in_order(entries)
+
+
+def _find(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    labels: Iterable[str],
+    known: Mapping[str, tuple[str, RecordingEntry]],
+    report: RepairReport,
+) -> dict[str, list[RecordingEntry]]:
+    """By id: entries of the recordings with these labels, which are recovered first."""
+    found: dict[str, list[RecordingEntry]] = {}
+    for label in labels:
+        looks, kept = known.get(label, ("", None))
+        try:
+            listing = directory.listing(label)
+            entry = kept
+            if kept is None or not _is_current(directory, kept, looks, listing):
+                entry = _refresh(directory, catalog, label, report)
+        except DiskFullError:
+            raise
+        except StoreError as error:
+            if directory.has(label):  # another process may have removed or renamed it
+                report.unreadable[label] = str(error)
+            continue
+        if entry is not None:
+            found.setdefault(entry.id, []).append(entry)
+    return found
+
+
+def in_order(entries: list[RecordingEntry]) -> list[RecordingEntry]:
+    """Recordings, oldest log time first, empty ones last."""
+    return sorted(entries, key=lambda r: (r.span is None, r.span or (0, 0), r.label))
+
+
+def _is_current(
+    directory: StoreDirectory, entry: RecordingEntry, looks: str, listing: Listing
+) -> bool:
+    """Whether a catalog row still fits the files."""
+    if looks != listing.print:
+        return False
+    if listing.open or entry.status == "open" or any(map(is_left_over, listing.others)):
+        return directory.is_held(entry.label)
+    return True
+
+
+def _refresh(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    label: str,
+    report: RepairReport,
+) -> RecordingEntry | None:
+    """Recover a recording if a crash left it, and put it into the catalog; None if it is gone."""
+    may_write = not catalog.is_in_memory
+    listing = directory.listing(label)
+    is_empty = not (listing.journal or listing.sealed or listing.open)
+    if is_empty and not _OURS.issuperset(listing.others):
+        raise StoreError("it has neither a journal nor a segment, but other files")
+    if is_empty and (not may_write or directory.is_beginning(label)):
+        return None
+    if not may_write:
+        return put_entry(directory, catalog, label, is_open=directory.is_held(label))
+    with directory.writing(label) as mine:
+        if not mine and not _has_begun(directory, label):
+            return None  # somebody is about to begin
+        now = recover(directory, label, report) if mine else label
+        return put_entry(directory, catalog, now, is_open=not mine) if now else None
+
+
+def _has_begun(directory: StoreDirectory, label: str) -> bool:
+    """Whether something says what recording it is: the first line of its journal, or a segment."""
+    listing = directory.listing(label)
+    if listing.sealed or listing.open:
+        return True
+    state = journal.read(directory.recording(label)) if listing.journal else None
+    return state is not None and bool(state.id)
+
+
+def _one_of(
+    directory: StoreDirectory,
+    copies: list[RecordingEntry],
+    known: Mapping[str, tuple[str, RecordingEntry]],
+    report: RepairReport,
+) -> RecordingEntry:
+    """The one of several directories with the same recording that answers.
+
+    The one that is most whole; of equals the one that the catalog knew, then the one whose
+    journal is older.
+    """
+    if len(copies) == 1:
+        return copies[0]
+    whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
+
+    def rank(entry: RecordingEntry) -> tuple[int, int, bool, int, str]:
+        place = whole.index(entry.status) if entry.status in whole else 0
+        was_known = entry.label in known and known[entry.label][1].id == entry.id
+        try:
+            path = directory.recording(entry.label) / journal.JOURNAL
+            written = files.status(path).st_ctime_ns
+        except OSError:
+            written = time.time_ns()
+        return -entry.messages, place, not was_known, written, entry.label
+
+    chosen, *others = sorted(copies, key=rank)
+    for other in others:
+        report.copies[other.label] = chosen.label
+    return chosen
+
+
+def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
+    """Finish what a crash left of a recording that this process holds.
+
+    Returns:
+        Its label, which a renaming that was interrupted may change; empty when it is gone.
+
+    Raises:
+        StoreError: It cannot be written, or its journal cannot be read.
+        DiskFullError: There is no room; nothing is lost.
+    """
+    path = directory.recording(label)
+    clear_away(directory, label)
+    listing = directory.listing(label)
+    state = journal.read(path) if listing.journal else None
+    if state is not None and state.removing:
+        remove_files(directory, label)
+        report.removed.append(label)
+        return ""
+    if state is not None and state.torn:
+        Journal(path).append()
+    recovered = _recover_segments(directory, label, listing, state)
+    inventory = take_inventory(directory, label)
+    is_empty = not inventory.summaries and not (state is not None and state.sealed)
+    if is_empty and not inventory.listing.sealed and (state is None or state.end is None):
+        announce_removal(directory, label)
+        remove_files(directory, label)
+        report.recovered[label] = recovered
+        return ""
+    if recovered:
+        report.recovered[label] = recovered
+    lines: list[journal.Event] = []
+    if inventory.state is None:
+        reason = "it was not there"
+        events = journal_from_segments(inventory, directory.settings.store_id, reason)
+        Journal(path).replace(events)
+        report.journals.append(label)
+        inventory = take_inventory(directory, label)
+    state = inventory.state
+    if state is not None and state.end is None:
+        lines.append(journal.event(journal.ENDED, end=_end_of(inventory)))
+    if state is not None and state.store and state.store != directory.settings.store_id:
+        lines.append(journal.event(journal.ADOPTED, store=directory.settings.store_id))
+        report.adopted.append(label)
+    if lines:
+        Journal(path).append(*lines)
+    return finish_renaming(directory, label, state)
+
+
+def is_left_over(name: str) -> bool:
+    """Whether a file in a recording's directory is what an interruption has left of a step."""
+    return bool(_LEFT_OVER.fullmatch(name) or _MOVING.fullmatch(name))
+
+
+def clear_away(directory: StoreDirectory, label: str) -> None:
+    """Remove files that never got their name, and give segments theirs that were to get it."""
+    finish_moves(directory, label)
+    path = directory.recording(label)
+    for name in directory.listing(label).others:
+        if _LEFT_OVER.fullmatch(name):
+            try:
+                files.unlink(path / name)
+            except OSError as error:
+                raise durability.explain(error, path / name, "removing") from error
+
+
+def moving_name(name: str, number: int) -> str:
+    """Name of a segment on its way to the name that it should have."""
+    return f"{name}.moving-{number:06d}"
+
+
+def finish_moves(
+    directory: StoreDirectory, label: str, *, replace: bool = False
+) -> list[tuple[str, str]]:
+    """Give segments that are on the way to another name that name.
+
+    Args:
+        directory: The store.
+        label: The recording, which this process holds.
+        replace: Keep a file that has the name already as `.damaged`: it is nothing that the
+            journal lists. Without, it may be on its way itself, and stays.
+
+    Returns:
+        The name that each had before, and the one that it has now.
+    """
+    path = directory.recording(label)
+    done = []
+    try:
+        for name in directory.listing(label).others:
+            moving = _MOVING.fullmatch(name)
+            if moving is None:
+                continue
+            final = path / sealed_name(int(moving["number"]))
+            if final.name in directory.listing(label).sealed.values():
+                if not replace:
+                    continue
+                files.rename(final, path / _free_name(directory, label, f"{final.name}.damaged"))
+            files.rename(path / name, final)
+            done.append((moving["before"], final.name))
+        if done:
+            files.sync_folder(path)
+    except OSError as error:
+        raise durability.explain(error, path, "renaming segments of") from error
+    return done
+
+
+def _free_name(directory: StoreDirectory, label: str, name: str) -> str:
+    """A name that no file has: this one, or one with a number before its last part."""
+    taken = set(directory.listing(label).others)
+    stem, _, last = name.rpartition(".")
+    return next(
+        n for n in (name, *(f"{stem}.{i}.{last}" for i in range(2, 1 << 20))) if n not in taken
+    )
+
+
+def finish_renaming(directory: StoreDirectory, label: str, state: JournalState | None) -> str:
+    """Give a directory the label that its journal announces; returns its label now.
+
+    Whoever has moved it elsewhere meanwhile has had the last word.
+    """
+    if state is None or state.moving is None:
+        return label
+    before, after = state.moving
+    if label == before and after in directory.labels():
+        after = directory.free_label(state.name, but=label)
+    if label == before and label != after:
+        directory.move(label, after)
+        label = after
+    Journal(directory.recording(label)).append(journal.event(journal.RENAMED, name=state.name))
+    return label
+
+
+def _recover_segments(
+    directory: StoreDirectory, label: str, listing: Listing, state: JournalState | None
+) -> list[Recovered]:
+    path = directory.recording(label)
+    log = Journal(path)
+    said = None
+    if state is not None and state.begun:
+        said = {key: state.begun[key] for key in ("id", "name", "tags", "source", "created")}
+
+    def announce(sealed: Sealed) -> None:
+        known = journal.read(path)
+        listed = known.sealed.get(sealed.segment) if known is not None else None
+        if known is not None and (listed is None or listed.digest != sealed.digest):
+            log.append(sealed_event(sealed))
+
+    recovered = []
+    for number, name in listing.open.items():
+        if (
+            state is not None
+            and state.is_proof
+            and state.end is not None
+            and number not in state.sealed
+        ):
+            # A mark that was to be added to a recording that had ended.
+            try:
+                files.unlink(path / name)
+            except OSError as error:
+                raise durability.explain(error, path / name, "removing") from error
+        else:
+            recovered.append(recover_segment(path / name, announce, recording=said))
+    return recovered
+
+
+def _end_of(inventory: Inventory) -> dict[str, Any]:
+    """How a recording ended whose journal does not say it."""
+    return dict(inventory.end or {"status": "recovered", "cut_bytes": 0, "damage": []})
+
+
+def announce_removal(directory: StoreDirectory, label: str) -> None:
+    """Write into the journal that a recording is about to be removed.
+
+    On a full disk there may be no room for that; then the directory's new name says it.
+    """
+    path = directory.recording(label)
+    if directory.listing(label).journal:
+        with suppress(DiskFullError):
+            Journal(path).append(journal.event(journal.REMOVING, by=os.getpid()))
+
+
+def remove_files(directory: StoreDirectory, label: str) -> None:
+    """Delete the files of a recording: first out of sight, then from the disk."""
+    directory.sweep(directory.hide(label))
+
+
+def put_entry(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+) -> RecordingEntry:
+    """Describe a recording as its files are now, and put it into the catalog.
+
+    Raises:
+        SegmentError: Nothing says what recording it is.
+    """
+    try:
+        return _put_entry(directory, catalog, label, is_open=is_open)
+    except CatalogError:
+        catalog.rebuild()
+        return _put_entry(directory, catalog, label, is_open=is_open)
+
+
+def _put_entry(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool
+) -> RecordingEntry:
+    described = describe_now(directory, catalog, label, is_open=is_open)
+    if directory.is_writable or catalog.is_in_memory:
+        catalog.put(described)
+    return described.entry
+
+
+def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
+    """Give a recording back what the catalog has lost of it.
+
+    Raises:
+        StoreError: Its files cannot be read any more, or differ from what is known of them.
+    """
+    catalog.mend()
+    for _ in range(2):
+        put_entry(directory, catalog, entry.label, is_open=directory.is_held(entry.label))
+        try:
+            for number, _, _ in entry.spans:
+                catalog.table(entry, number)
+        except CatalogError:
+            catalog.rebuild()
+        else:
+            return
+    raise StoreError(
+        f"The files of recording {entry.label!r} have changed since the store was opened. "
+        "Open it again."
+    )
+
+
+def describe_now(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+) -> Described:
+    """A recording as its files are now.
+
+    Raises:
+        SegmentError: Nothing says what recording it is.
+    """
+    return describe_inventory(catalog, take_inventory(directory, label), is_open=is_open)
+
+
+def describe_inventory(
+    catalog: Catalog, inventory: Inventory, *, is_open: bool = False
+) -> Described:
+    """A recording as an inventory has it.
+
+    Raises:
+        SegmentError: Nothing says what recording it is.
+    """
+    if not inventory.id:
+        raise SegmentError(
+            f"Recording {inventory.label!r} has neither a journal nor a segment that can be "
+            "read. Restore the files, or remove the directory."
+        )
+    return describe(
+        inventory,
+        is_open=is_open,
+        reason=ChunkIndexer(inventory.id).reason,
+        stamps=catalog.stamps,
+        damage=catalog.damage(inventory.id),
+    )

@@ -1,0 +1,70 @@
+"""Removing recordings, so that an interruption at any step is finished later."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hybridlog.maintenance.opening import announce_removal
+from hybridlog.maintenance.report import being_written
+from hybridlog_storage.index_state import IndexState
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+
+
+def remove(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database | None,
+    entry: RecordingEntry,
+) -> None:
+    """Delete a recording.
+
+    The journal says so first. Then the directory goes out of sight, and from then on the
+    recording is gone: whatever is left of it, the next opening removes.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        database: The index; None if it is unavailable: the next connection clears it.
+        entry: The recording.
+
+    Raises:
+        StoreError: It is being written, or cannot be removed.
+        DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
+    """
+    with directory.writing(entry.label) as mine:
+        if not mine:
+            raise being_written(entry.label)
+        announce_removal(directory, entry.label)
+        hidden = directory.hide(entry.label)
+        try:
+            catalog.remove(entry.id)
+            if database is not None:
+                _clear(IndexState(database), entry)
+        finally:
+            # On a full disk it is the room of these files that all else waits for.
+            directory.sweep(hidden)
+
+
+def _clear(state: IndexState, entry: RecordingEntry) -> None:
+    """Remove a recording from the index."""
+    (indexed,) = state.of([entry.key]).values() or (None,)
+    if indexed is not None:
+        state.put(entry, "removing", turn=indexed.turn + 1)
+    state.clear(entry.key, state.topic_collections())
+    state.remove(entry.key)
+
+
+def remove_copy(directory: StoreDirectory, label: str) -> None:
+    """Delete a directory that is a copy of another one's recording; the index stays.
+
+    Raises:
+        StoreError: It is being written, or cannot be removed.
+    """
+    with directory.writing(label) as mine:
+        if not mine:
+            raise being_written(label)
+        directory.sweep(directory.hide(label))

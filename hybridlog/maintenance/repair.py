@@ -1,0 +1,211 @@
+"""Cures that lose nothing: what can be proven is put right, all else is left and told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hybridlog.columns.stored import NAME as COLUMNS
+from hybridlog.columns.stored import FieldColumns
+from hybridlog.entries import journal_from_segments, sealed_line, take_inventory
+from hybridlog.maintenance.index import catch_up, reindex
+from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
+from hybridlog_storage import durability, files, journal
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.recovery import rebuild_summary
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hybridlog.entries import Inventory, Misfit
+    from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """Something that was put right, or could not be.
+
+    Attributes:
+        recording: Label of the recording.
+        place: File, or what else it is about.
+        done: What was done, or what is left to do.
+        is_cured: Whether it is right now.
+    """
+
+    recording: str
+    place: str
+    done: str
+    is_cured: bool = True
+
+
+def repair(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    repairs: RepairReport,
+    labels: Iterable[str] | None,
+) -> list[Repaired]:
+    """Put files, journals and the catalog right.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        repairs: What was found when the store was opened.
+        labels: Which recordings; None for all.
+
+    Raises:
+        StoreError: The store cannot be written.
+    """
+    directory.check_writable()
+    done = [Repaired(label, "journal", "written again") for label in repairs.journals]
+    if not catalog.is_sound():
+        catalog.rebuild()
+        done.append(Repaired("", "catalog", "made again"))
+        labels = None  # it has lost all others, too
+    for label in directory.labels() if labels is None else labels:
+        if label in repairs.copies:
+            original = repairs.copies[label]
+            what = f"it is a copy of {original}; remove one: `hybridlog rm {label}`"
+            done.append(Repaired(label, "recording", what, is_cured=False))
+            continue
+        try:
+            with directory.writing(label) as mine:
+                if mine:
+                    done += _repair_one(directory, catalog, label)
+        except StoreError as error:
+            done.append(Repaired(label, "recording", str(error), is_cured=False))
+    return done
+
+
+def _repair_one(directory: StoreDirectory, catalog: Catalog, label: str) -> list[Repaired]:
+    done = _put_segments_right(directory, label)
+    done += _put_journal_right(directory, label)
+    inventory = take_inventory(directory, label)
+    for misfit in inventory.misfits:
+        what = f"{misfit.reason}; restore it from a copy, if there is one"
+        place = misfit.file or f"segment {misfit.segment}"
+        done.append(Repaired(label, place, what, is_cured=False))
+    entry = put_entry(directory, catalog, label)
+    if entry.status == "damaged":
+        return done  # columns of what is lost fit again when that is restored
+    with suppress(FileNotFoundError):
+        try:
+            FieldColumns(directory.recording(label)).check(entry)
+        except StoreError:
+            files.unlink(directory.recording(label) / COLUMNS)
+            done.append(Repaired(label, "columns", "removed; the index answers instead"))
+    return done
+
+
+def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:
+    """Give segments their own names again, and damaged summaries their bytes."""
+    path = directory.recording(label)
+    inventory = take_inventory(directory, label)
+    done = [
+        Repaired(label, misfit.file, "its summary was made again")
+        for misfit in inventory.misfits
+        if misfit.file and _rebuild(inventory, misfit, path)
+    ]
+    inventory = take_inventory(directory, label)
+    moved = [m for m in inventory.misfits if m.belongs is not None]
+    wanted = {m.belongs for m in moved if m.belongs not in inventory.summaries}
+    try:
+        for misfit in moved:
+            if misfit.belongs is not None and misfit.belongs in wanted:
+                wanted.discard(misfit.belongs)
+                # Out of the way first: two that were exchanged want each other's name. From
+                # here on the name says what is to be done, if this is interrupted.
+                files.rename(path / misfit.file, path / moving_name(misfit.file, misfit.belongs))
+    except OSError as error:
+        raise durability.explain(error, path, "renaming segments of") from error
+    return done + [
+        Repaired(label, before, f"is {now} again")
+        for before, now in finish_moves(directory, label, replace=True)
+    ]
+
+
+def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
+    """Make a damaged summary again, if what comes out is what the journal lists."""
+    sealed = inventory.state.sealed.get(misfit.segment) if inventory.state is not None else None
+    if sealed is None or misfit.belongs is not None:
+        return False
+    return rebuild_summary(path / misfit.file, sealed.digest)
+
+
+def _put_journal_right(directory: StoreDirectory, label: str) -> list[Repaired]:
+    path = directory.recording(label)
+    inventory = take_inventory(directory, label)
+    state = inventory.state
+    if state is None:
+        return []
+    log = Journal(path)
+    if state.damaged:
+        reason = f"{len(state.damaged)} of its lines could not be read"
+        log.replace(journal_from_segments(inventory, directory.settings.store_id, reason))
+        return [Repaired(label, "journal", "written again; the old one is journal.old")]
+    done = []
+    if state.torn:
+        log.append()
+        done.append(Repaired(label, "journal", f"{state.torn} bytes behind its last line cut off"))
+    unlisted = [m for m in inventory.misfits if m.is_unlisted]
+    if unlisted:
+        # It may have listed others that are gone: nobody can prove now that it has not.
+        reason = f"it did not list {', '.join(misfit.file for misfit in unlisted)}"
+        log.append(
+            journal.event(journal.REBUILT, reason=reason),
+            *[sealed_line(inventory, misfit.segment) for misfit in unlisted],
+        )
+        done += [Repaired(label, misfit.file, "listed in the journal") for misfit in unlisted]
+    return done
+
+
+def repair_index(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database,
+    entries: Iterable[RecordingEntry],
+    *,
+    labels: Iterable[str] | None,
+    progress: Progress | None = None,
+) -> list[Repaired]:
+    """Index what is not in the index whole.
+
+    Raises:
+        DatabaseError: MongoDB fails.
+    """
+    state = IndexState(database)
+    known = state.of()
+    wanted = None if labels is None else set(labels)
+    done = []
+    for entry in entries:
+        indexed = known.get(entry.key)
+        if (wanted is not None and entry.label not in wanted) or entry.status == "open":
+            continue
+        if _is_restored(directory, catalog, entry):
+            if not reindex(directory, catalog, database, [entry.label], progress):
+                done.append(Repaired(entry.label, "index", "chunks that were damaged are right"))
+            continue
+        if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
+            continue
+        with directory.writing(entry.label) as mine:
+            if mine:
+                chunks = catch_up(directory, catalog, database, entry.label, progress)
+                done.append(Repaired(entry.label, "index", f"{chunks} chunks indexed"))
+    return done
+
+
+def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
+    """Whether a chunk that could not be read can be read now: its file came from a copy."""
+    for number, chunk in catalog.damage(entry.id):
+        path = directory.recording(entry.label) / f"{number:06d}.mcap"
+        with suppress(SegmentError), SegmentReader(path, number) as reader:
+            reader.read_chunk(reader.summary().chunks[chunk])
+            return True
+    return False

@@ -1,0 +1,45 @@
+"""What the opening of a store found and mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hybridlog_storage.errors import DiskFullError, StoreError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.recovery import Recovered
+
+Progress = Callable[[str, int, int], None]
+"""Called with the recording's label, bytes done and bytes in all."""
+
+
+@dataclass(slots=True)
+class RepairReport:
+    """What the opening of a store had to mend; all by label.
+
+    Attributes:
+        recovered: Segments that a crash had left open.
+        indexed: Recordings whose index was behind, and by how many chunks.
+        removed: Recordings whose removal was finished, or that have no files any more.
+        journals: Recordings whose journal was written again.
+        adopted: Recordings that came from another store.
+        copies: Copies of a recording, and the label of the one that answers.
+        unreadable: Recordings that could not be mended, and why; the others are.
+        disk_full: Why nothing could be mended: there was no room.
+    """
+
+    recovered: dict[str, list[Recovered]] = field(default_factory=dict)
+    indexed: dict[str, int] = field(default_factory=dict)
+    removed: list[str] = field(default_factory=list)
+    journals: list[str] = field(default_factory=list)
+    adopted: list[str] = field(default_factory=list)
+    copies: dict[str, str] = field(default_factory=dict)
+    unreadable: dict[str, str] = field(default_factory=dict)
+    disk_full: DiskFullError | None = None
+
+
+def being_written(label: str) -> StoreError:
+    """The error for a recording that another process holds."""
+    return StoreError(f"Recording {label!r} is being written. Wait until it is done, or stop it.")

@@ -1,0 +1,331 @@
+"""Reading everything, and holding what was made from the segments against them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hybridlog.columns.stored import FieldColumns
+from hybridlog.entries import take_inventory
+from hybridlog.indexing import ChunkIndexer, Documents
+from hybridlog.maintenance.opening import describe_inventory
+from hybridlog_storage.directory import LOCK
+from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
+from hybridlog_storage.index_documents import key_bound, recording_key
+from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.segment_check import SegmentCheck
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segment_reader import ChunkPlace
+
+_REPAIR = "run `hybridlog repair`"
+_RESTORE = "restore the file from a copy; what it held is in `hybridlog losses`"
+_KNOWN = frozenset({LOCK, "fields.columns", "fields.columns.part", "journal.old"})
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is off.
+
+    Attributes:
+        recording: Label of the recording; empty for the store itself.
+        place: File and byte, or what else it is about.
+        problem: What is wrong.
+        cure: What to do.
+    """
+
+    recording: str
+    place: str
+    problem: str
+    cure: str
+
+
+@dataclass(slots=True)
+class Verification:
+    """What `verify` has read, and found.
+
+    Attributes:
+        recordings: Recordings looked at.
+        chunks: Chunks read.
+        messages: Messages in them.
+        bytes_read: Bytes read from segments and journals.
+        findings: All that is off.
+        index: Whether the index was compared, too; MongoDB may be unavailable.
+    """
+
+    recordings: int = 0
+    chunks: int = 0
+    messages: int = 0
+    bytes_read: int = 0
+    findings: list[Finding] = field(default_factory=list)
+    index: bool = True
+
+
+def verify(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database | None,
+    repairs: RepairReport,
+    *,
+    labels: Iterable[str] | None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Check every byte of segments, journals and columns, and compare the index with them.
+
+    The documents of each chunk are made again and compared with those in the database, so
+    that each reference is seen to name the message it was made for.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        database: The index; None to leave it out.
+        repairs: What was found when the store was opened.
+        labels: Which recordings; None for all.
+        progress: Called after each part of a segment.
+    """
+    result = Verification(index=database is not None)
+    if not catalog.is_sound():
+        result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
+    for label in directory.labels() if labels is None else labels:
+        result.recordings += 1
+        try:
+            _Check(directory, catalog, database, label, result).run(repairs, progress)
+        except StoreError as error:
+            cure = "restore its files, or remove its directory"
+            result.findings.append(Finding(label, "recording", str(error), cure))
+    return result
+
+
+class _Check:
+    """Checks one recording."""
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        database: Database | None,
+        label: str,
+        result: Verification,
+    ) -> None:
+        self._directory = directory
+        self._catalog = catalog
+        self._database = database
+        self._label = label
+        self._result = result
+        self._path = directory.recording(label)
+        self._expected: dict[str, int] = {}
+        self._indexer = ChunkIndexer("")
+        self._is_damaged = False
+        self._has_index = False
+
+    def found(self, place: str, problem: str, cure: str) -> None:
+        """Note something that is off."""
+        self._result.findings.append(Finding(self._label, place, problem, cure))
+
+    def run(self, repairs: RepairReport, progress: Progress | None) -> None:
+        """Look at everything.
+
+        Raises:
+            StoreError: The recording cannot be read at all.
+        """
+        if self._label in repairs.copies:
+            cure = f"remove one of them: `hybridlog rm {self._label}`"
+            self.found(
+                "recording",
+                f"it is a copy of {repairs.copies[self._label]}, which answers",
+                cure,
+            )
+        is_held = self._directory.is_held(self._label)
+        self._has_index = not is_held and self._label not in repairs.copies
+        inventory = take_inventory(self._directory, self._label)
+        self._indexer = ChunkIndexer(inventory.id)
+        self._journal(inventory)
+        self._files(inventory, is_held=is_held)
+        total = sum(summary.size for summary in inventory.summaries.values())
+        before = 0
+        for number, name in inventory.listing.sealed.items():
+
+            def tell(at: int, before: int = before) -> None:
+                if progress is not None and total:
+                    progress(self._label, min(before + at, total), total)
+
+            self._segment(inventory, number, name, tell)
+            before += inventory.summaries[number].size if number in inventory.summaries else 0
+        if self._label in repairs.copies or not inventory.id:
+            return
+        entry = describe_inventory(self._catalog, inventory, is_open=is_held).entry
+        self._row(entry)
+        if entry.status == "open":
+            return
+        self._index(entry)
+        self._columns(entry)
+
+    def _journal(self, inventory: Inventory) -> None:
+        state = inventory.state
+        if state is None:
+            self.found("journal", "it is missing, so nobody can say what else is", _REPAIR)
+            return
+        self._result.bytes_read += state.length + state.torn
+        for number in state.damaged:
+            where = f"journal line {number}" if number else "journal"
+            problem = "it cannot be read" if number else "its first line is not the beginning"
+            self.found(where, problem, _REPAIR)
+        if state.torn:
+            self.found("journal", f"{state.torn} bytes behind its last line", _REPAIR)
+        if state.rebuilt is not None:
+            self.found(
+                "journal",
+                f"it was written again from the segments ({state.rebuilt}), so nobody can say "
+                "whether one was missing",
+                "compare with a copy, if there is one; nothing else can prove it",
+            )
+
+    def _files(self, inventory: Inventory, *, is_held: bool) -> None:
+        for misfit in inventory.misfits:
+            place = misfit.file or f"segment {misfit.segment}"
+            can_mend = misfit.is_unlisted or misfit.belongs is not None
+            self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE)
+        for name in inventory.listing.open.values():
+            if not is_held:
+                self.found(name, "a crash has left it open", "open the store to write")
+        for name in inventory.listing.others:
+            if name not in _KNOWN and not name.endswith(".damaged"):
+                self.found(name, "it is no file of a recording", "move it out of the store")
+
+    def _segment(
+        self,
+        inventory: Inventory,
+        number: int,
+        name: str,
+        tell: Callable[[int], None],
+    ) -> None:
+        """Every byte of a segment, and every chunk as a reader reads it."""
+        summary = inventory.summaries.get(number)
+        try:
+            with SegmentCheck(self._path / name) as check:
+                for offset, problem in check.problems(tell):
+                    self._is_damaged = True
+                    cure = _RESTORE if check.summary is not None else _REPAIR
+                    self.found(f"{name} byte {offset}", problem, cure)
+            if summary is None:
+                return
+            with SegmentReader(self._path / name, number) as reader:
+                for place in summary.chunks:
+                    self._chunk(reader, place, summary.channels, name)
+                self._result.bytes_read += reader.bytes_read
+        except SegmentError as error:
+            self._is_damaged = True
+            self.found(name, str(error), _RESTORE)
+
+    def _chunk(
+        self, reader: SegmentReader, place: ChunkPlace, channels: Mapping[int, Channel], name: str
+    ) -> None:
+        try:
+            chunk = reader.read_chunk(place)
+        except SegmentError as error:
+            if not self._is_damaged:
+                self.found(f"{name} byte {place.offset}", str(error), _RESTORE)
+            return
+        self._result.chunks += 1
+        self._result.messages += len(chunk.batch)
+        if self._database is None or not self._has_index:
+            return
+        documents, _ = self._indexer.documents_of([chunk], channels)
+        key = self._indexer.recording[:16]
+        for collection, want in _by_collection(documents).items():
+            self._expected[collection] = self._expected.get(collection, 0) + len(want)
+            problem = _compare(self._database, key, chunk, collection, want)
+            if problem:
+                where = f"{name} byte {chunk.offset}, collection {collection}"
+                self.found(where, problem, self._reindex)
+
+    @property
+    def _reindex(self) -> str:
+        return f"run `hybridlog reindex -r {self._label}`"
+
+    def _row(self, entry: RecordingEntry) -> None:
+        """The catalog's row, and its tables of chunks."""
+        known = self._catalog.recordings().get(entry.id)
+        if known is None:
+            self.found("catalog", "the recording is missing", _REPAIR)
+        elif known[1] != entry:
+            self.found("catalog", "its entry differs from the files", _REPAIR)
+        for number, _, _ in entry.spans:
+            try:
+                self._catalog.table(entry, number)
+            except CatalogError as error:
+                self.found("catalog", str(error), _REPAIR)
+
+    def _index(self, entry: RecordingEntry) -> None:
+        """What the database has beyond the segments."""
+        if self._database is None:
+            return
+        state = IndexState(self._database)
+        indexed = state.of([entry.key]).get(entry.key)
+        if indexed is None or not indexed.is_whole(entry):
+            self.found("index", "it is not complete", self._reindex)
+        elif not state.is_mirrored(entry):
+            self.found("index", "what it says of the recording differs", self._reindex)
+        for collection in state.topic_collections():
+            have = self._database.count(collection, {"_meta.rec": entry.key})
+            want = self._expected.get(collection, 0)
+            if have != want:
+                problem = f"{have} index documents, {want} messages in the segments"
+                self.found(f"collection {collection}", problem, self._reindex)
+
+    def _columns(self, entry: RecordingEntry) -> None:
+        try:
+            FieldColumns(self._path).check(entry)
+        except FileNotFoundError:
+            pass  # there need not be any
+        except StoreError as error:
+            self.found("columns", str(error), _REPAIR)
+
+
+def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
+    """Single documents; several channels of a chunk may share a topic."""
+    found: dict[str, list[bytes]] = {}
+    for part in documents:
+        found.setdefault(part.collection, []).extend(
+            row.tobytes() for table in part.tables for row in table
+        )
+    return found
+
+
+def _compare(
+    database: Database, key: str, chunk: StoredChunk, collection: str, want: list[bytes]
+) -> str | None:
+    """What is wrong with the documents of a chunk in one collection."""
+    times = chunk.batch.log_time
+    query = {
+        "_id": {"$gte": key_bound(int(times.min())), "$lt": key_bound(int(times.max()) + 1)},
+        "_meta.ref.chunk": chunk.number,
+        "_meta.ref.seg": chunk.segment,
+    }
+    have = {
+        document
+        for raw in database.find_raw(collection, query)
+        for document in _split(raw)
+        if recording_key(document) == key
+    }
+    if have == set(want):
+        return None
+    missing, extra = len(set(want) - have), len(have - set(want))
+    return f"{missing} index documents are missing or differ, {extra} are not of this chunk"
+
+
+def _split(data: bytes) -> Iterator[bytes]:
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        yield data[at : at + size]
+        at += size

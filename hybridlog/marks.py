@@ -1,0 +1,28 @@
+"""Marks: what happened, as a message on a topic of its own, that questions can use."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Final
+
+from hybridlog_storage.messages import Channel, Schema
+
+MARKS: Final = "/hybridlog/marks"
+"""Topic of marks."""
+_SCHEMA: Final = (
+    b'{"type":"object","properties":{"text":{"type":"string"},'
+    b'"tags":{"type":"object","additionalProperties":{"type":"string"}}}}'
+)
+
+
+def mark_channel() -> Channel:
+    """The channel of marks."""
+    return Channel(MARKS, "json", Schema("hybridlog.Mark", "jsonschema", _SCHEMA), {})
+
+
+def mark_payload(text: str, tags: Mapping[str, str]) -> bytes:
+    """A mark as a message."""
+    content = json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False)
+    # What came as bytes that are no UTF-8 stands in it as JSON's own escapes.
+    return content.encode("utf-8", "backslashreplace")

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import signal
+import threading
+import time
+
+import pytest
+
+from hybridlog_storage.threads import Threads
+
+
+class Interrupted(BaseException):
+    pass
+
+
+def test_what_runs_is_waited_for_again_after_an_interruption() -> None:
+    go, done = threading.Event(), []
+
+    def work() -> None:
+        go.wait(30)
+        time.sleep(0.1)
+        done.append(True)
+
+    def interrupt(*_: object) -> None:
+        raise Interrupted
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    threads = Threads(1, "test")
+    try:
+        threads.submit(work)
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with pytest.raises(Interrupted):
+            threads.shutdown(wait=True)
+        go.set()
+        threads.shutdown(wait=True, cancel_futures=True)
+        assert done == [True]
+    finally:
+        go.set()
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_what_waits_is_not_begun_when_it_is_cancelled() -> None:
+    go, done = threading.Event(), []
+    threads = Threads(1, "test")
+    first = threads.submit(go.wait, 30)
+    second = threads.submit(done.append, True)
+    threading.Timer(0.1, go.set).start()
+    threads.shutdown(wait=True, cancel_futures=True)
+    assert first.result() is True
+    assert second.cancelled()
+    assert done == []
+    with pytest.raises(RuntimeError):
+        threads.submit(done.append, True)
+    threads.shutdown()

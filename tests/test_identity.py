@@ -1,0 +1,348 @@
+"""A recording is its id: renamed, copied, moved and imported ones, and stores that were copied."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.maintenance.lease import become_another
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage import journal
+from hybridlog_storage.database import Database
+from hybridlog_storage.errors import DatabaseError, StoreError, TimeError, TopicError, UsageError
+from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.segment_writer import SegmentSettings
+
+NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
+COUNT = 60
+SECOND = 10**9
+
+
+@pytest.fixture(scope="module")
+def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with EmbeddedMongod(tmp_path_factory.mktemp("identity") / "mongod", linger_s=0) as running:
+        yield running.start()
+
+
+@pytest.fixture
+def uri(mongod: str, request: pytest.FixtureRequest) -> Iterator[str]:
+    name = f"id{abs(hash(request.node.name))}"
+    yield mongod.replace("/?", f"/{name}?")
+    with Database.connect(mongod, name) as database:
+        database.drop_all()
+
+
+def payload(n: int) -> bytes:
+    return b'{"n": %d, "pad": "%s"}' % (n, b"x" * 300)
+
+
+def make_log(path: Path, first: int = 0) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("n", "jsonschema", b"{}")
+        channel = writer.register_channel("/n", "json", schema)
+        for n in range(first, first + COUNT):
+            writer.add_message(channel, n * SECOND, payload(n), n * SECOND)
+        writer.finish()
+    return path
+
+
+@pytest.fixture
+def place(tmp_path: Path, uri: str) -> Path:
+    """A store with one recording of several segments."""
+    log = make_log(tmp_path / "log.mcap", 100)
+    with hl.open(tmp_path / "store", mongo=uri, create=True) as store:
+        settings = SegmentSettings(chunk_size=1024, segment_size=3000, compression="none")
+        entry = store.record(log, name="one", tags={"a": "1"}, settings=settings).entry
+        assert entry.segments > 2
+    return tmp_path / "store"
+
+
+def answers(store: hl.Store, recording: str | None = None) -> tuple[int, int, list[bytes]]:
+    query = store.topic("/n")
+    if recording is not None:
+        query = query.in_recording(recording)
+    return query.count(), query.where("n >= 130").count(), [bytes(m.raw) for m in query]
+
+
+def right() -> tuple[int, int, list[bytes]]:
+    return COUNT, 30, [payload(n) for n in range(100, 100 + COUNT)]
+
+
+def test_a_renamed_directory_changes_the_label_alone(place: Path, uri: str) -> None:
+    with hl.open(place, mongo=uri) as store:
+        (before,) = store.recordings()
+        (place / "recordings" / "one").rename(place / "recordings" / "other")
+    with hl.open(place, mongo=uri) as store:
+        (after,) = store.recordings()
+        assert (after.id, after.label, after.name) == (before.id, "other", "one")
+        assert not store.repairs.indexed
+        assert answers(store) == answers(store, "other") == answers(store, before.id) == right()
+        assert not store.verify().findings
+        store.reindex()
+        assert answers(store) == right()
+
+
+def test_a_directory_renamed_under_an_open_store(place: Path, uri: str) -> None:
+    with hl.open(place, mongo=uri) as store:
+        assert store.topic("/n").where("n >= 130").count() == 30
+        (place / "recordings" / "one").rename(place / "recordings" / "other")
+        store.refresh()
+        assert answers(store) == right()
+
+
+@pytest.mark.parametrize("copy", ["a-copy", "z-copy"])
+def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, copy: str) -> None:
+    shutil.copytree(place / "recordings" / "one", place / "recordings" / copy)
+    for _ in range(2):
+        with hl.open(place, mongo=uri) as store:
+            assert [r.label for r in store.recordings()] == ["one"]
+            assert store.repairs.copies == {copy: "one"}
+            assert answers(store) == answers(store, copy) == right()
+            (finding,) = store.verify().findings
+            assert (finding.recording, "copy of one" in finding.problem) == (copy, True)
+            store.reindex()
+            assert answers(store) == right()
+            done = store.repair()
+            assert [one.is_cured for one in done if one.recording == copy] == [False]
+    with hl.open(place, mongo=uri) as store:
+        store.remove(copy)
+        assert not (place / "recordings" / copy).exists()
+        assert [r.label for r in store.recordings()] == ["one"]
+        assert not store.repairs.copies
+        assert answers(store) == right()
+        assert not store.verify().findings
+
+
+def test_the_copy_that_is_whole_answers(place: Path, uri: str) -> None:
+    shutil.copytree(place / "recordings" / "one", place / "recordings" / "two")
+    (place / "recordings" / "one" / "000001.mcap").unlink()
+    with hl.open(place, mongo=uri) as store:
+        (entry,) = store.recordings()
+        assert (entry.label, entry.status) == ("two", "complete")
+        assert store.repairs.copies == {"one": "two"}
+        assert answers(store) == right()
+
+
+def test_a_recording_from_another_store_is_adopted(place: Path, uri: str, tmp_path: Path) -> None:
+    with hl.open(tmp_path / "mine", create=True):
+        pass
+    shutil.copytree(place / "recordings" / "one", tmp_path / "mine" / "recordings" / "theirs")
+    with hl.open(tmp_path / "mine") as store:
+        assert store.repairs.adopted == ["theirs"]
+        (entry,) = store.recordings()
+        assert (entry.label, entry.status, entry.tags) == ("theirs", "complete", {"a": "1"})
+        assert answers(store) == right()
+        assert not store.verify().findings
+    with hl.open(tmp_path / "mine") as store:
+        assert not store.repairs.adopted
+    # The other one is untouched.
+    with hl.open(place, mongo=uri) as store:
+        assert answers(store) == right()
+
+
+def test_import(place: Path, uri: str, tmp_path: Path) -> None:
+    with hl.open(place, mongo=uri) as store:
+        store.record(make_log(tmp_path / "second.mcap", 500), name="second")
+    with hl.open(tmp_path / "mine", create=True) as mine:
+        mine.record(make_log(tmp_path / "third.mcap", 900), name="one")
+        report = mine.import_from(place, ["one"])
+        assert (report.imported, report.known) == (["one-2"], [])
+        assert answers(mine, "one-2") == right()
+        again = mine.import_from(place)
+        assert (again.imported, again.known) == (["second"], ["one-2"])
+        assert mine.topic("/n").count() == 3 * COUNT
+        assert not mine.repairs.adopted  # that stands in the journals already
+        assert not mine.verify().findings
+        assert mine.select(["one-2"])[0].status == "complete"
+    with hl.open(place, mongo=uri) as store:
+        assert len(store.recordings()) == 2
+
+
+def test_an_import_goes_on_where_it_was_stopped(place: Path, uri: str, tmp_path: Path) -> None:
+    with hl.open(place, mongo=uri) as store:
+        (entry,) = store.recordings()
+    with hl.open(tmp_path / "mine", create=True) as mine:
+        begun = tmp_path / "mine" / "recordings" / f".importing-{entry.id}"
+        begun.mkdir()
+        source = place / "recordings" / "one"
+        shutil.copy(source / "000000.mcap", begun)
+        half = (source / "000001.mcap").read_bytes()
+        (begun / "000001.mcap").write_bytes(half[: len(half) // 2])
+        assert not mine.recordings()
+        report = mine.import_from(place)
+        left = entry.stored_bytes - (source / "000000.mcap").stat().st_size
+        assert (report.imported, report.bytes_copied) == (["one"], left)
+        assert answers(mine) == right()
+        assert not begun.exists()
+
+
+def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
+    path = place / "recordings" / "one" / "000001.mcap"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
+    path.write_bytes(data)
+    with hl.open(tmp_path / "mine", create=True) as mine:
+        with pytest.raises(StoreError, match="does not fit its checksums"):
+            mine.import_from(place)
+        assert not mine.recordings()
+        path.unlink()
+        with pytest.raises(StoreError, match="not whole"):
+            mine.import_from(place)
+        assert not mine.recordings()
+
+
+def documents(uri: str) -> dict[str, int]:
+    with Database.connect(uri) as database:
+        return {c: database.count(c, {}) for c in database.list_collections()}
+
+
+def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
+    place: Path, uri: str, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(place, copy)
+    before = documents(uri)
+    shutil.rmtree(copy / "recordings" / "one")
+    for _ in range(2):
+        with hl.open(copy, mongo=uri) as store:
+            assert store.database is None
+            assert "copy" in str(store.without_database)
+            assert "--new-id" in str(store.without_database)
+            with pytest.raises(DatabaseError, match="--moved"):
+                store.topic("/n") if store.topics() else store.database_for("This")
+        with pytest.raises(StoreError, match="copy"):
+            hl.open(copy, mongo=uri, require_database=True)
+    assert documents(uri) == before
+    with hl.open(place, mongo=uri) as store:
+        assert answers(store) == right()
+    # With an id and a database of its own it is a store like any other.
+    shutil.copytree(place / "recordings" / "one", copy / "recordings" / "one")
+    become_another(copy, "embedded")
+    with hl.open(copy) as store:
+        assert answers(store) == right()
+        assert store.repairs.adopted == ["one"]
+        store.remove("one")
+    assert documents(uri) == before
+
+
+def test_a_moved_store_takes_its_index_along(place: Path, uri: str, tmp_path: Path) -> None:
+    moved = place.rename(tmp_path / "moved")
+    with hl.open(moved, mongo=uri) as store:
+        assert answers(store) == right()
+        assert not store.repairs.indexed
+        with Database.connect(uri) as database:
+            mark = IndexState(database).mark()
+            assert mark is not None
+            assert mark["path"] == str(moved.resolve())
+
+
+def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
+    with Database.connect(uri) as database:
+        state = IndexState(database)
+        mark = dict(state.mark() or {})
+        state.claim({"id": mark["id"], "host": "another", "path": "/data/store"})
+    with hl.open(place, mongo=uri) as store:
+        with pytest.raises(DatabaseError, match="/data/store on another"):
+            store.database_for("This")
+        assert store.topic("/n").count() == COUNT  # by topic and time it goes on
+        store.take_over()
+        assert answers(store) == right()
+
+
+def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
+    with hl.open(place, mongo=uri) as store:
+        entry = store.rename("one", "second floor")
+        assert (entry.label, entry.name) == ("second-floor", "second floor")
+        store.tag("second-floor", b="2", a="3")
+        store.untag("second-floor", "b")
+        store.note("second-floor", "the wheel slipped")
+        with pytest.raises(UsageError, match="no tag 'x'"):
+            store.untag("second-floor", "x")
+        store.mark("second-floor", "+10s", "slip", {"kind": "odd"})
+        store.mark("second-floor", "110.5", "after")
+        with pytest.raises(TimeError):
+            store.mark("second-floor", "never", "x")
+        with pytest.raises(TopicError):
+            store.tag("one", a="1")
+
+    def check(store: hl.Store) -> None:
+        (found,) = store.recordings()
+        assert (found.id, found.label, found.name) == (entry.id, "second-floor", "second floor")
+        assert (found.tags, found.status) == ({"a": "3"}, "complete")
+        assert [note["text"] for note in found.notes] == ["the wheel slipped"]
+        assert [(m["time"], m["text"]) for m in found.marks] == [
+            (110 * SECOND, "slip"),
+            (110 * SECOND + SECOND // 2, "after"),
+        ]
+        marks = store.topic("/hybridlog/marks")
+        assert [(m.log_time_ns, m.fields["text"]) for m in marks] == [
+            (110 * SECOND, "slip"),
+            (110 * SECOND + SECOND // 2, "after"),
+        ]
+        assert marks.where("text == 'slip'").count() == 1
+        near = store.topic("/n").around(marks.where("tags.kind == 'odd'"), before="1s", after="1s")
+        assert [m.fields["n"] for m in near] == [109, 110]
+        assert answers(store, "second-floor") == right()
+        assert not store.verify().findings
+
+    with hl.open(place, mongo=uri) as store:
+        check(store)
+        with Database.connect(uri) as database:
+            mirror = database.find_one("hybridlog.recordings", {})
+            assert mirror is not None
+            assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
+        store.reindex()
+        check(store)
+    (place / "catalog.sqlite").unlink()
+    with hl.open(place, mongo=uri) as store:
+        check(store)
+
+
+def test_marks_need_no_mongodb(place: Path, uri: str) -> None:
+    with hl.open(place, mongo=NOWHERE) as store:
+        store.mark("one", "+1s", "seen")
+        assert [m.fields["text"] for m in store.topic("marks")] == ["seen"]
+    with hl.open(place, mongo=uri) as store:
+        assert store.topic("marks").where("text == 'seen'").count() == 1
+        assert store.repairs.indexed == {"one": 1}
+
+
+def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store, store.start("live") as recording:
+        with pytest.raises(StoreError, match="without --at"):
+            store.mark(recording.id, "100", "x")
+        with pytest.raises(StoreError, match="being written"):
+            store.tag(recording.id, a="1")
+        with pytest.raises(StoreError, match="being written"):
+            store.remove(recording.id)
+
+
+def test_intervals_of_a_label_and_of_nobody(place: Path, uri: str) -> None:
+    with hl.open(place, mongo=uri) as store:
+        span = np.array([[110 * SECOND, 112 * SECOND, 1]])
+        for name in ("one", store.entry("one").id):
+            assert store.topic("/n").during(Intervals.of([(name, span)])).count() == 2
+        with pytest.raises(TopicError, match="'nobody'"):
+            store.topic("/n").during(Intervals.of([("nobody", span)]))
+
+
+def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None:
+    path = place / "recordings" / "one"
+    Journal(path).append(journal.event(journal.REMOVING, by=1))
+    with hl.open(place, mongo=uri) as store:
+        assert store.repairs.removed == ["one"]
+        assert not store.recordings()
+        assert list((place / "recordings").iterdir()) == []
+        database = store.database_for("This")
+        assert database.count("n", {}) == 0
+        assert IndexState(database).of() == {}
