@@ -10,19 +10,22 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
+from hybridlog.query.mongo_filter import FieldTypes
 from hybridlog.query.where import And, Compare, Exists, Member, Not, Or
 
 if TYPE_CHECKING:
+    from hybridlog.query.mongo_filter import Stat
     from hybridlog.query.where import Condition, Expression, Node, Value
 
-_STATISTICS: dict[str, Callable[[Sequence[float]], float]] = {
-    "min": min,
-    "max": max,
-    "mean": lambda values: math.fsum(values) / len(values),
-}
-_SUMMARY = frozenset({"n", *_STATISTICS})
+Document: TypeAlias = Mapping[str, object]
+"""Fields of an index document: dict, list, str, bool, int, float, None."""
+Test: TypeAlias = Callable[[Document], bool]
+
+_SUMMARY = frozenset({"n", "min", "max", "mean"})
+_ESCAPE = re.compile(r"\\.", re.DOTALL)
+_IGNORES_CASE = re.compile(r"\(\?[a-zA-Z]*i")
 _ORDERS: dict[str, Callable[[float | str, float | str], bool]] = {
     "<": lambda one, other: one < other,  # type: ignore[operator]
     "<=": lambda one, other: one <= other,  # type: ignore[operator]
@@ -31,17 +34,25 @@ _ORDERS: dict[str, Callable[[float | str, float | str], bool]] = {
 }
 
 
-def holds(expression: Expression, document: Mapping[str, object]) -> bool:
-    """Whether a predicate holds for a document.
+def holds(
+    expression: Expression, document: Document, field_types: Mapping[str, str] | None = None
+) -> bool:
+    """Whether a predicate holds for a document; see `compiled`."""
+    return compiled(expression, field_types)(document)
+
+
+def compiled(expression: Expression, field_types: Mapping[str, str] | None = None) -> Test:
+    """A predicate as a test of one document after the other.
 
     Args:
         expression: As `where.parse` gives it.
-        document: Fields of an index document: dict, list, str, bool, int, float, None.
+        field_types: As for `where.compile_filter`, which refuses what does not fit them.
     """
-    return _node(expression.root, document)
+    types = None if field_types is None else tuple(field_types.items())
+    return _node(expression.root, FieldTypes.of(types))
 
 
-def numbers_at(document: Mapping[str, object], path: str) -> list[float]:
+def numbers_at(document: Document, path: str) -> list[float]:
     """The numbers that a path such as `pose.position.x` or `ranges.min` leads to.
 
     Args:
@@ -49,22 +60,25 @@ def numbers_at(document: Mapping[str, object], path: str) -> list[float]:
         path: Names and places with dots between them.
     """
     parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
-    values = (value for leaf in _reach(document, parts) for value in _elements(leaf))
+    found = _found(document, parts, FieldTypes.of(None).statistic(parts))
+    values = (value for leaf in found for value in _elements(leaf))
     return [value for value in values if isinstance(value, int | float) and _is_number(value)]
 
 
-def _node(node: Node, document: Mapping[str, object]) -> bool:
-    if isinstance(node, And):
-        return all(_node(item, document) for item in node.items)
-    if isinstance(node, Or):
-        return any(_node(item, document) for item in node.items)
+def _node(node: Node, types: FieldTypes) -> Test:
     if isinstance(node, Not):
-        return not _node(node.item, document)
-    return _condition(node, document)
+        negated = _node(node.item, types)
+        return lambda document: not negated(document)
+    if isinstance(node, And | Or):
+        tests = [_node(item, types) for item in node.items]
+        joined = all if isinstance(node, And) else any
+        return lambda document: joined(test(document) for test in tests)
+    stat = types.statistic(node.field.parts)
+    return lambda document: _condition(node, document, stat)
 
 
-def _condition(node: Condition, document: Mapping[str, object]) -> bool:
-    found = list(_reach(document, node.field.parts))
+def _condition(node: Condition, document: Document, stat: Stat | None) -> bool:
+    found = _found(document, node.field.parts, stat)
     if isinstance(node, Exists):
         return bool(found) is node.present
     values = [value for leaf in found for value in _elements(leaf)]
@@ -73,9 +87,11 @@ def _condition(node: Condition, document: Mapping[str, object]) -> bool:
             return bool(found) and not any(_equal(value, node.value) for value in values)
         if node.order == "==":
             return any(_equal(value, node.value) for value in values)
-        # A long array is a summary: its least or its greatest element answers for it.
-        end = "min" if node.order in {"<", "<="} else "max"
-        values.extend(leaf[end] for leaf in found if _is_summary(leaf))
+        if _is_number(node.value):
+            # A long array is a summary: its least or its greatest element answers for it.
+            end = "min" if node.order in {"<", "<="} else "max"
+            leaves = _values(document, node.field.parts)
+            values.extend(leaf[end] for leaf in leaves if _is_summary(leaf))
         return any(_ordered(node.order, value, node.value) for value in values)
     if isinstance(node, Member):
         hit = any(_equal(value, wanted) for value in values for wanted in node.values)
@@ -83,6 +99,18 @@ def _condition(node: Condition, document: Mapping[str, object]) -> bool:
         pattern = _pattern(node.pattern)
         hit = any(isinstance(value, str) and bool(pattern.search(value)) for value in values)
     return bool(found) and not hit if node.negated else hit
+
+
+def _found(document: Document, parts: tuple[str | int, ...], stat: Stat | None) -> list[object]:
+    """What a path leads to, statistics of arrays that are there element by element included."""
+    found = list(_reach(document, parts))
+    if stat is not None:
+        found.extend(
+            _statistic(stat, value)
+            for value in _values(document, parts[:-1])
+            if isinstance(value, list) and _has_statistic(value, stat)
+        )
+    return found
 
 
 def _reach(value: object, parts: tuple[str | int, ...]) -> Iterator[object]:
@@ -95,24 +123,54 @@ def _reach(value: object, parts: tuple[str | int, ...]) -> Iterator[object]:
         if str(part) in value:
             yield from _reach(value[str(part)], rest)
     elif isinstance(value, list):
-        if isinstance(part, int):
-            if part < len(value):
-                yield from _reach(value[part], rest)
-            return
-        if not rest and part in _SUMMARY and all(isinstance(v, int | float) for v in value):
-            # A short array has no summary, but answers as if it had one.
-            yield _statistic(part, value)
-            return
+        if isinstance(part, int) and part < len(value):
+            yield from _reach(value[part], rest)
+        # MongoDB takes a number for a name, too.
         for element in value:
             if isinstance(element, Mapping):
                 yield from _reach(element, parts)
 
 
-def _statistic(name: str, values: Sequence[float]) -> float | None:
-    if name == "n":
+def _values(value: object, parts: tuple[str | int, ...]) -> Iterator[object]:
+    """What a path leads to; a number in it is a place in an array and no name."""
+    if not parts:
+        yield value
+        return
+    part, rest = parts[0], parts[1:]
+    if isinstance(part, int):
+        if isinstance(value, list) and part < len(value):
+            yield from _values(value[part], rest)
+        return
+    for element in _elements(value):
+        if isinstance(element, Mapping) and part in element:
+            yield from _values(element[part], rest)
+
+
+def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
+    """Whether an array has a statistic, and its elements have no field of that name."""
+    if stat == "n":
+        return not any(isinstance(value, Mapping) and stat in value for value in values)
+    return all(isinstance(value, int | float) for value in values)
+
+
+def _statistic(stat: Stat, values: Sequence[float]) -> float | None:
+    if stat == "n":
         return len(values)
-    finite = [float(value) for value in values if math.isfinite(value)]
-    return _STATISTICS[name](finite) if finite else None
+    finite = [value * 1 for value in values if math.isfinite(value)]  # True counts as 1
+    if not finite:
+        return None
+    if stat == "mean":
+        return _sum(finite) / len(finite)
+    return min(finite) if stat == "min" else max(finite)
+
+
+def _sum(values: Sequence[float]) -> float:
+    # An integer beyond 2^53 is a double and a rest.
+    rests = (value - int(float(value)) for value in values if isinstance(value, int))
+    try:
+        return math.fsum((*values, *rests))
+    except OverflowError:
+        return float(sum(values))
 
 
 def _is_summary(leaf: object) -> TypeGuard[Mapping[str, object]]:
@@ -147,4 +205,11 @@ def _ordered(order: str, value: object, wanted: Value) -> bool:
 
 @lru_cache(maxsize=256)
 def _pattern(text: str) -> re.Pattern[str]:
-    return re.compile(text)
+    # As MongoDB reads it: \w, \d, \s and \b are about ASCII, and \Z may be before a last
+    # end of line. Without regard to case it knows all letters; re.ASCII would not.
+    ascii_only = re.ASCII if _IGNORES_CASE.search(text) is None else re.NOFLAG
+    return re.compile(_ESCAPE.sub(_escape, text), ascii_only)
+
+
+def _escape(found: re.Match[str]) -> str:
+    return r"(?=\n?\Z)" if found[0] == r"\Z" else found[0]

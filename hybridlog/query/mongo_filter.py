@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeGuard
 
 from hybridlog.query.tokens import error_at
 from hybridlog.query.where import (
@@ -41,6 +41,11 @@ _STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 _SHOWN = 10
 _INF = float("inf")
 _NULL: dict[str, object] = {"$type": "null"}
+_NUMBER_TYPES = ["int", "long", "double", "bool"]  # booleans count as 0 and 1
+_BOOLEANS = [
+    {"case": {"$eq": ["$$b", True]}, "then": 1},
+    {"case": {"$eq": ["$$b", False]}, "then": 0},
+]
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
 
 _KINDS: dict[str, _Kind] = {
@@ -84,11 +89,11 @@ def to_filter(expression: Expression, field_types: Mapping[str, str] | None) -> 
         WhereError: A field that does not exist, or a value that does not fit its type.
     """
     types = None if field_types is None else tuple(field_types.items())
-    return _Compiler(expression.text, _Types.of(types)).node(expression.root)
+    return _Compiler(expression.text, FieldTypes.of(types)).node(expression.root)
 
 
 @dataclass(frozen=True, slots=True)
-class _Types:
+class FieldTypes:
     """What is known of the fields.
 
     Attributes:
@@ -105,9 +110,9 @@ class _Types:
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(field_types: tuple[tuple[str, str], ...] | None) -> _Types:
+    def of(field_types: tuple[tuple[str, str], ...] | None) -> FieldTypes:
         """Of paths and their types, None when they are not known."""
-        found = _Types(field_types is not None, dict(_META))
+        found = FieldTypes(field_types is not None, dict(_META))
         for written, kind in {**dict(field_types or ()), **_META}.items():
             parts = written.split(".")
             for count in range(1, len(parts) + 1):
@@ -122,6 +127,29 @@ class _Types:
                 found.arrays.add(path)
         return found
 
+    def is_open(self, name: str) -> bool:
+        """Whether anything may stand below a name of the top level."""
+        return not self.known and name != "_meta"
+
+    def statistic(self, parts: tuple[str | int, ...]) -> Stat | None:
+        """The statistic of an array that a path asks for; None when it asks for a field.
+
+        Where the types are not known it may be either, and each message decides.
+        """
+        names = [part for part in parts if isinstance(part, str)]
+        stat = _STATS.get(str(parts[-1]))
+        if stat is None or len(parts) < 2 or self.is_open(names[0]):
+            return stat if len(parts) > 1 else None
+        path, parent = ".".join(names), ".".join(names[:-1])
+        if path in self.types or path in self.inner or parent not in self.arrays:
+            return None
+        numeric = _KINDS.get(self.base(parent)) in {"number", "bool", "time"}
+        return stat if numeric or stat == "n" else None
+
+    def base(self, path: str) -> str:
+        """Type of the elements of an array; empty when they are messages."""
+        return self.types.get(path, "").split("[", 1)[0]
+
 
 @dataclass(frozen=True, slots=True)
 class _Target:
@@ -132,16 +160,18 @@ class _Target:
         stat: Set when the path asks for the summary of an array.
         base: Type of that array's elements.
         array: Whether the path is an array of numbers, none of its elements.
+        open: Whether the types are not known.
     """
 
     kind: _Kind
     stat: Stat | None = None
     base: str = ""
     array: bool = False
+    open: bool = False
 
 
 class _Compiler:
-    def __init__(self, text: str, types: _Types) -> None:
+    def __init__(self, text: str, types: FieldTypes) -> None:
         self._text = text
         self._types = types
 
@@ -159,8 +189,13 @@ class _Compiler:
     def _condition(self, node: Condition) -> Filter:
         target = self._target(node.field)
         self._check(node, target)
+        if target.open and _depends_on_the_value(node, target.stat):
+            return self._of_anything(node, target.stat)
         if target.stat is not None:
             return self._of_summary(node, target.stat, target.base)
+        return self._of_field(node, target)
+
+    def _of_field(self, node: Condition, target: _Target) -> Filter:
         path = node.field.path
         match node:
             case Compare(order=order, value=value):
@@ -184,18 +219,15 @@ class _Compiler:
         path = ".".join(names)
         if names[0] == "_id":
             raise self._fail(asked, "_id cannot be asked for; use _meta.t, _meta.rec and _meta.seq")
-        if not types.known and names[0] != "_meta":
-            return _Target("other")
+        stat = types.statistic(asked.parts)
+        if types.is_open(names[0]):
+            return _Target("other", stat, open=True)
         if path in types.types:
             kind = _KINDS.get(types.types[path].split("[", 1)[0], "other")
             numbers = kind in {"number", "time"} and types.types[path].endswith("]")
             return _Target(kind, array=numbers and isinstance(asked.parts[-1], str))
-        parent, last = ".".join(names[:-1]), names[-1]
-        if path not in types.inner and parent in types.arrays and isinstance(asked.parts[-1], str):
-            base = types.types.get(parent, "").split("[", 1)[0]
-            numeric = _KINDS.get(base) in {"number", "bool", "time"}
-            if last in _STATS and (numeric or last == "n"):
-                return _Target("number", _STATS[last], base)
+        if stat is not None:
+            return _Target("number", stat, types.base(".".join(names[:-1])))
         if path in types.inner or path in types.arrays:
             return _Target("other")
         raise self._unknown(asked, path)
@@ -275,6 +307,26 @@ class _Compiler:
             case Match(position=position):  # `_check` has refused it; numbers have no pattern
                 raise error_at(self._text, position, "the field is a number, not a string")
 
+    def _of_anything(self, node: Condition, stat: Stat | None) -> Filter:
+        """A condition on a path of which no type is known: each document decides."""
+        asked = node.field
+        there: Filter = {asked.path: {"$exists": True}}
+        if stat is not None:
+            there = {"$or": [there, {"$expr": _anywhere(asked.parts[:-1], _Counted(stat))}]}
+        match node:
+            case Exists(present=present):
+                return there if present else {"$nor": [there]}
+            case Compare(order="!=", value=value):
+                return {"$and": [there, {"$nor": [_open_test(asked, stat, "==", value)]}]}
+            case Compare(order=order, value=value):
+                return _open_test(asked, stat, order, value)
+            case Member(values=values, negated=negated):
+                one = _any_of([_open_test(asked, stat, "==", value) for value in values])
+                return {"$and": [there, {"$nor": [one]}]} if negated else one
+            case Match(pattern=pattern, negated=negated):
+                found = _at_element(asked, {"$regex": pattern})
+                return {"$and": [there, {"$nor": [found]}]} if negated else found
+
     def _either(self, asked: Field, stat: Stat, base: str, operator: str, value: Value) -> Filter:
         summary: Filter = {asked.path: _comparison(operator, value)}
         if _is_nan(value):
@@ -335,7 +387,7 @@ class _Test:
 
     Attributes:
         stat: The statistic.
-        base: Type of the elements.
+        base: Type of the elements; `any` when it is not known.
         operator: Aggregation operator.
         value: What to compare with.
     """
@@ -358,8 +410,9 @@ class _Test:
         if self.stat == "n":
             return {"$size": here}
         numbers: object = here
-        if _KINDS.get(self.base) == "bool":
-            numbers = {"$map": {"input": here, "as": "b", "in": {"$cond": ["$$b", 1, 0]}}}
+        if self.base == "any" or _KINDS.get(self.base) == "bool":
+            number = {"$switch": {"branches": _BOOLEANS, "default": "$$b"}}
+            numbers = {"$map": {"input": here, "as": "b", "in": number}}
         finite = {
             "$filter": {
                 "input": numbers,
@@ -370,6 +423,117 @@ class _Test:
         }
         operator = {"min": "$min", "max": "$max", "mean": "$avg"}[self.stat]
         return {operator: finite}
+
+
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    """Whether a value is a list that has a statistic, and no field of that name.
+
+    Attributes:
+        stat: The statistic.
+        test: What must hold of it; None when nothing must.
+    """
+
+    stat: Stat
+    test: _Test | None = None
+
+    def on(self, here: str) -> object:
+        """The aggregation expression for the value at `here`."""
+        each: object = {"$in": [{"$type": "$$e"}, _NUMBER_TYPES]}
+        if self.stat == "n":
+            named = {"$ne": [{"$type": f"$$e.{self.stat}"}, "missing"]}
+            each = {"$not": [{"$and": [{"$eq": [{"$type": "$$e"}, "object"]}, named]}]}
+        fits = {"$allElementsTrue": [{"$map": {"input": here, "as": "e", "in": each}}]}
+        found: object = fits if self.test is None else {"$and": [fits, self.test.on(here)]}
+        return {"$cond": [{"$isArray": [here]}, found, False]}
+
+
+@dataclass(frozen=True, slots=True)
+class _Extreme:
+    """Whether a value is the summary of a long array of which an element is in order.
+
+    Attributes:
+        end: The element that is in order if any is.
+        operator: Aggregation operator.
+        value: What to compare with.
+    """
+
+    end: str
+    operator: str
+    value: float
+
+    def on(self, here: str) -> object:
+        """The aggregation expression for the value at `here`."""
+        end = f"{here}.{self.end}"
+        whole = [{"$ne": [{"$type": f"{here}.{name}"}, "missing"]} for name in _STATS]
+        return {
+            "$and": [
+                {"$eq": [{"$type": here}, "object"]},
+                *whole,
+                {"$in": [{"$type": end}, _NUMBER_TYPES]},
+                {"$gte": [end, -_INF]},  # NaN sorts before it
+                {self.operator: [end, {"$literal": self.value}]},
+            ]
+        }
+
+
+def _depends_on_the_value(node: Condition, stat: Stat | None) -> bool:
+    """Whether a condition on a path without types means more than one thing."""
+    if stat is not None or isinstance(node.field.parts[-1], int):
+        return True
+    return isinstance(node, Compare) and node.order in _EXTREMES and _is_number(node.value)
+
+
+def _open_test(asked: Field, stat: Stat | None, order: str, value: Value) -> Filter:
+    """A comparison with whatever a path leads to: values, elements, summaries."""
+    operator = _OPERATORS[order]
+    found = [_at_element(asked, _comparison(operator, value))]
+    if _is_number(value) and order in _EXTREMES:
+        end = _EXTREMES[order]
+        exact = {"$expr": _anywhere(asked.parts, _Extreme(end, operator, value))}
+        # The first condition is cheap, and few documents satisfy it.
+        found.append({"$and": [{f"{asked.path}.{end}": {operator: value}}, exact]})
+    if stat is not None and not _is_nan(value) and (_is_number(value) or value is None):
+        test = _Counted(stat, _Test(stat, "any", operator, value))
+        found.append({"$expr": _anywhere(asked.parts[:-1], test)})
+    return _any_of(found)
+
+
+def _at_element(asked: Field, test: Filter) -> Filter:
+    """A condition on a value, or on any element of it.
+
+    MongoDB looks into an array that a name leads to, but not into one that is itself an
+    element.
+    """
+    found: Filter = {asked.path: test}
+    if isinstance(asked.parts[-1], str):
+        return found
+    return {"$or": [found, {asked.path: {"$elemMatch": test}}]}
+
+
+def _anywhere(parts: tuple[str | int, ...], test: _Counted | _Extreme) -> object:
+    """An aggregation expression: whether a test holds of any value that a path leads to.
+
+    Any value on the way may be an array.
+    """
+    return _further(f"${parts[0]}", parts[1:], test, 0)
+
+
+def _further(
+    here: str, parts: tuple[str | int, ...], test: _Counted | _Extreme, depth: int
+) -> object:
+    if not parts:
+        return test.on(here)
+    part, rest, variable = parts[0], parts[1:], f"v{depth}"
+    if isinstance(part, int):
+        element = {"$cond": [{"$isArray": [here]}, {"$arrayElemAt": [here, part]}, None]}
+        inner = _further(f"$${variable}", rest, test, depth + 1)
+        return {"$let": {"vars": {variable: element}, "in": inner}}
+    inner = _further(f"$${variable}.{part}", rest, test, depth + 1)
+    is_object = {"$eq": [{"$type": f"$${variable}"}, "object"]}
+    values = {"$cond": [{"$isArray": [here]}, here, [here]]}
+    each = {"$cond": [is_object, inner, False]}
+    return {"$anyElementTrue": [{"$map": {"input": values, "as": variable, "in": each}}]}
 
 
 def _any_of(filters: list[Filter]) -> Filter:
@@ -392,6 +556,10 @@ def _membership(path: str, values: tuple[Value, ...], *, negated: bool) -> Filte
     if negated:
         return {path: {"$nin": others, "$exists": True, "$not": _NULL}}
     return {"$or": [{path: _NULL}, {path: {"$in": others}}]}
+
+
+def _is_number(value: Value) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _is_nan(value: Value) -> bool:

@@ -21,6 +21,7 @@ _WINDOW = 100
 
 _PART = r"[^\W\d]\w*|`[^`]*`"
 _FIRST = re.compile(_PART)
+_DIGITS = "0123456789"
 _NEXT = re.compile(rf"\.(?P<name>{_PART}|[0-9]+)|\[\s*(?P<index>[0-9]+|\*)?\s*\]")
 _NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]+")
@@ -208,13 +209,18 @@ def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
     end = first.end()
     # `in[1, 2]` is the operator and a list, not an element of a field.
     is_in = first[0].lower() == "in"
+    of_any = False
     while (match := _NEXT.match(text, end)) and not (is_in and text[end] == "["):
-        if match["name"] is not None:
-            name = match["name"]
-            parts.append(
-                _index(text, end, name) if name[0] in "0123456789" else _name(text, end + 1, name)
+        name = match["name"]
+        is_element = name is None or name[0] in _DIGITS
+        if is_element and of_any:
+            raise error_at(
+                text, end, "any element can be asked only of named fields: write x[0][1] or x[*].y"
             )
-        elif match["index"] not in {None, "*"}:
+        of_any = name is None and match["index"] in {None, "*"}
+        if name is not None:
+            parts.append(_index(text, end, name) if is_element else _part(text, end + 1, name))
+        elif not of_any:
             parts.append(_index(text, end, match["index"]))
         end = match.end()
     if text[end : end + 1] == ".":
@@ -232,6 +238,13 @@ def _name(text: str, at: int, name: str) -> str:
     if any(0xD800 <= ord(char) <= 0xDFFF for char in plain):
         raise error_at(text, at, "the name is not valid Unicode")
     return plain
+
+
+def _part(text: str, at: int, name: str) -> str | int:
+    """A name behind another; MongoDB takes a number for a place in an array."""
+    plain = _name(text, at, name)
+    is_place = plain.isascii() and plain.isdecimal() and str(int(plain[:10])) == plain
+    return int(plain) if is_place else plain
 
 
 def _index(text: str, at: int, digits: str) -> int:

@@ -29,8 +29,9 @@ greater than anything. `== null` finds a stored null, not a missing field.
 The pattern of `~` is found anywhere in the string unless anchored; its backslashes stand
 for themselves. Patterns that could run for very long are refused.
 
-`x.min`, `x.max`, `x.mean` and `x.n` of an array ask for its summary; when the types of
-the fields are known, short arrays, which are stored element by element, answer too.
+`x.min`, `x.max`, `x.mean` and `x.n` of an array ask for its summary; short arrays, which
+are stored element by element, answer too. Where the types of the fields are not known, a
+field of that name in an element comes before the summary.
 """
 
 from __future__ import annotations
