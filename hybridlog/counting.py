@@ -21,14 +21,15 @@ from hybridlog.columns.kept import cost_s
 from hybridlog.processors import processors
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog_storage.catalog import RECORDINGS
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.index_state import RECORDINGS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.guarded import GuardedIndex
     from hybridlog.reader import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
@@ -54,17 +55,17 @@ def in_all_times(
         recordings: Where to count; those that have the topic.
         predicate: A MongoDB filter, not empty.
     """
-    database = store.database_for("A predicate")
+    index = store.index_for("A predicate", recordings)
     collection = collection_of(topic)
-    ids = sorted(entry.id for entry in recordings)
-    own = {"$and": [{"_meta.rec": {"$in": ids} if len(ids) > 1 else ids[0]}, dict(predicate)]}
+    keys = sorted(entry.key for entry in recordings)
+    own = {"$and": [{"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0]}, dict(predicate)]}
     if _messages(topic, recordings) < _MANY:
-        return database.count(collection, own)
-    if _is_whole(store, database, topic, recordings):
-        found = _counted(database, topic, recordings, predicate)
-        if not _has_strangers(store, database):
+        return index.count(collection, own)
+    if _is_whole(store, index.database, topic, recordings):
+        found = _counted(index, topic, recordings, predicate)
+        if not _has_strangers(store, index.database):
             return found
-    return _counted(database, topic, recordings, own)
+    return _counted(index, topic, recordings, own)
 
 
 def count_in_columns(query: Query, topics: Iterable[str]) -> tuple[int, list[str]]:
@@ -129,7 +130,7 @@ def _in_columns(query: Query, spans: NDArray[np.int64], found: NDArray[np.bool_]
 
 def _asked_each(query: Query, entry: RecordingEntry, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
     """One small question a span and topic, which is answered by its first message."""
-    database = query.store.database_for("A predicate")
+    index = query.store.index_for("A predicate", [entry])
     topics = [t for t in query.topics if any(c.topic == t for c in entry.channels)]
     rows = np.flatnonzero(spans[:, 1] > spans[:, 0])
     found = np.zeros(len(spans), np.bool_)
@@ -141,7 +142,7 @@ def _asked_each(query: Query, entry: RecordingEntry, spans: NDArray[np.int64]) -
             (collection_of(topic), {"$and": [own, predicate]} if predicate else own)
             for own in conditions
         ]
-        found[rows] = np.array(database.count_each(asked, most=1), np.bool_)
+        found[rows] = np.array(index.count_each(asked, most=1), np.bool_)
     return found
 
 
@@ -189,24 +190,24 @@ def _is_whole(
 
 def _has_strangers(store: Store, database: Database) -> bool:
     """Whether there are recordings that the store did not know of when it was looked at."""
-    known = {entry.id for entry in store.recordings()}
-    if not known.issuperset(store.directory.recording_ids()):
+    labels = {entry.label for entry in store.recordings()} | store.repairs.copies.keys()
+    if not labels.issuperset(store.directory.labels()):
         return True
-    others = {"_id": {"$nin": sorted(known)}}
+    others = {"_id": {"$nin": sorted(entry.key for entry in store.recordings())}}
     return database.find_one(RECORDINGS, others, {"_id": 1}) is not None
 
 
 def _counted(
-    database: Database, topic: str, recordings: Sequence[RecordingEntry], asked: _Filter
+    index: GuardedIndex, topic: str, recordings: Sequence[RecordingEntry], asked: _Filter
 ) -> int:
     """What a filter finds: with an index in one go, else in parts side by side."""
     collection = collection_of(topic)
     parts = min(_messages(topic, recordings) // _PART, _MOST_PARTS, processors())
-    if parts < 2 or _is_served(database, collection, asked):
-        return database.count(collection, asked)
+    if parts < 2 or _is_served(index.database, collection, asked):
+        return index.count(collection, asked)
     filters = [{"$and": [part, dict(asked)]} for part in _key_ranges(topic, recordings, parts)]
     with ThreadPoolExecutor(parts, thread_name_prefix="hybridlog-count") as pool:
-        return sum(pool.map(lambda part: database.count(collection, part), filters))
+        return sum(pool.map(lambda part: index.count(collection, part), filters))
 
 
 def _key_ranges(

@@ -91,12 +91,12 @@ def windows(query: Query, before: DurationLike, after: DurationLike) -> Interval
         )
     if parse_duration(before) == parse_duration(after) == 0:
         raise UsageError("How long before or after? A window needs one of them.")
-    names = {entry.key: entry for entry in query.store.recordings()}
+    names = {int(entry.key, 16): entry for entry in query.store.recordings()}
     parts: list[tuple[int, NDArray[np.int64]]] = []
     for topic in query.topics:
         found = judged(query, topic, as_rows=True) if query.is_unthinned else None
         if found is not None:
-            parts.extend((p.recording.key, p.columns.log_time[p.rows()]) for p in found)
+            parts.extend((int(p.recording.key, 16), p.columns.log_time[p.rows()]) for p in found)
             continue
         for raw, rows, _ in query.thinned_documents(topic, _KEY):
             keys = key_columns(raw).take(rows)
@@ -198,9 +198,9 @@ def _holds(query: Query, key: bytes) -> NDArray[np.bool_]:
     own: _Filter = {"_id": key}
     if query.filter:
         own = {"$and": [own, query.filter]}
-    database = query.store.database_for("A state")
+    index = query.index_for("A state")
     # An index of the user's on the predicate's fields would be the long way to one document.
-    return np.array([bool(database.count(collection_of(query.topics[0]), own, by_key=True))])
+    return np.array([bool(index.count(collection_of(query.topics[0]), own, by_key=True))])
 
 
 def _merged(
@@ -235,16 +235,14 @@ def _changes_in(
     tolerance: float,
     changing: Changing,
 ) -> Iterator[NDArray[np.int64]]:
-    database = query.store.database_for("A change")
+    index = query.index_for("A change")
     collection = collection_of(query.topics[0])
     carried = b""
     start = _key_before(query, entry, span, query.filter)
     if start is not None:
-        carried = b"".join(database.find_raw(collection, {"_id": start}, projection))
+        carried = b"".join(index.find_raw(collection, {"_id": start}, projection))
     asked = _asked(entry, span, query.filter)
-    for raw in database.find_raw(
-        collection, asked, projection, sort=[("_id", 1)], batch_size=_BATCH
-    ):
+    for raw in index.find_raw(collection, asked, projection, sort=[("_id", 1)], batch_size=_BATCH):
         documents = carried + raw
         starts = split(documents)
         if len(starts):
@@ -293,7 +291,7 @@ def _asked(entry: RecordingEntry, span: Span, predicate: Mapping[str, object]) -
     """Documents of a recording in a span of log time that satisfy a predicate."""
     own: _Filter = {
         "_id": {"$gte": key_bound(span[0]), "$lt": key_bound(span[1])},
-        "_meta.rec": entry.id,
+        "_meta.rec": entry.key,
     }
     return {"$and": [own, dict(predicate)]} if predicate else own
 
@@ -306,7 +304,7 @@ def _key_before(
     if span[0] <= entry.span[0]:
         return None
     before = entry.span[0], span[0]
-    found = query.store.database_for("What was before").find_one(
+    found = query.index_for("What was before").find_one(
         collection_of(query.topics[0]),
         _asked(entry, before, predicate),
         _KEY,
@@ -317,8 +315,8 @@ def _key_before(
 
 def _keys(query: Query, asked: _Filter) -> Iterator[KeyColumns]:
     """Keys of the documents that a filter finds, in order, never an empty batch."""
-    database = query.store.database_for("A state")
-    for raw in database.find_raw(
+    index = query.index_for("A state")
+    for raw in index.find_raw(
         collection_of(query.topics[0]), asked, _KEY, sort=[("_id", 1)], batch_size=_BATCH
     ):
         keys = key_columns(raw)

@@ -54,7 +54,13 @@ from hybridlog.query.times import (
     parse_time,
 )
 from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.errors import SegmentError, TimeError, TopicError, UsageError
+from hybridlog_storage.errors import (
+    IndexChangedError,
+    SegmentError,
+    TimeError,
+    TopicError,
+    UsageError,
+)
 from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
@@ -62,6 +68,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.guarded import GuardedIndex
     from hybridlog.query.intervals import Intervals
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
@@ -198,8 +205,15 @@ class Query:
         A message in several of them is given once. Given twice, both must hold.
 
         Args:
-            intervals: From `intervals`, `changes` or `windows` of any query of this store.
+            intervals: From `intervals`, `changes` or `windows` of any query of this store, or
+                made by hand; recordings go by id or by label.
+
+        Raises:
+            TopicError: an interval is of a recording that is not in the store.
         """
+        known = self.store.recordings()
+        ids = {entry.label: entry.id for entry in known} | {entry.id: entry.id for entry in known}
+        intervals = intervals.by_id(ids)
         if self._windows is not None:
             intervals = self._windows.common(intervals)
         return self._with(_windows=intervals.merged())
@@ -268,7 +282,7 @@ class Query:
             now = parse_time(moment, start=start, end=end)
             if start < end and start <= now:
                 moments.append((min(now, end - 1), start, recording))
-        best: tuple[tuple[int, int, int], Message] | None = None
+        best: tuple[tuple[int, str, int], Message] | None = None
         # The recording that could hold the latest message is asked first: mostly it does.
         for latest, start, recording in sorted(moments, key=itemgetter(0), reverse=True):
             if best is not None and latest < best[0][0]:
@@ -298,7 +312,7 @@ class Query:
             return chunk
 
         def read(entry: ChunkEntry) -> StoredChunk:
-            key = recording.id, entry.segment, entry.offset
+            key = recording.id, entry.segment, entry.number
             return self.store.recent_chunks.get(key, partial(load, entry))
 
         chunks = self.store.chunks_before(recording, list(lanes), span)
@@ -370,7 +384,7 @@ class Query:
     def count(self) -> int:
         """Number of messages, without reading a payload."""
         started = time.monotonic()
-        total = -(-self._count() // self._every)
+        total = -(-self._count_again() // self._every)
         self.counters.messages = total if self._limit is None else min(total, self._limit)
         self.counters.elapsed_s = time.monotonic() - started
         return self.counters.messages
@@ -746,7 +760,7 @@ class Query:
             start, end = span_of(recording)
             # `2025-01-01` to `end` is no mistake, there is only nothing so late.
             if low < high or low == start or high == end:
-                spans.append(f"{recording.id} spans {format_time(start)} to {format_time(end)}")
+                spans.append(f"{recording.label} spans {format_time(start)} to {format_time(end)}")
         if not spans:
             start, end = span_of(outside[0][0])
             parse_range(begin, stop, start=start, end=end)
@@ -780,6 +794,18 @@ class Query:
             yield
         finally:
             self.counters.elapsed_s = time.monotonic() - started
+
+    def index_for(self, purpose: str) -> GuardedIndex:
+        """The index, to ask about the recordings of the question.
+
+        Args:
+            purpose: What it is needed for, if it is not to be had.
+
+        Raises:
+            DatabaseError: MongoDB is away.
+            IndexChangedError: Another process removes documents of these recordings.
+        """
+        return self.store.index_for(purpose, self._recordings())
 
     def empty_plan(self) -> Plan:
         """The channels of the question, and nothing to read."""
@@ -820,7 +846,7 @@ class Query:
         """Ask the index which messages of some chunks satisfy the predicate."""
         from hybridlog.frames.bson import reference_columns
 
-        database = self.store.database_for("A predicate")
+        index = self.index_for("A predicate")
         low, high = min(t.first for t in tasks), max(t.last for t in tasks)
         wanted = {t.key for t in tasks}
         found: dict[tuple[str, int, int], list[NDArray[np.int64]]] = {}
@@ -830,9 +856,9 @@ class Query:
         }
         for topic in self.topics:
             for recording in recordings:
-                query = self._filter({**bounds, "_meta.rec": recording})
+                query = self._filter({**bounds, "_meta.rec": recording[:16]})
                 # With the order MongoDB weighs the range against an index of the user's.
-                for raw in database.find_raw(
+                for raw in index.find_raw(
                     collection_of(topic), query, _REFERENCE, sort=[("_id", 1)]
                 ):
                     reference = reference_columns(raw)
@@ -856,7 +882,7 @@ class Query:
             window: Log time `[begin, end)`, ns, within the range of `between`.
         """
         bounds = self._bounds_in(recording)
-        conditions: dict[str, object] = {"_meta.rec": recording.id}
+        conditions: dict[str, object] = {"_meta.rec": recording.key}
         if bounds is not None and self._clock != "log":
             name = STAMP if self._clock == "header" else "_meta.pub"
             conditions[name] = {"$gte": bounds[0], "$lt": bounds[1]}
@@ -890,12 +916,23 @@ class Query:
         parts = [_any_of(group) for group in groups]
         return parts[::-1] if self._reverse else parts
 
+    def _count_again(self) -> int:
+        """What `_count` says, asked once more when another process has changed the index."""
+        try:
+            return self._count()
+        except IndexChangedError:
+            there = {recording.id for recording in self.store.recordings()}
+            if not there.issuperset(self.recording_ids):
+                raise
+        return self._count()
+
     def _count(self) -> int:
         self.counters.reset()
         if self._predicates:
             self.store.database_for("A predicate")
-        has_index = self.store.database is not None
         is_plain = not self._predicates and self.is_by_log_time
+        # A question about topics and log times alone asks no server.
+        has_index = not is_plain and self.store.database is not None
         total, left = 0, list(self.topics)
         if has_index and not is_plain:
             total, left = count_in_columns(self, self.topics)
@@ -928,33 +965,42 @@ class Query:
 
     def _count_between(self, target: Target) -> int:
         """Messages of one recording in the range of log time, whatever is in them."""
-        has_index = self.store.database is not None
-        topics = _topics_of(target)
-        counted = {t for t in topics if not has_index or _has_full_chunks(target.recording, t)}
-        channels = [c.id for c in target.recording.channels if c.topic in counted]
+        topics = set(_topics_of(target))
+        counted = topics
+        if self.store.connected is not None:
+            counted = {topic for topic in topics if _has_full_chunks(target.recording, topic)}
         total = 0
-        if channels:
-            span = target.bounds or (0, TIME_LIMIT - 1)
-            windows = self._windows_in(target.recording, span)
-            chunks = self._chunks(target.recording, channels, target.bounds, target.windows)
-            try:
-                total = count_in_chunks(
-                    chunks,
-                    set(channels),
-                    np.array(windows, np.int64).reshape(-1, 2),
-                    partial(self.store.segment, target.recording.id),
-                    self.counters,
-                )
-            except SegmentError:
-                if not has_index:
-                    raise
-                counted = set()  # the index knows it without the segment
-        others = [topic for topic in topics if topic not in counted]
+        try:
+            total = self._count_in_chunks(target, counted)
+        except SegmentError:
+            if self.store.database is None:
+                raise
+            counted = set()  # the index knows it without the segment
+        others = sorted(topics - counted)
         if not others:
             return total
         found, left = count_in_columns(self._with(recording_ids=(target.recording.id,)), others)
         total += found
-        return total + self._count_documents([(topic, target) for topic in left]) if left else total
+        if not left:
+            return total
+        try:
+            return total + self._count_documents([(topic, target) for topic in left])
+        except IndexChangedError:  # the segments know it without the index
+            return total + self._count_in_chunks(target, set(left))
+
+    def _count_in_chunks(self, target: Target, topics: set[str]) -> int:
+        """The same of some topics, without the index."""
+        channels = [c.id for c in target.recording.channels if c.topic in topics]
+        if not channels:
+            return 0
+        windows = self._windows_in(target.recording, target.bounds or (0, TIME_LIMIT - 1))
+        return count_in_chunks(
+            self._chunks(target.recording, channels, target.bounds, target.windows),
+            set(channels),
+            np.array(windows, np.int64).reshape(-1, 2),
+            partial(self.store.segment, target.recording.id),
+            self.counters,
+        )
 
     def _count_documents(self, wanted: Sequence[tuple[str, Target]]) -> int:
         """What the index has of topics of recordings in the range, where the predicate holds."""
@@ -963,7 +1009,7 @@ class Query:
             for topic, target in wanted
             for part in self._parts([target])
         ]
-        return sum(self.store.database_for("An index").count_each(filters))
+        return sum(self.index_for("An index").count_each(filters))
 
     def thinned_documents(
         self, topic: str, projection: Mapping[str, object] | None
@@ -976,7 +1022,7 @@ class Query:
         """
         from hybridlog_storage.bson_columns import split
 
-        database = self.store.database_for("Reading index documents")
+        index = self.index_for("Reading index documents")
         lanes: list[Lane] = []
         self.counters.reset()
         found = self._targets(lanes, with_chunks=False)
@@ -990,7 +1036,7 @@ class Query:
         for asked in [[part] for part in parts] if one_by_one else [parts]:
             most = 0 if self._limit is None else self._limit - given
             for raw in (
-                database.find_raw(
+                index.find_raw(
                     collection,
                     asked[0],
                     projection,
@@ -1000,9 +1046,7 @@ class Query:
                     batch_size=_BATCH,
                 )
                 if one_by_one
-                else database.find_each(
-                    collection, asked, projection, order=order, batch_size=_BATCH
-                )
+                else index.find_each(collection, asked, projection, order=order, batch_size=_BATCH)
             ):
                 count = len(split(raw))
                 rows = np.arange((-taken) % self._every, count, self._every)

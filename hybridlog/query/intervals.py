@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.losses import lost_spans
 from hybridlog.query.times import (
     TIME_LIMIT,
     DurationLike,
@@ -21,7 +22,7 @@ from hybridlog.query.times import (
     parse_duration,
 )
 from hybridlog.schema.column import ranges
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -240,6 +241,23 @@ class Intervals:
         end: NDArray[np.int64] = np.clip(self._end, low, high)
         return Intervals(self._recordings, self._recording, begin, end, self._messages)
 
+    def by_id(self, ids: Mapping[str, str]) -> Intervals:
+        """The same, of recordings that may have been named otherwise.
+
+        Args:
+            ids: Id of each recording, by its id and by its other names.
+
+        Raises:
+            TopicError: one of them is not among these.
+        """
+        unknown = [name for name in self._recordings if name not in ids]
+        if unknown:
+            raise TopicError(
+                f"An interval is of recording {unknown[0]!r}, which is not in the store."
+            )
+        names = tuple(ids[name] for name in self._recordings)
+        return Intervals(names, self._recording, self._begin, self._end, self._messages)
+
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """What of one recording is covered: int64[n, 2], begin and end, apart, in order."""
         if recording not in self._recordings:
@@ -271,11 +289,17 @@ class Intervals:
 def span_of(recording: RecordingEntry) -> Span:
     """Log time of a recording; empty at 0 without messages.
 
+    Stored messages that are lost count, so that relative times mean what they meant before.
     It ends no later than the last nanosecond that 64 bits can say: a message of just then
     is in no interval.
     """
-    span = recording.span
-    return (span[0], min(span[1] + 1, TIME_LIMIT - 1)) if span is not None else (0, 0)
+    spans = [*lost_spans(recording)]
+    if recording.span is not None:
+        spans.append(recording.span)
+    if not spans:
+        return 0, 0
+    first, last = min(first for first, _ in spans), max(last for _, last in spans)
+    return first, min(last + 1, TIME_LIMIT - 1)
 
 
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:

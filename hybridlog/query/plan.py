@@ -144,7 +144,7 @@ class Target:
 
 
 ChunkKey = tuple[str, int, int]
-"""Recording id, segment number, chunk offset."""
+"""Recording id, number of the segment, number of the chunk in it."""
 
 Chosen = Mapping[ChunkKey, "NDArray[np.int64]"]
 """Payload offsets (`_meta.ref.off`) of the chosen messages of each chunk, sorted."""
@@ -166,7 +166,7 @@ class Task:
     @property
     def key(self) -> ChunkKey:
         """Where the chunk lies."""
-        return self.target.recording.id, self.chunk.segment, self.chunk.offset
+        return self.target.recording.id, self.chunk.segment, self.chunk.number
 
 
 @dataclass(frozen=True, slots=True)
@@ -430,7 +430,7 @@ def _in_order(pieces: list[Piece], plan: Plan) -> Piece:
     """Put pieces into one, sorted by log time, recording and arrival."""
     if len(pieces) == 1 and not plan.reverse and _is_in_order(pieces[0]):
         return pieces[0]
-    keys = np.array([lane.recording.key for lane in plan.lanes], np.int64)
+    keys = np.array([int(lane.recording.key, 16) for lane in plan.lanes], np.uint64)
     times = np.concatenate([p.batch.log_time for p in pieces])
     lanes = np.concatenate([p.batch.channel for p in pieces])
     seq = np.concatenate([p.seq for p in pieces])

@@ -474,10 +474,13 @@ def test_strings_that_are_no_text_are_those_of_the_index(store: hl.Store, each_w
 def test_a_damaged_segment_leaves_the_answer_to_mongodb(store: hl.Store, at_once: None) -> None:
     rows = [(n % 12, "/state", {"i8": n % 3, "f64": float(n)}) for n in range(60)]
     recorded(store, {"one": rows})
-    (segment,) = store.directory.path.glob("**/000000.mcap")
+    (entry,) = store.recordings()
+    segment = store.directory.recording(entry.label) / "000000.mcap"
     content = bytearray(segment.read_bytes())
-    for place in range(300, len(content) // 2, 50):
-        content[place] ^= 0xFF
+    chunks = store.catalog.chunks(entry)
+    assert len(chunks) > 4
+    for chunk in chunks[::2]:
+        content[chunk.offset + chunk.length // 2] ^= 0xFF
     segment.write_bytes(content)
     assert store.topic("/state").where("i8 == 1").count() == 20
 
@@ -526,14 +529,14 @@ def test_a_message_at_the_end_of_time(store: hl.Store, each_way: None) -> None:
     recorded(store, {})
     path = store.directory.path / "last.mcap"
     write_log(path, [(t, "/state", message(usual(i8=1))) for t in (BASE, 2**63 - 1)], "last")
-    store.record(path)
+    last = store.record(path).entry.id
     assert [store.topic("/state").where("i8 == 1").count() for _ in range(3)] == [2, 2, 2]
     for most in (0, MOST_BYTES):
         store.kept.most_bytes = most
         asked = store.topic("/state").where("i8 == 1")
-        ((begin, end),) = asked.intervals().of_recording("last").tolist()
+        ((begin, end),) = asked.intervals().of_recording(last).tolist()
         assert (begin, end) == (BASE, 2**63 - 1)
-        windows = asked.windows(before="2ns", after="1ns").of_recording("last").tolist()
+        windows = asked.windows(before="2ns", after="1ns").of_recording(last).tolist()
         assert windows == [[BASE, BASE + 1], [2**63 - 3, 2**63 - 1]]
         # The last moment of all begins no interval.
         assert store.topic("/state").during(asked.intervals()).count() == 1

@@ -24,9 +24,9 @@ from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.columns.stored import NAME, FieldColumns
 from hybridlog.schema.column import Strings
 from hybridlog_storage import column_file
-from hybridlog_storage.catalog import CHUNKS, RECORDINGS, Catalog
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, TimeError
+from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.columns.test_kept import BASE, DEFINITION, SECOND, message, usual, write_log
@@ -57,7 +57,7 @@ def recorded(store: hl.Store, tmp_path: Path) -> hl.Store:
 
 
 def file_of(store: hl.Store, recording: str = "log") -> Path:
-    return store.directory.recording(recording) / NAME
+    return store.directory.recording(store.entry(recording).label) / NAME
 
 
 def value_of(document: dict[str, Any], path: str) -> Any:
@@ -161,7 +161,7 @@ def test_while_a_recording_goes_on_there_are_none(store: hl.Store) -> None:
     with store.start("live") as recording:
         recording.write(CHANNEL, message(usual()))
         assert store.columns(recording.id) is None
-        assert not file_of(store, recording.id).exists()
+        assert not (store.directory.recording(recording.label) / NAME).exists()
     assert store.columns(recording.id) is not None
 
 
@@ -187,16 +187,20 @@ def test_what_a_crash_has_left_gets_all_its_columns(recorded: hl.Store) -> None:
     path = recorded.directory.path
     before = file_of(recorded).read_bytes()
     # As if the recorder had been killed: some chunks are indexed, and the end is missing.
-    half = recorded.catalog.chunks("log")[1::2]
-    for chunk in half:
-        database.delete(CHUNKS, {"_id.off": chunk.offset})
-    entry = database.find_one(RECORDINGS, {"_id": "log"})
-    assert entry is not None
-    database.replace(RECORDINGS, {"_id": "log"}, {**entry, "status": "open"})
+    (entry,) = recorded.recordings()
+    chunks = recorded.catalog.chunks(entry)
+    half = chunks[1::2]
+    assert half
+    state = IndexState(database)
+    state.put(entry, "open", turn=1)
+    state.put_chunks(chunks[::2])
+    for topic in ("state", "other"):
+        database.delete(topic, {"_meta.ref.chunk": {"$in": [chunk.number for chunk in half]}})
     file_of(recorded).rename(path / f"recordings/log/{NAME}.part")
     recorded.close()
     with hl.open(path, require_database=True) as again:
-        assert again.tended.indexed == {"log": len(half)}
+        assert again.repairs.indexed == {"log": len(half)}
+        assert again.verify().findings == []
         assert file_of(again).read_bytes() == before
         assert compare_with_documents(again) == 20
     assert not list(path.glob("**/*.part"))
@@ -276,15 +280,15 @@ def test_a_file_that_lies_is_not_believed(store: hl.Store, tmp_path: Path, lie: 
 def test_a_chunk_that_is_indexed_twice_is_no_two_chunks(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put = Catalog.put_chunks
+    put = IndexState.put_chunks
     failures = iter([True])
 
-    def sometimes(catalog: Catalog, entries: Any) -> None:
+    def sometimes(state: IndexState, entries: Any) -> None:
         if next(failures, False):
             raise DatabaseError("for a moment")
-        put(catalog, entries)
+        put(state, entries)
 
-    monkeypatch.setattr(Catalog, "put_chunks", sometimes)
+    monkeypatch.setattr(IndexState, "put_chunks", sometimes)
     words = Channel("/words", "ros1", Schema("std_msgs/String", "ros1msg", b"string data"))
     with store.start("live", flush_interval_s=0.05) as recording:
         for word in (b"small", b"x" * 5000):
@@ -359,9 +363,11 @@ def test_whatever_fails_the_recording_goes_on(
 
 
 def test_columns_are_opened_while_all_is_forgotten(recorded: hl.Store) -> None:
+    log = recorded.entry("log").id
+
     def ask() -> None:
         for _ in range(300):
-            assert recorded.columns("log") is not None
+            assert recorded.columns(log) is not None
 
     with ThreadPoolExecutor(2) as pool:
         asked = [pool.submit(ask) for _ in range(2)]
@@ -430,7 +436,7 @@ def test_no_room_for_columns_is_no_loss(
     report = store.record(tmp_path / "log.mcap", name="log")
     assert room[0] < 0
     assert report.entry.status == "complete"
-    assert store.columns("log") is None
+    assert store.columns(store.entry("log").id) is None
     assert not list(store.directory.path.glob(f"**/{NAME}*"))
     assert store.topic("/state").where("i8 == 1").count() == 1
 
@@ -457,7 +463,7 @@ def test_a_topic_of_two_types_has_no_columns(store: hl.Store) -> None:
                 Channel("/state", "ros1", OTHER.schema), bytes(4), log_time=BASE + 10 + n
             )
             recording.write(OTHER, bytes(4), log_time=BASE + 20 + n)
-    columns, (entry,) = FieldColumns(store.directory.recording(recording.id)), store.recordings()
+    columns, (entry,) = FieldColumns(store.directory.recording(recording.label)), store.recordings()
     assert not columns.has(entry, "/state", {})
     assert columns.has(entry, "/other", {"data": "int32"})
 
@@ -468,7 +474,7 @@ def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Pa
     place.mkdir()
     gatherer = FieldGatherer(place)
     channels = {lane.channel_id: lane.channel for lane in recorded.lanes(entry)}
-    for chunk in recorded.catalog.chunks("log"):
+    for chunk in recorded.catalog.chunks(entry):
         read = recorded.segment("log", chunk.segment).read_chunk(chunk.place)
         gatherer.add(read, channels)
         gatherer.add(read, channels)
@@ -492,7 +498,7 @@ def test_chunks_may_come_in_any_order(
     name = live(store, 200, settings=SegmentSettings(chunk_size=1024, segment_size=8192))
     (entry,) = store.recordings()
     channels = {lane.channel_id: lane.channel for lane in store.lanes(entry)}
-    chunks = list(store.catalog.chunks(name))
+    chunks = store.catalog.chunks(entry)
     assert len({chunk.segment for chunk in chunks}) > 2
     shuffled = chunks[seed // 2 :: 2] + chunks[: seed // 2] + chunks[seed // 2 + 1 :: 2]
     if seed % 2:

@@ -63,9 +63,12 @@ def test_a_count_by_time_is_what_a_loop_counts(
     is_away: bool,
 ) -> None:
     model = recorded(store, logs)
-    windows = intervals(*((n, BASE + b * SECOND, BASE + (b + s) * SECOND) for n, b, s in spans))
+    ids = model.ids
+    windows = intervals(
+        *((ids[n], BASE + b * SECOND, BASE + (b + s) * SECOND) for n, b, s in spans)
+    )
     begin, end = (BASE + edges[0] * SECOND, BASE + (edges[0] + edges[1]) * SECOND)
-    both = intervals(("a", begin, end), ("b", begin, end))
+    both = intervals((ids["a"], begin, end), (ids["b"], begin, end))
     with (
         hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked,
         pytest.MonkeyPatch.context() as patch,
@@ -124,22 +127,35 @@ def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
         assert alone.topic("/state").between("+5s", "+165s").count() == 160
 
 
-@pytest.mark.parametrize("damage", ["time", "length", "opcode"])
+@pytest.mark.parametrize("damage", ["time", "place", "length", "opcode", "arrivals"])
 def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) -> None:
-    """An index has no checksum: what it says is held against the entry of its chunk."""
+    """Whether or not what it says could be: the catalog has the checksum of its bytes."""
     path = segment_of(many)
     whole = path.read_bytes()
     chunk = many.chunks(many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log")[0]
     index = chunk.offset + chunk.length
-    at = {"opcode": 0, "length": 2, "time": 9 + 6 + 16 + 5}[damage]
+    entry = 9 + 6 + 16  # the second one: record head, channel, length, the first one
+    at = {
+        "opcode": 0,
+        "length": 2,
+        "time": entry,
+        "place": entry + 8,
+        "arrivals": chunk.trailer - 1,
+    }[damage]
     damaged = bytearray(whole)
-    damaged[index + at] ^= 0x10
+    damaged[index + at] ^= 1
     path.write_bytes(damaged)
     try:
-        with hl.open(many.directory.path, require_database=True) as opened:
+        with (
+            hl.open(many.directory.path, require_database=True) as opened,
+            hl.open(many.directory.path, mongo=AWAY) as alone,
+        ):
             query = opened.topic("/state").between("+5s", "+165s")
-            assert query.count() == 160
-            # With another length nothing of the chunk is found, and the index of MongoDB tells.
-            assert query.counters.chunks_read == (damage != "length")
+            assert query.count() == 160  # by the index
+            assert query.counters.chunks_read == 0
+            with pytest.raises(SegmentError, match=f"{chunk.offset} of .*{path.name}"):
+                alone.topic("/state").between("+5s", "+165s").count()
+            # Within one range the chunk is not looked at.
+            assert alone.topic("/state").between("+20s", "+165s").count() == 145
     finally:
         path.write_bytes(whole)

@@ -61,6 +61,9 @@ def asked(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 # --- counts in all times --------------------------------------------------------------
 
+GONE = "f" * 16
+"""Key of a recording that the store does not know."""
+
 
 @several
 @given(
@@ -77,7 +80,7 @@ def test_a_count_is_what_a_loop_counts(
     chosen: tuple[str, ...],
 ) -> None:
     model = recorded(store, logs)
-    has = [name for name in chosen if model.of(name)]
+    has = [model.ids[name] for name in chosen if model.of(model.ids[name])]
     if not has:
         return
     database = store.database_for("the test")
@@ -138,7 +141,7 @@ def test_what_no_recording_has_is_not_counted(
     recorded(store, {"a": [(second, "/state", {"s": 1}) for second in range(6)]})
     query = store.topic("/state").where("s == 1")
     database = store.database_for("the test")
-    stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": "gone"}})
+    stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": GONE}})
     database.insert_raw("state", stray, 1)
     if trace != "documents":
         # The collection's own count is about right only, after a crash.
@@ -147,12 +150,12 @@ def test_what_no_recording_has_is_not_counted(
             Database, "count", lambda self, *a, **k: real(self, *a, **k) - (len(a) == 1)
         )
     if trace == "entry":
-        database.replace("hybridlog.recordings", {"_id": "gone"}, {"_id": "gone"})
+        database.replace("hybridlog.recordings", {"_id": GONE}, {"_id": GONE})
     if trace == "directory":
         (store.directory.path / "recordings" / "gone").mkdir()
     assert query.count() == 6
-    database.delete("hybridlog.recordings", {"_id": "gone"})
-    database.delete("state", {"_meta.rec": "gone"})
+    database.delete("hybridlog.recordings", {"_id": GONE})
+    database.delete("state", {"_meta.rec": GONE})
     if trace == "directory":
         (store.directory.path / "recordings" / "gone").rmdir()
 
@@ -167,16 +170,16 @@ def test_a_recording_that_begins_during_a_count(
     counted = counting._counted
 
     def slowly(*args: Any) -> int:
-        if not database.find_one("hybridlog.recordings", {"_id": "new"}):
-            database.replace("hybridlog.recordings", {"_id": "new"}, {"_id": "new"})
-            stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": "new"}})
+        if not database.find_one("hybridlog.recordings", {"_id": GONE}):
+            database.replace("hybridlog.recordings", {"_id": GONE}, {"_id": GONE})
+            stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": GONE}})
             database.insert_raw("state", stray, 1)
         return counted(*args)
 
     monkeypatch.setattr(counting, "_counted", slowly)
     assert query.count() == 6
-    database.delete("hybridlog.recordings", {"_id": "new"})
-    database.delete("state", {"_meta.rec": "new"})
+    database.delete("hybridlog.recordings", {"_id": GONE})
+    database.delete("state", {"_meta.rec": GONE})
 
 
 def test_a_short_range_is_read_by_its_keys_whatever_indexes_there_are(store: hl.Store) -> None:
@@ -235,7 +238,9 @@ def test_intervals_that_contain_a_message_are_what_a_loop_finds(
     store: hl.Store, logs: dict[str, Any], spans: list[tuple[str, int, int]], several_reads: float
 ) -> None:
     model = recorded(store, logs)
-    rows = intervals(*((name, BASE + b * SECOND, BASE + (b + n) * SECOND) for name, b, n in spans))
+    rows = intervals(
+        *((model.ids[name], BASE + b * SECOND, BASE + (b + n) * SECOND) for name, b, n in spans)
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(counting, "_SEVERAL", several_reads)
         for topics in (store.topics(), ["/state"]):

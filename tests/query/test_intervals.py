@@ -44,6 +44,25 @@ def intervals(*rows: tuple[str, int, int]) -> Intervals:
 # --- the parts ------------------------------------------------------------------------
 
 
+def test_intervals_that_only_touch_have_nothing_in_common() -> None:
+    late, early = intervals(("r", 10, 20)), intervals(("r", 0, 10))
+    assert len(late.common(early)) == len(early.common(late)) == 0
+    both = intervals(("r", 0, 10), ("r", 20, 30))
+    assert [(i.begin_ns, i.end_ns) for i in intervals(("r", 9, 21)).common(both)] == [
+        (9, 10),
+        (20, 21),
+    ]
+
+
+@pytest.mark.parametrize("max_gap", [2**62, 2**63 - 2, 2**63 - 1])
+def test_a_state_may_be_believed_for_ever(max_gap: int) -> None:
+    """No time that a recording can have is beyond what is believed."""
+    begin = 1_400_000_000 * SECOND
+    holding = Holding(max_gap)
+    assert not len(holding.add(np.array([begin, begin + SECOND]), np.array([True, True])))
+    assert listed(holding.finish(begin + 2 * SECOND)) == [(begin, begin + 2 * SECOND, 2)]
+
+
 def naive_holding(said: Sequence[tuple[int, bool]], end: int, max_gap: int | None) -> Rows:
     """Looks at every nanosecond."""
     holds = set()
@@ -217,9 +236,11 @@ class Said:
 
 
 class Model:
-    """Two recordings that overlap in time, and the naive answers about them."""
+    """Recordings that overlap in time, by id, and the naive answers about them."""
 
-    def __init__(self, logs: dict[str, list[Said]]) -> None:
+    def __init__(self, logs: dict[str, list[Said]], ids: dict[str, str]) -> None:
+        self.ids = ids
+        """Of each recording, by the name it was given."""
         self.logs = {name: sorted(log, key=lambda m: m.time) for name, log in logs.items()}
 
     def of(self, name: str, topic: str = "/state") -> list[Said]:
@@ -316,12 +337,14 @@ def recorded(store: hl.Store, logs: dict[str, Any]) -> Model:
     """Put logs in the place of what the store has."""
     for entry in store.recordings():
         store.remove(entry.id)
-    said = {}
+    said, ids = {}, {}
     for name, rows in logs.items():
         path = store.directory.path / f"{name}.mcap"
-        said[name] = write_log(path, rows, next(_marks))
-        store.record(path, name=name, settings=SegmentSettings(chunk_size=1024))
-    return Model(said)
+        messages = write_log(path, rows, next(_marks))
+        report = store.record(path, name=name, settings=SegmentSettings(chunk_size=1024))
+        ids[name] = report.entry.id
+        said[report.entry.id] = messages
+    return Model(said, ids)
 
 
 HOLDS = {
@@ -371,8 +394,7 @@ def test_what_a_store_says_is_what_a_loop_says(
     if between is not None:
         span = BASE + between[0] * SECOND, BASE + (between[0] + between[1]) * SECOND
         query = query.between(f"{span[0]}ns", f"{span[1]}ns")
-        names = {r.id for r in store.recordings() if r.id in query.recording_ids}
-        if all(not _meet(model.span(name), span) for name in names):
+        if all(not _meet(model.span(name), span) for name in query.recording_ids):
             with pytest.raises(TimeError, match="Nothing was recorded"):
                 query.intervals()
             return
@@ -394,7 +416,7 @@ def test_what_a_store_says_is_what_a_loop_says(
     )
 
     for fields in (("s",), ("x",), ("name", "v"), ("s", "x", "name", "v")):
-        if not any(f in m.value for m in model.of("a") + model.of("b") for f in fields):
+        if not any(f in m.value for name in model.logs for m in model.of(name) for f in fields):
             continue
         steps = model.steps(_key(fields), span)
         apart = query.changes(*fields, pause=0)

@@ -43,7 +43,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 
 
 def looked_for(
-    model: Model, keys: dict[str, int], topics: set[str], now: int, states: set[int]
+    model: Model, keys: dict[str, str], topics: set[str], now: int, states: set[int]
 ) -> tuple[str, object] | None:
     """Recording and number of the current message: by time, recording, then arrival."""
     found = [
@@ -135,7 +135,7 @@ def test_what_was_read_is_forgotten_with_its_recording(many: hl.Store) -> None:
 
 def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
     entry = many.recordings()[0]
-    path = many.directory.recording(entry.id) / "000000.mcap"
+    path = many.directory.recording(entry.label) / "000000.mcap"
     whole = path.read_bytes()
     last = many.chunks(entry, [entry.channels[0].id], None, "log")[-1]
     place = last.offset + last.length - 1
@@ -176,7 +176,18 @@ def chunk(number: int, size: int) -> StoredChunk:
     batch = Batch(
         bytearray(size), one, one + size, np.zeros(1, np.int32), one, one, one.astype(np.uint32)
     )
-    return StoredChunk(0, number, size, 0, batch, one, size)
+    return StoredChunk(
+        segment=0,
+        number=number,
+        offset=1000 * number,
+        length=size,
+        trailer=0,
+        crc=0,
+        trailer_crc=0,
+        batch=batch,
+        seq=one,
+        compressed_size=size,
+    )
 
 
 class Reading:
@@ -197,7 +208,7 @@ class Reading:
 def test_those_that_were_not_asked_for_longest_go_first() -> None:
     reading = Reading(RecentChunks(3500))
     for number in (1, 2, 3, 1, 4, 1, 2):
-        assert reading.get(number).offset == number
+        assert reading.get(number).number == number
     assert reading.read == [1, 2, 3, 4, 2]  # 2 had to go for 4
 
 
@@ -205,8 +216,8 @@ def test_a_chunk_without_room_is_given_and_not_kept() -> None:
     reading = Reading(RecentChunks(3500))
     reading.get(1)
     assert len(reading.get(2, size=4000).batch.buffer) == 4000
-    assert reading.get(2, size=4000).offset == 2
-    assert reading.get(1).offset == 1
+    assert reading.get(2, size=4000).number == 2
+    assert reading.get(1).number == 1
     assert reading.read == [1, 2, 2]
 
 
@@ -219,7 +230,7 @@ def test_nothing_is_kept_of_what_could_not_be_read() -> None:
     for _ in range(2):
         with pytest.raises(SegmentError):
             chunks.get(("a", 0, 1), damaged)
-    assert Reading(chunks).get(1).offset == 1
+    assert Reading(chunks).get(1).number == 1
 
 
 def test_several_threads_ask_for_the_same_chunks() -> None:
@@ -229,7 +240,7 @@ def test_several_threads_ask_for_the_same_chunks() -> None:
     def ask(seed: int) -> None:
         reading = Reading(chunks)
         numbers = np.random.default_rng(seed).integers(0, 10, 2000).tolist()
-        wrong.extend(number for number in numbers if reading.get(number).offset != number)
+        wrong.extend(number for number in numbers if reading.get(number).number != number)
 
     threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
     for thread in threads:

@@ -1,0 +1,153 @@
+"""The index as questions see it: an answer counts only if nothing was removed meanwhile.
+
+Another process may remove a recording, or make its index again, at any moment. It says so
+in the database before the first document goes. So whoever asks looks there once more after
+each answer: one small question, of one document. Before the first one it is made sure that
+all documents of the recordings are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hybridlog_storage.errors import IndexChangedError
+from hybridlog_storage.index_state import IndexState
+
+if TYPE_CHECKING:
+    from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.index_state import Progressed
+
+_Filter = Mapping[str, object]
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What the index said of itself at a time.
+
+    Attributes:
+        turn: How often documents of any recording were about to be removed.
+        recordings: How far each recording was that was looked at, by key; None for one that
+            is not in the index. Looked at after `turn` was.
+    """
+
+    turn: int
+    recordings: Mapping[str, Progressed | None]
+
+    @classmethod
+    def of(cls, database: Database, keys: Collection[str], before: Belief | None) -> Belief:
+        """What it says now of some recordings, and of those that it said something of before."""
+        state = IndexState(database)
+        if before is not None and before.recordings.keys() >= set(keys):
+            return before
+        turn = state.turn()
+        known = before.recordings if before is not None and before.turn == turn else {}
+        missing = set(keys) - known.keys()
+        return cls(turn, {**known, **dict.fromkeys(missing), **state.progress(missing)})
+
+    def problem(self, entry: RecordingEntry) -> str | None:
+        """Why the index cannot answer for a recording; None when it can."""
+        found = self.recordings[entry.key]
+        if found is None:
+            gone = f"Recording {entry.label!r} was removed from the index by another process."
+            return None if entry.status == "open" else f"{gone} Ask again."
+        if entry.status == "open" or entry.digests.items() <= dict(found.segments).items():
+            return None
+        return (
+            f"The index of recording {entry.label!r} is not complete: another process changes it "
+            "at this moment. Ask again when that is done; questions by topic and time are "
+            "answered all the same."
+        )
+
+
+class GuardedIndex:
+    """Asks the index about some recordings. Thread safe.
+
+    The methods are those of `Database`, and raise what those raise.
+
+    Args:
+        store: Whose index.
+        database: The same, connected.
+        entries: The recordings.
+
+    Raises:
+        IndexChangedError: Not all documents of these recordings are there.
+    """
+
+    def __init__(self, store: Store, database: Database, entries: Sequence[RecordingEntry]) -> None:
+        self.database = database
+        self._store = store
+        self._entries = entries
+        self._keys = {entry.key for entry in entries}
+        self._belief = store.belief(database, self._keys)
+        self._refuse(self._belief)
+
+    def count(self, collection: str, asked: _Filter | None = None, *, by_key: bool = False) -> int:
+        """Number of documents that match."""
+        return self._once(lambda: self.database.count(collection, asked, by_key=by_key))
+
+    def count_each(self, questions: Sequence[tuple[str, _Filter]], *, most: int = 0) -> list[int]:
+        """Numbers of documents that match each of many questions."""
+        return self._once(lambda: self.database.count_each(questions, most=most))
+
+    def find_one(self, collection: str, *args: Any, **options: Any) -> dict[str, Any] | None:
+        """The first document, None when there is none."""
+        return self._once(lambda: self.database.find_one(collection, *args, **options))
+
+    def find_raw(self, collection: str, *args: Any, **options: Any) -> Iterator[bytes]:
+        """Documents as bytes, many in one item."""
+        return self._each(self.database.find_raw(collection, *args, **options))
+
+    def find_each(
+        self, collection: str, filters: Sequence[_Filter], *args: Any, **options: Any
+    ) -> Iterator[bytes]:
+        """Documents of many questions, one after the other, as `find_raw` gives them."""
+        return self._each(self.database.find_each(collection, filters, *args, **options))
+
+    def _once(self, ask: Callable[[], _T]) -> _T:
+        found = ask()
+        self._check()
+        return found
+
+    def _each(self, found: Iterator[bytes]) -> Iterator[bytes]:
+        """Items that are believed: each is kept back until there is another one, or no more."""
+        kept: bytes | None = None
+        for item in found:
+            if kept is not None:
+                self._check()
+                yield kept
+            kept = item
+        self._check()
+        if kept is not None:
+            yield kept
+
+    def _check(self) -> None:
+        """Make sure that what was found is all there was.
+
+        Raises:
+            IndexChangedError: It may not be; what the store knows is read anew.
+        """
+        if IndexState(self.database).turn() == self._belief.turn:
+            return
+        before = self._belief
+        self._belief = self._store.belief(self.database, self._keys, anew=True)
+        self._refuse(self._belief)
+        for entry in self._entries:
+            then, now = before.recordings[entry.key], self._belief.recordings[entry.key]
+            if then is not None and (now is None or now.turn != then.turn):
+                self._store.refresh()
+                raise IndexChangedError(
+                    f"The index of recording {entry.label!r} was changed by another process "
+                    "while it was asked. Ask again."
+                )
+
+    def _refuse(self, belief: Belief) -> None:
+        for entry in self._entries:
+            problem = belief.problem(entry)
+            if problem is not None:
+                self._store.refresh()
+                raise IndexChangedError(problem)
