@@ -155,6 +155,14 @@ RecordingOption = Annotated[
         autocompletion=complete_recording,
     ),
 ]
+OneRecording = Annotated[
+    str,
+    typer.Argument(
+        help="A recording: label, name, or the beginning of its id.",
+        metavar="RECORDING",
+        autocompletion=complete_recording,
+    ),
+]
 RunningOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -359,6 +367,12 @@ def record(
     after: Annotated[
         str | None, typer.Option(help="With --ring: time after the trigger.", metavar="TIME")
     ] = None,
+    shared: Annotated[
+        bool,
+        typer.Option(
+            "--shared", help="If this makes the store: let the group of its directory write it."
+        ),
+    ] = False,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -411,6 +425,7 @@ def record(
             chunk_size,
             compression.value,
             level,
+            shared,
             mongo,
             as_json,
             quiet,
@@ -519,17 +534,113 @@ def mark(
         list[str] | None, typer.Option(help="Keep KEY=VALUE with it. Repeatable.", metavar="K=V")
     ] = None,
     recording: RunningOption = None,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="Mark a recording that has ended, at this time: as for --between.", metavar="T"
+        ),
+    ] = None,
     store: StoreOption = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Set a mark while recording, that questions can use.
+    """Set a mark that questions can use, now or at a time gone by.
 
     A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --event
     /hybridlog/marks "text = 'gripper slipped'" --before 5s --after 5s`.
     """
+    if at is not None:
+        from hybridlog.cli import edit
+
+        edit.mark(text, tag or [], recording or [], at, store, quiet=quiet)
+        return
     from hybridlog.cli import mark as command
 
     command.run(text, tag or [], recording or [], store, quiet=quiet)
+
+
+@app.command()
+def rename(
+    recording: OneRecording,
+    name: Annotated[str, typer.Argument(help="Its new name.", metavar="NAME")],
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Give a recording another name.
+
+    Its directory is renamed, too; the recording stays the same for everything else.
+    """
+    from hybridlog.cli import edit
+
+    edit.rename(recording, name, store, quiet=quiet)
+
+
+@app.command()
+def tag(
+    recording: OneRecording,
+    pairs: Annotated[
+        list[str] | None, typer.Argument(help="Tags; without, show them.", metavar="KEY=VALUE")
+    ] = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Keep tags with a recording."""
+    from hybridlog.cli import edit
+
+    edit.tag(recording, pairs or [], store, as_json=as_json, quiet=quiet)
+
+
+@app.command()
+def untag(
+    recording: OneRecording,
+    keys: Annotated[list[str], typer.Argument(help="Keys of tags.", metavar="KEY")],
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Remove tags of a recording."""
+    from hybridlog.cli import edit
+
+    edit.untag(recording, keys, store, quiet=quiet)
+
+
+@app.command()
+def note(
+    recording: OneRecording,
+    text: Annotated[str, typer.Argument(help="What to remember.", metavar="TEXT")],
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Write a note about a recording; `info` shows it."""
+    from hybridlog.cli import edit
+
+    edit.note(recording, text, store, quiet=quiet)
+
+
+@app.command(name="import")
+def import_store(
+    other: Annotated[
+        Path, typer.Argument(help="The other store's directory.", metavar="STORE", readable=False)
+    ],
+    recording: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--recording",
+            "-r",
+            help="Only this recording of it (label, name, or id). Repeatable.",
+            metavar="RECORDING",
+        ),
+    ] = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Copy recordings in from another store.
+
+    Every byte is checked. After an interruption, run it again: what was copied stays.
+    """
+    from hybridlog.cli import edit
+
+    edit.import_store(other, recording, store, as_json=as_json, quiet=quiet)
 
 
 @app.command()
@@ -812,15 +923,20 @@ def index(
 
 @app.command()
 def reindex(
+    recording: RecordingOption = None,
     store: StoreOption = None,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Drop the index and make it again from the segments."""
+    """Make the index again from the segments, recording by recording.
+
+    The others go on answering meanwhile. After an interruption, the next command that needs
+    the index finishes the recording at which it was stopped.
+    """
     from hybridlog.cli import maintain
 
-    maintain.reindex(store, mongo, as_json=as_json, quiet=quiet)
+    maintain.reindex(recording, store, mongo, as_json=as_json, quiet=quiet)
 
 
 @app.command()
@@ -838,11 +954,48 @@ def verify(
 ) -> None:
     """Read everything, check checksums and references.
 
-    Exits with 1, and a list, when something is off.
+    Exits with 1, and a list with a cure for each, when something is off.
     """
     from hybridlog.cli import maintain
 
     maintain.verify(recording, store, mongo, as_json=as_json, quiet=quiet)
+
+
+@app.command()
+def repair(
+    recording: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Only these recordings.", metavar="RECORDING", autocompletion=complete_recording
+        ),
+    ] = None,
+    store: StoreOption = None,
+    moved: Annotated[
+        bool,
+        typer.Option("--moved", help="The store was moved here: its index comes along."),
+    ] = False,
+    new_id: Annotated[
+        bool,
+        typer.Option(
+            "--new-id",
+            help="The store is a copy: make it a store of its own, with the index at --mongo.",
+        ),
+    ] = False,
+    mongo: MongoOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Mend what can be mended without losing anything.
+
+    Segments get their own names again, damaged summaries and journals are written again,
+    catalog and index are brought up to date. Exits with 1, and a list, when something is
+    left that only a copy can restore.
+    """
+    from hybridlog.cli import maintain
+
+    maintain.repair(
+        recording, store, mongo, moved=moved, new_id=new_id, as_json=as_json, quiet=quiet
+    )
 
 
 @app.command()
@@ -859,6 +1012,23 @@ def rm(
     from hybridlog.cli import maintain
 
     maintain.remove(recording, store, mongo, yes=yes)
+
+
+@app.command()
+def trust(
+    store: StoreOption = None,
+    forget: Annotated[
+        bool, typer.Option("--forget", help="Agree no more to what this store names.")
+    ] = False,
+) -> None:
+    """Agree to the MongoDB that a store of somebody else's names.
+
+    Without that, commands do not connect there: only what this user made is trusted. The
+    password is not kept in the store: see HYBRIDLOG_MONGO_PASSWORD.
+    """
+    from hybridlog.cli import trust as command
+
+    command.run(store, forget=forget)
 
 
 @app.command()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from hybridlog.losses import topics_of
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def question(store: Store, topics: Sequence[str] | None, recordings: Sequence[st
     from hybridlog.query.topics import resolve
 
     chosen = store.select(recordings)
-    known = {channel.topic for entry in chosen for channel in entry.channels}
+    known = {topic for entry in chosen for topic in topics_of(entry)}
     with _explained(lambda: chosen):
         names = resolve(topics, known) if topics else sorted(known)
     return store.query(names, [entry.id for entry in chosen])
@@ -48,7 +49,7 @@ def _explained(recordings: Callable[[], Sequence[RecordingEntry]]) -> Iterator[N
     try:
         yield
     except TopicError as error:
-        names = [entry.id for entry in recordings() if entry.status == "open"]
+        names = [entry.label for entry in recordings() if entry.status == "open"]
         if not names:
             raise
         are = "is" if len(names) == 1 else "are"

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def complete_recording(context: typer.Context, incomplete: str) -> list[str]:
-    """Ids of recordings that begin with what was typed."""
+    """Labels of recordings that begin with what was typed."""
     with _nothing_on_error():
-        return [i for i in _store(context).recording_ids() if i.startswith(incomplete)]
+        return [i for i in _store(context).labels() if i.startswith(incomplete)]
     return []
 
 
@@ -46,9 +46,9 @@ def complete_topic(context: typer.Context, incomplete: str) -> list[str]:
         directory = _store(context)
         given = context.params.get("recording") or ()
         wanted = (given,) if isinstance(given, str) else tuple(given)
-        ids = directory.recording_ids()
+        labels = directory.labels()
         # A recording may be given by its name, too, which is not looked up here.
-        topics = _topics(directory, [i for i in ids if i.startswith(wanted)] or ids)
+        topics = _topics(directory, [i for i in labels if i.startswith(wanted)] or labels)
         found = {topic for topic in topics if topic.startswith(incomplete)}
         if incomplete and not incomplete.startswith("/"):
             found.update(n for n in _short_names(topics) if n.startswith(incomplete))
@@ -64,13 +64,14 @@ def _store(context: typer.Context) -> StoreDirectory:
     return StoreDirectory(store_path(os.path.expanduser(value) if value is not None else None))  # noqa: PTH111
 
 
-def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
-    from hybridlog.entries import StoredSummaries, channels_of
+def _topics(directory: StoreDirectory, labels: Sequence[str]) -> set[str]:
+    from hybridlog.entries import read_summary
 
     return {
         channel.topic
-        for recording in recordings
-        for channel in channels_of(StoredSummaries(directory, recording)).values()
+        for label in labels
+        for number, path in directory.segments(label)
+        for channel in read_summary(path, number).channels.values()
     }
 
 

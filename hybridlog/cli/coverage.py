@@ -16,7 +16,18 @@ if TYPE_CHECKING:
 def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording; what a crash cut off stands in it, too."""
     losses = [dict(loss) for loss in entry.end.get("losses", [])]
-    if entry.status == "recovered":
+    if entry.status == "unfinished":
+        losses.append(
+            {
+                "cause": "cut short by a crash",
+                "file": "",
+                "offset": None,
+                "reason": "its last segment is read once the store can be written again",
+                "count": None,
+                "topic": None,
+            }
+        )
+    if was_cut_short(entry):
         losses.append(
             {
                 "cause": "cut short by a crash",
@@ -41,6 +52,11 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     return losses
 
 
+def was_cut_short(entry: RecordingEntry) -> bool:
+    """Whether a crash ended a recording, whatever else is the matter with it."""
+    return "recovered" in {entry.status, entry.end.get("status")}
+
+
 def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     """How much of a recording is there: `complete`, or how much is missing."""
     wished = sum(loss["count"] or 0 for loss in losses if loss["cause"] == Cause.THROTTLE)
@@ -53,6 +69,8 @@ def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     if not losses:
         if entry.status == "open":
             return "being recorded"
+        if entry.status == "unproven":
+            return "not known: its journal was lost, so a segment may be missing"
         # A log of no messages is complete without any; of a robot nobody can say that.
         is_live = not entry.source["bytes"]
         return "nothing was received" if is_live and not entry.messages else "complete"
@@ -94,7 +112,9 @@ def gaps(
     """
     for entry in recordings:
         if entry.status == "open":
-            yield f"{entry.id} is still being recorded; what comes later is not in this answer."
+            yield f"{entry.label} is still being recorded; what comes later is not in this answer."
+        if entry.status == "unproven":
+            yield f"{entry.label} has lost its journal, so this answer may not be complete."
         if between is not None and not _touches(entry, between):
             continue
         losses = [
@@ -105,11 +125,11 @@ def gaps(
         ]
         wished = [loss for loss in losses if loss["cause"] == Cause.THROTTLE]
         for loss in wished:
-            yield f"{entry.id}: {line_of(loss)} while it was recorded."
+            yield f"{entry.label}: {line_of(loss)} while it was recorded."
         if len(losses) > len(wished):
             yield (
-                f"{entry.id} is not complete, so this answer may not be: "
-                f"{describe(entry, losses)}; `hybridlog info {entry.id}` says where."
+                f"{entry.label} is not complete, so this answer may not be: "
+                f"{describe(entry, losses)}; `hybridlog info {entry.label}` says where."
             )
 
 
@@ -125,7 +145,8 @@ def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
         low, high = parse_range(*between, start=start, end=end)
     except TimeError:  # empty in this recording: nothing of the answer is from there
         return False
-    return high > start and (low < end or entry.status == "recovered")
+    is_cut = entry.status == "unfinished" or was_cut_short(entry)
+    return high > start and (low < end or is_cut)
 
 
 def tell_unreadable(missing: int) -> None:

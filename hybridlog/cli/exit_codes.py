@@ -21,8 +21,8 @@ EXIT_CODES: Final = {
     9: "an optional package is missing",
     10: "fields are asked for that a message definition does not give",
     INTERNAL: "a mistake in hybridlog itself",
-    130: "interrupted (Ctrl-C); nothing half-made is kept",
-    143: "ended (SIGTERM); nothing half-made is kept",
+    130: "interrupted (Ctrl-C): taken back, or finished by a later command",
+    143: "ended (SIGTERM): taken back, or finished by a later command",
 }
 
 

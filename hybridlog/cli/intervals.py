@@ -15,7 +15,7 @@ from hybridlog.cli.fetch import closing_line, names_of
 from hybridlog.cli.opening import opened
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.reader import Query
@@ -87,12 +87,13 @@ def _show(
         for predicate in asked.where or ():
             query = query.where(predicate)
         found = answer(query)
+        labels = {entry.id: entry.label for entry in store.recordings()}
         if count:
             output.say(str(len(found)))
         elif as_json:
-            output.print_json([_as_dict(row) for row in found])
+            output.print_json([_as_dict(row, labels) for row in found])
         elif len(found):
-            _print(found)
+            _print(found, labels)
         sys.stdout.flush()
         if quiet:
             return
@@ -104,16 +105,16 @@ def _show(
             output.note(line)
 
 
-def _as_dict(row: Interval) -> dict[str, object]:
+def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:
     return {
-        "recording": row.recording,
+        "recording": labels[row.recording],
         "begin_ns": row.begin_ns,
         "end_ns": row.end_ns,
         "messages": row.messages,
     }
 
 
-def _print(found: Intervals) -> None:
+def _print(found: Intervals, labels: Mapping[str, str]) -> None:
     from hybridlog.query.times import format_duration, format_time
 
     columns: list[output.Column] = [
@@ -128,7 +129,7 @@ def _print(found: Intervals) -> None:
     rows = []
     for row in found:
         cells = [
-            row.recording,
+            labels[row.recording],
             format_time(row.begin_ns),
             format_time(row.end_ns),
             format_duration(row.duration_ns),

@@ -75,7 +75,7 @@ class Closing:
             rows = closing_rows(reports[0], state, self._unreached)
             if self._recorder.reason:
                 rows.append(("ended", self._recorder.reason))
-            output.print_table([("recording", "left"), (reports[0].entry.id, "left")], rows)
+            output.print_table([("recording", "left"), (reports[0].entry.label, "left")], rows)
         elif reports:
             _print_snapshots(reports)
         else:
@@ -145,7 +145,7 @@ def _print_snapshots(reports: Sequence[RecordReport]) -> None:
         [("snapshot", "left"), ("because of", "left"), ("messages", "right"), ("stored", "right")],
         [
             (
-                report.entry.id,
+                report.entry.label,
                 report.entry.tags.get("trigger", ""),
                 str(report.entry.messages),
                 output.size(report.entry.stored_bytes),
@@ -158,7 +158,7 @@ def _print_snapshots(reports: Sequence[RecordReport]) -> None:
 def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
     recordings = [
         {
-            "recording": report.entry.id,
+            "recording": report.entry.label,
             "status": report.entry.status,
             "tags": report.entry.tags,
             "messages": report.entry.messages,

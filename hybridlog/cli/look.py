@@ -12,6 +12,7 @@ from hybridlog.cli.observed import observed_fields
 from hybridlog.cli.opening import opened
 from hybridlog.cli.segment import show_segment
 from hybridlog.latched import depth_of
+from hybridlog.losses import Cause
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import REDUCED, Channel
 
@@ -25,6 +26,8 @@ _STATUS = {
     "open": "being recorded",
     "damaged": "source damaged",
     "recovered": "cut short by a crash",
+    "unfinished": "cut short by a crash, not recovered yet",
+    "unproven": "journal lost",
 }
 
 
@@ -54,14 +57,14 @@ def list_recordings(store: Path | None, mongo: str | None, *, as_json: bool) -> 
 
 def _line(entry: RecordingEntry, *, narrow: bool) -> list[str]:
     span = entry.span
-    notes = [] if entry.status == "complete" else [_STATUS.get(entry.status, entry.status)]
-    if entry.name != entry.id:
+    notes = [] if entry.status == "complete" else [_status(entry)]
+    if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
     known = not _is_unknown(entry)
     start = output.short_time(span[0], minutes=narrow) if span else "-"
     cells = [
-        entry.id,
+        entry.label,
         start,
         output.short_duration(span[1] - span[0]) if span else "-",
         str(entry.messages) if known else "-",
@@ -85,9 +88,7 @@ def show_info(what: str | None, store: Path | None, mongo: str | None, *, as_jso
         return
     with opened(store, mongo, quiet=as_json) as view:
         chosen = view.select([what]) if what is not None else view.recordings()
-        index = None
-        if view.database is not None:
-            index = f"database {view.database.name} at {view.database.address}"
+        index = view.index_place
     if as_json:
         full = [_full(r) for r in chosen]
         output.print_json(full[0] if what is not None else full)
@@ -121,7 +122,7 @@ def show_schema(
             schema = lane.channel.schema
             key = (lane.channel.topic, lane.recording.id if schema is None else repr(schema))
             if key in seen:
-                seen[key]["recordings"].append(lane.recording.id)
+                seen[key]["recordings"].append(lane.recording.label)
             else:
                 seen[key] = _of_channel(view, lane)
     if not seen:
@@ -169,7 +170,7 @@ def _of_channel(store: Store, lane: Lane) -> dict[str, Any]:
         "message_encoding": channel.message_encoding,
         "schema_encoding": schema.encoding if schema is not None else None,
         "definition": text,
-        "recordings": [lane.recording.id],
+        "recordings": [lane.recording.label],
         "not_indexed": codec.reason,
         "observed": observed,
         "fields": fields,
@@ -183,10 +184,19 @@ def _asked_as(field: dict[str, Any]) -> str:
     return path
 
 
+def _status(entry: RecordingEntry) -> str:
+    """The status of a recording, for people."""
+    losses = entry.end.get("losses", ())
+    if entry.status == "damaged" and any(loss["cause"] == Cause.SEGMENT for loss in losses):
+        return "stored data lost"
+    return _STATUS.get(entry.status, entry.status)
+
+
 def _brief(entry: RecordingEntry) -> dict[str, Any]:
     span = entry.span
     return {
-        "recording": entry.id,
+        "recording": entry.label,
+        "id": entry.id,
         "name": entry.name,
         "tags": entry.tags,
         "status": entry.status,
@@ -207,6 +217,8 @@ def _full(entry: RecordingEntry) -> dict[str, Any]:
         "chunks": entry.chunks,
         "coverage": coverage.describe(entry, coverage.losses_of(entry)),
         "losses": coverage.losses_of(entry),
+        "notes": entry.notes,
+        "marks": entry.marks,
         "channels": [
             {
                 "topic": c.topic,
@@ -218,7 +230,7 @@ def _full(entry: RecordingEntry) -> dict[str, Any]:
                 "first_ns": c.stats.first,
                 "last_ns": c.stats.last,
                 "skew_ns": _skew(c),
-                "unreadable": c.stats.unreadable,
+                "unreadable": c.stats.unreadable if entry.is_decoded else None,
                 "not_indexed": c.reason,
                 "metadata": c.metadata,
             }
@@ -253,14 +265,15 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     span = entry.span
     losses = coverage.losses_of(entry)
     source = entry.source
-    status = _STATUS.get(entry.status, entry.status)
+    status = _status(entry)
     if entry.status == "open":
-        status += f"; `hybridlog top {entry.id}` shows it"
+        status += f"; `hybridlog top {entry.label}` shows it"
     held = (
         f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
         f"{output.counted(entry.chunks, 'chunk')}"
     )
     rows = [
+        ("id", entry.id),
         ("name", entry.name),
         ("status", status),
         ("source", _source(source)),
@@ -272,9 +285,10 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
         ("coverage", coverage.describe(entry, losses)),
         *(("", coverage.line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
+        *(("note", note["text"]) for note in entry.notes),
         ("index", index or "MongoDB is away"),
     ]
-    output.print_table([("recording", "left"), (entry.id, "left")], rows)
+    output.print_table([("recording", "left"), (entry.label, "left")], rows)
     if not entry.channels:
         return
     output.say()
@@ -292,13 +306,13 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
     output.print_table(
         columns,
         [
-            _channel_row(c, indexed=index is not None, narrow=narrow)
+            _channel_row(c, is_decoded=entry.is_decoded, narrow=narrow)
             for c in sorted(entry.channels, key=lambda c: c.topic)
         ],
     )
 
 
-def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[str]:
+def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> list[str]:
     stats = channel.stats
     rate = _rate(channel)
     notes = []
@@ -310,7 +324,7 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[
         notes.append("fields only")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
-    skew = "-" if indexed else "?"
+    skew = "-" if is_decoded else "?"
     if stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
     kind = channel.type or channel.message_encoding
@@ -323,8 +337,7 @@ def _channel_row(channel: ChannelEntry, *, indexed: bool, narrow: bool) -> list[
         "; ".join(notes),
     ]
     if not narrow:
-        # Segments do not say it of themselves.
-        cells.insert(4, output.size(stats.payload_bytes) if indexed else "?")
+        cells.insert(4, output.size(stats.payload_bytes))
     return cells
 
 

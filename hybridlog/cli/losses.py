@@ -29,7 +29,7 @@ def show(
     with opened(store, mongo) as found:
         entries = found.select(recordings) if recordings else found.recordings()
     rows = [
-        {"recording": entry.id, **loss}
+        {"recording": entry.label, **loss}
         for entry in entries
         for loss in losses_of(entry)
         if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
@@ -44,8 +44,8 @@ def show(
     for entry in entries:
         if entry.status == "open":
             output.note(
-                f"{entry.id} is still being recorded: what it lacks stands here at its end, and "
-                f"`hybridlog top {entry.id}` shows it now."
+                f"{entry.label} is still being recorded: what it lacks stands here at its end, and "
+                f"`hybridlog top {entry.label}` shows it now."
             )
 
 

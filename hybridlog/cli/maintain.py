@@ -1,4 +1,4 @@
-"""`hybridlog reindex`, `verify` and `rm`."""
+"""`hybridlog reindex`, `index`, `verify`, `repair` and `rm`."""
 
 from __future__ import annotations
 
@@ -13,29 +13,51 @@ from hybridlog.cli import output
 from hybridlog.cli.opening import opened
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.stopping import Stopped
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import DatabaseError, UsageError
 
 
-def reindex(store: Path | None, mongo: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Make the index anew."""
+def reindex(
+    recordings: list[str] | None,
+    store: Path | None,
+    mongo: str | None,
+    *,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Make the index again, recording by recording."""
     started = time.monotonic()
     with opened(store, mongo, needs_database=True, quiet=quiet) as view:
-        total = sum(r.stored_bytes for r in view.recordings())
+        chosen = view.select(recordings) if recordings else view.recordings()
+        total = sum(r.stored_bytes for r in chosen)
         try:
             with progress_bar("reindex", total, quiet=quiet) as bar:
-                recordings = view.reindex(Stages(bar))
+                done = view.reindex(recordings or None, Stages(bar))
         except Stopped as stopped:
-            stopped.consequence = "The next command that opens the store finishes the index."
+            stopped.consequence = (
+                "What was done is done; the next command that needs the index finishes the "
+                "recording at which it was stopped."
+            )
             raise
-    messages = sum(r.messages for r in recordings)
+    left = [entry.label for entry in chosen if entry.id not in {r.id for r in done}]
+    for label in left:
+        output.note(f"Recording {label} is being written, and was left as it is.")
+    for entry in done:
+        if entry.status == "damaged":
+            output.note(f"{entry.label} is damaged: `hybridlog losses {entry.label}` says where.")
+    messages = sum(r.messages for r in done)
     elapsed = time.monotonic() - started
     if as_json:
         output.print_json(
-            {"recordings": len(recordings), "messages": messages, "seconds": round(elapsed, 3)}
+            {
+                "recordings": len(done),
+                "messages": messages,
+                "left": left,
+                "seconds": round(elapsed, 3),
+            }
         )
     elif not quiet:
         output.say(
-            f"{output.counted(len(recordings), 'recording')}, "
+            f"{output.counted(len(done), 'recording')}, "
             f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
         )
 
@@ -88,41 +110,96 @@ def verify(
 ) -> None:
     """Read and compare everything; exit 1 when something is off."""
     started = time.monotonic()
-    with opened(store, mongo, needs_database=True, quiet=quiet) as view:
+    with opened(store, mongo, quiet=quiet) as view:
         chosen = view.select(recordings) if recordings else view.recordings()
         total = sum(r.stored_bytes for r in chosen)
         with progress_bar("verify", total, quiet=quiet) as bar:
             result = view.verify(recordings or None, Stages(bar))
+        why = view.without_database
     elapsed = time.monotonic() - started
     if as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
         for finding in result.findings:
-            output.say(f"{finding.recording}: {finding.place}: {finding.problem}")
+            of = f"{finding.recording}: " if finding.recording else ""
+            output.say(f"{of}{finding.place}: {finding.problem}; {finding.cure}")
         if not quiet:
             problems = output.counted(len(result.findings), "problem")
+            where = "" if result.index else " in the files"
             output.say(
                 f"{output.counted(result.recordings, 'recording')}, "
                 f"{output.counted(result.chunks, 'chunk')}, "
                 f"{output.counted(result.messages, 'message')}, "
                 f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: "
-                f"{problems if result.findings else 'all is well'}"
+                f"{problems if result.findings else 'all is well' + where}"
             )
+    if not result.index and (result.findings or why is None):
+        output.note(f"The index was not compared: {why}")
     if result.findings:
+        raise typer.Exit(1)
+    if not result.index and why is not None:
+        raise DatabaseError(f"The index was not compared: {why}")
+
+
+def repair(
+    recordings: list[str] | None,
+    store: Path | None,
+    mongo: str | None,
+    *,
+    moved: bool,
+    new_id: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Apply the cures that lose nothing; exit 1 when something is left."""
+    if moved and new_id:
+        raise UsageError("A store was moved, or it is a copy: --moved or --new-id, not both.")
+    if new_id:
+        from hybridlog.maintenance.lease import become_another
+        from hybridlog.store import store_path
+
+        become_another(store_path(store), mongo)
+        output.say("the store has an id of its own now")
+    with opened(store, mongo, quiet=quiet) as view:
+        if moved:
+            view.take_over()
+            output.say("the index belongs to the store at this place now")
+        with progress_bar("repair", 0, quiet=quiet) as bar:
+            done = view.repair(recordings or None, Stages(bar))
+    left = [one for one in done if not one.is_cured]
+    if as_json:
+        output.print_json([asdict(one) for one in done])
+    else:
+        for one in done:
+            mark = "left" if not one.is_cured else "mended"
+            of = f"{one.recording}: " if one.recording else ""
+            output.say(f"{of}{one.place}: {mark}: {one.done}")
+        if not done and not quiet:
+            output.say("nothing to mend")
+    if left:
         raise typer.Exit(1)
 
 
 def remove(recordings: list[str], store: Path | None, mongo: str | None, *, yes: bool) -> None:
     """Delete recordings, after asking."""
-    with opened(store, mongo, needs_database=True) as view:
-        chosen = view.select(recordings)
+    with opened(store, mongo) as view:
+        copies = [name for name in recordings if name in view.repairs.copies]
+        chosen = view.select([name for name in recordings if name not in copies])
+        labels = copies + [entry.label for entry in chosen]
+        names = ", ".join(labels)
         if not yes:
-            names = ", ".join(r.id for r in chosen)
             if not sys.stdin.isatty():
                 raise UsageError(f"Deleting {names} for good needs --yes.")
             if not typer.confirm(f"Delete {names} for good?", err=True):
                 output.note("Nothing is deleted.")
                 raise typer.Exit(1)
-        for entry in chosen:
-            view.remove(entry.id)
-            output.say(f"deleted {entry.id}")
+        for label in labels:
+            try:
+                view.remove(label)
+            except Stopped as stopped:
+                stopped.consequence = (
+                    "A recording whose removal began is gone; the next command that opens the "
+                    "store removes the rest of it."
+                )
+                raise
+            output.say(f"deleted {label}")

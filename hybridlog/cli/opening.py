@@ -21,6 +21,7 @@ def opened(
     mongo: str | None,
     *,
     create: bool = False,
+    shared: bool = False,
     needs_database: bool = False,
     quiet: bool = False,
 ) -> Iterator[Store]:
@@ -30,6 +31,7 @@ def opened(
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
         create: Make it if there is none.
+        shared: If it is made: for the group of its directory.
         needs_database: Fail when MongoDB is away.
         quiet: No progress while the index is brought up to date.
     """
@@ -38,7 +40,12 @@ def opened(
     bar = LateBar("indexing", quiet=quiet)
     try:
         store = open_store(
-            path, mongo=mongo, create=create, require_database=needs_database, progress=bar
+            path,
+            mongo=mongo,
+            create=create,
+            shared=shared,
+            require_database=needs_database,
+            progress=bar,
         )
     finally:
         bar.close()
@@ -48,19 +55,45 @@ def opened(
 
 
 def _tell(store: Store) -> None:
-    tended = store.tended
-    for recording, segments in tended.recovered.items():
+    repairs = store.repairs
+    for recording, segments in repairs.recovered.items():
         _tell_recovered(recording, segments)
-    for recording, chunks in tended.indexed.items():
-        if chunks and recording not in tended.recovered:
+    for recording in repairs.journals:
+        note(
+            f"Recording {recording} has lost its journal. It was written again, but nobody can "
+            "say whether a segment is missing, too."
+        )
+    for recording in repairs.adopted:
+        note(f"Recording {recording} came from another store; it belongs to this one now.")
+    for copy, original in repairs.copies.items():
+        note(
+            f"{copy} is a copy of recording {original}, which answers. Remove one of them: "
+            f"`hybridlog rm {copy}`."
+        )
+    for recording, problem in repairs.unreadable.items():
+        note(f"Recording {recording} cannot be read: {problem}")
+    if repairs.disk_full is not None:
+        note(
+            "The disk of the store is full, so what a crash has left was not recovered. Remove "
+            f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
+        )
+    elif not store.directory.is_writable:
+        note(f"The store {store.directory.path} is read-only; its segments answer.")
+    tell_index(store)
+
+
+def tell_index(store: Store) -> None:
+    """Say what the connection to the index has mended, or why there is none."""
+    repairs = store.repairs
+    for recording, chunks in repairs.indexed.items():
+        if chunks and recording not in repairs.recovered:
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
-    for recording in tended.removed:
+    for recording in repairs.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
-    for recording, problem in tended.unreadable.items():
-        note(f"Recording {recording} cannot be brought into the index: {problem}")
     if store.without_database is not None:
         note(
-            f"MongoDB is away, so only topics and times can be asked for: {store.without_database}"
+            "MongoDB is unavailable, so only topics and times can be asked for: "
+            f"{store.without_database}"
         )
 
 

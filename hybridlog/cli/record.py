@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -47,6 +48,7 @@ class Choices:
     chunk_size: str
     compression: str
     level: int
+    shared: bool
     mongo: str | None
     as_json: bool
     quiet: bool
@@ -101,7 +103,12 @@ def _run_logs(paths: list[Path], choices: Choices) -> None:
     done = _Results(paths, choices)
     try:
         with opened(
-            choices.store, choices.mongo, create=True, needs_database=True, quiet=choices.quiet
+            choices.store,
+            choices.mongo,
+            create=True,
+            shared=choices.shared,
+            needs_database=True,
+            quiet=choices.quiet,
         ) as store:
             for path in paths:
                 try:
@@ -120,9 +127,11 @@ def _run_logs(paths: list[Path], choices: Choices) -> None:
 
 def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
     """Before a store is made: what cannot succeed should leave nothing behind."""
-    from hybridlog.store import EMBEDDED, check_claim, store_path
+    from hybridlog.maintenance.lease import check
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import EMBEDDED, NAME, with_password
 
-    if (store_path(choices.store) / "hybridlog.toml").exists():
+    if os.path.lexists(store_path(choices.store) / NAME):
         return
     from hybridlog.sources.detect import open_source
 
@@ -142,9 +151,10 @@ def _check_new_store(paths: Sequence[Path], choices: Choices) -> None:
     if choices.mongo not in {None, EMBEDDED}:
         # The URI is written down in the store that is made, so it should be right.
         from hybridlog_storage.database import Database
+        from hybridlog_storage.index_state import IndexState
 
-        with Database.connect(choices.mongo) as database:
-            check_claim(database)
+        with Database.connect(with_password(choices.mongo)) as database:
+            check(IndexState(database).mark(), {"id": ""}, database)
 
 
 def _record_one(
@@ -300,7 +310,8 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
     entry = report.entry
     return {
         "path": str(path),
-        "recording": entry.id,
+        "recording": entry.label,
+        "id": entry.id,
         "status": entry.status,
         "topics": _topics(report),
         "messages": entry.messages,
@@ -330,7 +341,7 @@ def _print_one(path: Path, report: RecordReport) -> None:
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
     left_out = f" ({report.skipped} left out)" if report.skipped else ""
     output.print_table(
-        [("recording", "left"), (entry.id, "left")],
+        [("recording", "left"), (entry.label, "left")],
         [
             ("source", f"{path} ({entry.source['kind']})"),
             ("topics", str(_topics(report))),
@@ -371,7 +382,7 @@ class _Figures(NamedTuple):
 def _print_several(reports: Sequence[RecordReport]) -> None:
     lines = [
         _Figures(
-            report.entry.id,
+            report.entry.label,
             _topics(report),
             report.entry.messages,
             int(report.entry.source["bytes"]),

@@ -45,7 +45,14 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
         for source in sources:
             held.enter_context(source).check()
         store = held.enter_context(
-            opened(choices.store, choices.mongo, create=True, needs_database=True, quiet=quiet)
+            opened(
+                choices.store,
+                choices.mongo,
+                create=True,
+                shared=choices.shared,
+                needs_database=True,
+                quiet=quiet,
+            )
         )
         with _until_told() as told_to_stop:
             recorder = Recorder(store, sources, chosen, shown.say)

@@ -59,7 +59,8 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     output.print_table(
         [("segment", "left"), (str(path), "left")],
         [
-            ("recording", str(summary.recording.get("id"))),
+            ("recording", str(summary.recording.get("name"))),
+            ("id", str(summary.recording.get("id"))),
             ("start", format_time(first) if first is not None else "-"),
             ("last", format_time(last) if last is not None else "-"),
             ("bytes", output.size(bytes_all)),

@@ -37,7 +37,7 @@ def store(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path
     run("record", logs / "odd.mcap", "--quiet", store=path)
     run("record", logs / "torn.bag", "--quiet", store=path, code=4)
     # While this is open, no command has to start mongod anew.
-    with hl.open(path):
+    with hl.open(path, require_database=True):
         yield path
 
 
@@ -46,5 +46,5 @@ def fresh(logs: Path, tmp_path: Path) -> Iterator[Path]:
     """A store with `small`, to be changed."""
     path = tmp_path / "store"
     run("record", logs / "small.bag", "--quiet", store=path)
-    with hl.open(path):
+    with hl.open(path, require_database=True):
         yield path

@@ -59,7 +59,9 @@ def test_info(logs: Path, store: Path) -> None:
     assert "/base/scan" in text
     assert "sensor_msgs/LaserScan" in text
     assert "latched" in text
-    assert "index      database" in text
+    assert re.search(r"^index +the MongoDB that comes with hybridlog *$", text, re.MULTILINE)
+    assert re.search(rf"^id +{found['id']} *$", text, re.MULTILINE)
+    assert re.fullmatch("[0-9a-f]{32}", found["id"])
 
 
 def test_info_without_a_name_shows_all_and_the_losses(store: Path) -> None:
@@ -83,7 +85,8 @@ def test_info_of_what_a_program_recorded_names_no_address(tmp_path: Path) -> Non
 def test_info_of_a_segment(logs: Path, store: Path) -> None:
     path = store / "recordings/robot/000000.mcap"
     found = run("info", path, "--json").json
-    assert found["recording"]["id"] == "robot"
+    assert found["recording"]["name"] == "robot"
+    assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json["id"]
     assert sum(c["messages"] for c in found["channels"]) == len(read_bag(logs / "robot.bag"))
     assert "/base/scan" in run("info", path).out
     for log in ("odd.mcap", "robot.bag"):
@@ -176,7 +179,7 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
 def test_notes_of_a_channel() -> None:
     def notes(encoding: str, **metadata: str) -> str:
         entry = ChannelEntry(1, "/a", encoding, None, "T", metadata, False, None)
-        return _channel_row(entry, indexed=True, narrow=False)[-1]
+        return _channel_row(entry, is_decoded=True, narrow=False)[-1]
 
     assert notes("cdr", offered_qos_profiles="- durability: 1\n  depth: 1") == "latched"
     assert notes("cdr", offered_qos_profiles="- durability: 2") == ""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from tests.independent import read_bag
+from tests.other_user import User, needs_root, open_place
 
 from .running import recordings, run
 
@@ -89,14 +91,14 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "s"
     run("record", logs / "odd.mcap", "-q", store=store)
     settings = store / "hybridlog.toml"
-    settings.write_text(settings.read_text().replace("format = 1", "format = 99"))
+    settings.write_text(settings.read_text().replace("format = 2", "format = 99"))
     for command in (("ls",), ("record", logs / "small.bag"), ("fetch", "-t", "x")):
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err
         assert "newer hybridlog" in done.err
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
 def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
     places = [fresh, fresh / "recordings", fresh / "mongod"]
     for place in places:
@@ -106,6 +108,21 @@ def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
     finally:
         for place in places:
             place.chmod(0o700)
+
+
+@needs_root
+def test_a_store_that_another_user_cannot_write(logs: Path) -> None:
+    with open_place() as place:
+        store = place / "store"
+        run("record", logs / "small.bag", "-q", store=store)
+        shutil.copy(logs / "odd.mcap", place)
+        user, where = User(place), ("--store", store)
+        done = user.run("record", place / "odd.mcap", *where, code=5)
+        assert "read-only" in done.err
+        assert user.run("rm", "-y", "small", *where, code=None).code in {5, 6}
+        count = ("fetch", "-t", "/imu/data", "--count", "-q", *where)
+        assert user.run(*count).out == run(*count).out
+        assert recordings(store) == ["small"]
 
 
 def test_the_default_store_is_in_the_working_directory(

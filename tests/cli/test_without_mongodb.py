@@ -1,0 +1,145 @@
+"""What needs no server asks none: no driver is imported, and no mongod is started."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hybridlog.demo.write import write_bag
+
+from .running import environment, run, wait_for
+
+BLOCKED = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "pymongo" or name in {
+            "hybridlog_storage.mongod", "hybridlog_storage.mongod_keeper"
+        }:
+            print("imported", name, file=sys.stderr, flush=True)
+            raise ImportError(name)
+
+sys.meta_path.insert(0, Blocked())
+from hybridlog.cli import main
+main()
+"""
+COMMANDS = {
+    "ls": ["ls"],
+    "ls --json": ["ls", "--json"],
+    "info": ["info", "robot"],
+    "info --json": ["info", "robot", "--json"],
+    "losses": ["losses"],
+    "losses of one": ["losses", "robot"],
+    "schema": ["schema", "/imu/data"],
+    "count": ["fetch", "-t", "/imu/data", "--count"],
+    "count in a range": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2500ms", "--count"],
+    "count in a recording": ["fetch", "-t", "/imu/data", "-r", "robot", "--count"],
+    "raw": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "raw"],
+    "mcap": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "mcap"],
+    "bag": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "bag"],
+    "jsonl": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "jsonl"],
+    "csv": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "csv"],
+    "parquet": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "parquet"],
+    "of all topics": ["fetch", "-t", "re:.*", "--between", "+1s", "+1100ms", "-F", "raw"],
+    "the last ones": ["fetch", "-t", "/imu/data", "--reverse", "--limit", "3", "-F", "jsonl"],
+    "every tenth": ["fetch", "-t", "/imu/data", "--every", "10", "-F", "jsonl"],
+    "at a time": ["fetch", "-t", "/base/scan", "--at", "+2s", "-F", "jsonl"],
+    "by header stamps": ["fetch", "-t", "/imu/data", "--clock", "header",
+                         "--between", "+1s", "+2s", "-F", "raw"],
+}  # fmt: skip
+FILES = {"raw": "raw", "mcap": "mcap", "bag": "bag", "jsonl": "jsonl", "parquet": "parquet"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A store whose mongod has ended."""
+    base = tmp_path_factory.mktemp("without")
+    write_bag(base / "robot.bag", duration_s=4.0, topics=["/imu/data", "/base/scan", "/tf"])
+    path = base / "store"
+    run("record", base / "robot.bag", "--quiet", store=path)
+    wait_for(lambda: not mongods(path))
+    yield path
+    # Nobody has started one meanwhile, however shortly it ran.
+    assert not mongods(path)
+
+
+def mongods(store: Path) -> list[str]:
+    """Processes that say the store's mongod directory in their command line."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = place.read_bytes().decode("utf-8", "replace")
+        except OSError:
+            continue
+        if str(store / "mongod") in line:
+            found.append(line)
+    return found
+
+
+def without(store: Path, *arguments: object) -> bytes:
+    """What a command says that can import no driver and start no server."""
+    log = store / "mongod" / "mongod.log"
+    before = log.stat().st_mtime_ns if log.exists() else time.time_ns()
+    ended = subprocess.run(
+        [sys.executable, "-c", BLOCKED, *map(str, arguments)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        env=environment(HYBRIDLOG_STORE=str(store)),
+        timeout=120,
+        check=False,
+    )
+    assert b"imported" not in ended.stderr, ended.stderr[-2000:]
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert not log.exists() or log.stat().st_mtime_ns == before
+    return ended.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_topics_and_times_are_answered_without_a_server(store: Path, name: str) -> None:
+    assert without(store, *COMMANDS[name])
+
+
+@pytest.mark.parametrize("form", FILES)
+def test_files_are_written_without_a_server(store: Path, tmp_path: Path, form: str) -> None:
+    target = tmp_path / f"out.{form}"
+    without(store, "fetch", "-t", "/imu/data", "-F", form, "-o", target)
+    assert target.exists()
+
+
+def test_the_counts_are_those_of_the_catalog(store: Path) -> None:
+    everything = int(without(store, "fetch", "-t", "/imu/data", "--count"))
+    parts = [
+        int(without(store, "fetch", "-t", "/imu/data", "--between", a, b, "--count"))
+        for a, b in (("start", "+1500ms"), ("+1500ms", "end"))
+    ]
+    assert everything == sum(parts) > 100
+
+
+def test_the_blocker_blocks(store: Path) -> None:
+    """The tests above can fail: a question about a field does need the server."""
+    ended = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            BLOCKED,
+            "fetch",
+            "-t",
+            "/imu/data",
+            "--where",
+            "header.seq > 5",
+            "--count",
+        ],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        env=environment(HYBRIDLOG_STORE=str(store)),
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode != 0
+    assert b"imported" in ended.stderr
