@@ -1,0 +1,83 @@
+"""Small logs whose content is known, and stores that hold them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog_storage.segment_writer import SegmentSettings
+
+HEADER = (
+    "std_msgs/Header header\nint32 n\n"
+    + "=" * 80
+    + ("\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n")
+)
+BEGIN_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+SETTINGS = SegmentSettings(chunk_size=1 << 10, segment_size=4_000, compression="none")
+
+
+@dataclass(frozen=True)
+class Said:
+    """A message of a log, and the number that stands in its field `n`."""
+
+    time: int
+    payload: bytes
+    n: int
+
+
+Content = Mapping[str, tuple[Said, ...]]
+"""What a log holds, by topic."""
+
+
+def content(first: int, count: int) -> Content:
+    """Messages of three topics: numbers, JSON, and such with a header stamp.
+
+    Args:
+        first: Number of the first message of each topic.
+        count: Of how many there are of each.
+    """
+    found: dict[str, list[Said]] = {"/number": [], "/text": [], "/stamped": []}
+    for n in range(first, first + count):
+        time = BEGIN_NS + n * STEP_NS
+        stamp = struct.pack("<II", (time - 1000) // 10**9, (time - 1000) % 10**9)
+        payloads = {
+            "/number": struct.pack("<id", n, n / 7),
+            "/text": json.dumps({"n": n, "s": "x" * (n % 5)}).encode(),
+            "/stamped": struct.pack("<I", n) + stamp + struct.pack("<I2si", 2, b"ab", n),
+        }
+        for place, (topic, payload) in enumerate(payloads.items()):
+            found[topic].append(Said(time + place, payload, n))
+    return {topic: tuple(said) for topic, said in found.items()}
+
+
+def write(path: Path, said: Content) -> Path:
+    """A log with these messages, as an MCAP file."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        number = writer.register_schema("a/Number", "ros1msg", b"int32 n\nfloat64 x\n")
+        stamped = writer.register_schema("a/Stamped", "ros1msg", HEADER.encode())
+        text = writer.register_schema("a/Text", "jsonschema", b'{"type":"object"}')
+        channels = {
+            "/number": writer.register_channel("/number", "ros1", number),
+            "/text": writer.register_channel("/text", "json", text),
+            "/stamped": writer.register_channel("/stamped", "ros1", stamped),
+        }
+        everything = [(one, channels[topic]) for topic, part in said.items() for one in part]
+        for one, channel in sorted(everything, key=lambda item: item[0].time):
+            writer.add_message(channel, one.time, one.payload, one.time)
+        writer.finish()
+    return path
+
+
+def record(store: Path, uri: str, log: Path, name: str) -> None:
+    """Record a log in several segments."""
+    with hl.open(store, mongo=uri, create=True) as opened:
+        opened.record(log, name=name, settings=SETTINGS)

@@ -1,0 +1,361 @@
+"""Stores that are prepared once, copied for each case, and looked at from all sides."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shutil
+import sqlite3
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import bson
+from pymongo import MongoClient
+
+import hybridlog as hl
+from hybridlog.cli.coverage import losses_of
+from hybridlog.maintenance.lease import place_of
+from hybridlog.maintenance.opening import describe_now
+from hybridlog_storage.catalog import CATALOG, RecordingEntry
+from hybridlog_storage.catalog import _crc as crc_of
+from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.database import Database
+from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, IndexState
+from hybridlog_storage.mongod import EmbeddedMongod
+from tests.faults.logs import Content
+
+WHERE = 20
+"""Messages with `n` of at least this are asked for."""
+_ANY_FILE = {"writer.lock", "fields.columns", "journal.old"}
+_MADE_UP = re.compile(r"\b[0-9a-f]{32}\b|\d{19}")
+
+
+class Server:
+    """One mongod for many databases. A context manager."""
+
+    def __init__(self, directory: Path) -> None:
+        self._mongod = EmbeddedMongod(directory)
+        self._count = 0
+
+    def __enter__(self) -> Server:
+        self._uri = self._mongod.start()
+        self.client: MongoClient[Any] = MongoClient(self._uri)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.close()
+        self._mongod.stop()
+
+    def new(self) -> str:
+        """The URI of a database that is empty."""
+        self._count += 1
+        return self._uri.replace("/?", f"/case_{self._count}?")
+
+    def drop(self, uri: str) -> None:
+        """Remove a database."""
+        self.client.drop_database(_name(uri))
+
+    def documents(self, uri: str) -> dict[str, bytes]:
+        """All documents of a database, by collection."""
+        database = self.client[_name(uri)]
+        return {
+            name: b"".join(database[name].find_raw_batches({}))
+            for name in database.list_collection_names()
+            if not name.startswith("system.")
+        }
+
+
+def _name(uri: str) -> str:
+    return uri.partition("/?")[0].rpartition("/")[2].partition("?")[0]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A store and its database, to be copied.
+
+    Attributes:
+        path: The store.
+        documents: Of its database, by collection.
+    """
+
+    path: Path
+    documents: Mapping[str, bytes]
+
+    @classmethod
+    def of(cls, server: Server, path: Path, uri: str) -> Prepared:
+        """A store as it is now."""
+        return cls(path, server.documents(uri))
+
+    def duplicate(self, path: Path) -> None:
+        """Copy the files, with a catalog that fits them as well as it did before."""
+        shutil.copytree(self.path, path, symlinks=True)
+        if not (path / CATALOG).exists():
+            return
+        old, new = StoreDirectory(self.path), StoreDirectory(path)
+        with contextlib.closing(sqlite3.connect(path / CATALOG)) as db, db:
+            rows = db.execute("select id, files, entry from recordings").fetchall()
+            for recording, looks, entry in rows:
+                label = json.loads(entry)["label"]
+                if looks == old.listing(label).print:
+                    row = recording, new.listing(label).print, entry
+                    db.execute(
+                        "update recordings set files = ?, crc = ? where id = ?",
+                        (row[1], crc_of(*row), recording),
+                    )
+
+    @contextmanager
+    def copy(self, server: Server, path: Path) -> Iterator[Case]:
+        """A copy of its own for a case."""
+        self.duplicate(path)
+        uri = server.new()
+        try:
+            with Database.connect(uri) as database:
+                for collection, data in self.documents.items():
+                    if not collection.startswith(CATALOG_PREFIX):
+                        database.ensure_collection(collection)
+                    count = len(bson.decode_all(data))
+                    if count and collection != STORE:
+                        database.insert_raw(collection, data, count)
+                IndexState(database).claim(place_of(StoreDirectory(path)))
+            yield Case(server, path, uri)
+        finally:
+            server.drop(uri)
+            shutil.rmtree(path)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A store that something is done to.
+
+    Attributes:
+        server: Of its database.
+        path: The store.
+        uri: Its database.
+    """
+
+    server: Server
+    path: Path
+    uri: str
+
+    def open(self) -> hl.Store:
+        """The store, as a new process opens it."""
+        return hl.open(self.path, mongo=self.uri)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A recording, as everything that can be asked shows it.
+
+    Attributes:
+        entry: Its entry in the catalog, without what is drawn or measured anew each time.
+        messages: Log time and payload of its messages, by topic, in order.
+        losses: Rows of its loss ledger.
+    """
+
+    entry: Mapping[str, Any]
+    messages: Mapping[str, tuple[tuple[int, bytes], ...]]
+    losses: tuple[Mapping[str, Any], ...]
+
+    @property
+    def lost(self) -> int:
+        """Messages that its ledger says are missing."""
+        return sum(row["count"] or 0 for row in self.losses)
+
+    def holds(self, said: Content) -> bool:
+        """Whether it has all messages of a log, and no others."""
+        return self.messages == {
+            topic: tuple((one.time, one.payload) for one in part) for topic, part in said.items()
+        }
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a store answers.
+
+    Attributes:
+        recordings: By label.
+        files: Names of all files, but for those that may be there or not.
+        findings: What `verify` says.
+    """
+
+    recordings: Mapping[str, Seen]
+    files: frozenset[str]
+    findings: tuple[str, ...] = field(default=())
+
+    def without(self, label: str) -> State:
+        """The same without a recording."""
+        return replace(
+            self,
+            recordings={k: v for k, v in self.recordings.items() if k != label},
+            files=frozenset(f for f in self.files if f.partition("/")[0] != label),
+        )
+
+
+class WrongError(AssertionError):
+    """A store contradicts itself."""
+
+
+def look(case: Case) -> State:
+    """Open a store as a new process does, ask everything, and hold the answers together.
+
+    Raises:
+        WrongError: An answer contradicts another one, or something was left over.
+    """
+    with case.open() as store:
+        store.kept.most_bytes = 0  # MongoDB answers
+        without_server = {entry.label: _messages(store, entry) for entry in store.recordings()}
+        database = store.connect()
+        # What connecting has mended is what counts.
+        seen = {entry.label: _look_at(store, entry) for entry in store.recordings()}
+        for label, messages in without_server.items():
+            _check(seen[label].messages == messages, f"{label} changed while it was asked")
+        verification = store.verify()
+        findings = tuple(
+            sorted(f"{f.recording}: {f.place}: {f.problem}" for f in verification.findings)
+        )
+        _check(verification.index, "the index was not compared")
+        _check_database(store, database)
+        _check_catalog(store)
+        _check(not store.repairs.unreadable, f"unreadable: {store.repairs.unreadable}")
+    return State(seen, _files(case.path), tuple(_plain(f) for f in findings))
+
+
+def _check(holds: object, otherwise: str) -> None:
+    if not holds:
+        raise WrongError(otherwise)
+
+
+def _messages(store: hl.Store, entry: RecordingEntry) -> dict[str, tuple[tuple[int, bytes], ...]]:
+    """Messages by topic, without asking a server."""
+    found: dict[str, list[tuple[int, bytes]]] = defaultdict(list)
+    topics = sorted({c.topic for c in entry.channels})
+    if not topics:
+        return {}
+    query = store.query(topics, [entry.id])
+    for message in query:
+        found[message.topic].append((message.log_time_ns, bytes(message.raw)))
+    _check(query.count() == sum(map(len, found.values())), "the number of messages differs")
+    return {topic: tuple(part) for topic, part in found.items()}
+
+
+def _look_at(store: hl.Store, entry: RecordingEntry) -> Seen:
+    messages = _messages(store, entry)
+    for topic, part in messages.items():
+        query = store.query([topic], [entry.id])
+        numbers = [number_of(topic, payload) for _, payload in part]
+        wanted = [n for n in numbers if n is not None and n >= WHERE]
+        asked = query.where({"n": {"$gte": WHERE}})
+        _check(asked.count() == len(wanted), f"count of {topic} where: {asked.count()}")
+        given = [number_of(topic, bytes(m.raw)) for m in asked]
+        _check(given == wanted, f"messages of {topic} where: {given} instead of {wanted}")
+        documents = list(query.documents())
+        _check(len(documents) == len(part), f"{len(documents)} documents of {len(part)} {topic}")
+        begin, end = part[0][0], part[-1][0] + 1
+        middle = (begin + end + 1) // 2
+        half = query.between(f"{begin}ns", f"{middle}ns")
+        expected = sum(time < middle for time, _ in part)
+        _check(half.count() == expected, f"half of {topic}: {half.count()} instead of {expected}")
+    told = sum(channel.stats.messages for channel in entry.channels)
+    _check(told == sum(map(len, messages.values())), f"{entry.label} says {told} messages")
+    return Seen(_comparable(entry), messages, tuple(map(_without_made_up, losses_of(entry))))
+
+
+def number_of(topic: str, payload: bytes) -> int | None:
+    """What stands in the field `n` of a message."""
+    if topic == "/number":
+        return int.from_bytes(payload[:4], "little", signed=True)
+    if topic == "/stamped":
+        return int.from_bytes(payload[-4:], "little", signed=True)
+    value = json.loads(payload).get("n")
+    return value if isinstance(value, int) else None
+
+
+def _comparable(entry: RecordingEntry) -> dict[str, Any]:
+    found = entry.to_document()
+    # Drawn or taken anew for each recording, and what follows from them.
+    for name in ("id", "created", "digests", "stored_bytes"):
+        del found[name]
+    found["source"].pop("path", None)
+    for note in found["notes"]:
+        note.pop("at")
+    found["end"] = _without_made_up(found["end"])
+    return found
+
+
+def _without_made_up(value: Any) -> Any:
+    """What is the same each time: without ids and sizes of files."""
+    if isinstance(value, Mapping):
+        return {k: _without_made_up(v) for k, v in value.items() if k not in {"length", "offset"}}
+    if isinstance(value, list | tuple):
+        return [_without_made_up(v) for v in value]
+    return _plain(value) if isinstance(value, str) else value
+
+
+def _plain(text: str) -> str:
+    return _MADE_UP.sub("*", text)
+
+
+def _files(path: Path) -> frozenset[str]:
+    """Names of files in recordings, and whatever else should not be in the store."""
+    recordings = path / "recordings"
+    found = {str(p.relative_to(recordings)) for p in recordings.rglob("*")}
+    found |= {f"../{p.name}" for p in path.iterdir()}
+    return frozenset(name for name in found if Path(name).name not in _ANY_FILE) - {
+        "../catalog.sqlite",
+        "../hybridlog.toml",
+        "../recordings",
+    }
+
+
+def _check_database(store: hl.Store, database: Database) -> None:
+    """Nothing is in it that is of no recording, and of each recording there is all."""
+    entries = {entry.key: entry for entry in store.recordings() if entry.label}
+    _check(not list(database.find(CHUNKS)), f"chunks are left: {list(database.find(CHUNKS))}")
+    mirror = {document["_id"]: document for document in database.find(RECORDINGS)}
+    _check(mirror.keys() == entries.keys(), f"mirrored are {mirror.keys()}")
+    for key, entry in entries.items():
+        document = dict(mirror[key])
+        index = document.pop("index")
+        del document["_id"]
+        _check(index["state"] == "complete", f"{entry.label} is {index['state']}")
+        _check(index["segments"] == entry.digests, f"of {entry.label} other segments are indexed")
+        wanted = bson.decode(bson.encode(entry.to_document()))
+        _check(document == wanted, f"the mirror of {entry.label}: {document} not {wanted}")
+    expected: dict[str, dict[str, int]] = defaultdict(dict)
+    for key, entry in entries.items():
+        for topic in {c.topic for c in entry.channels}:
+            if entry.messages_of(topic):
+                expected[collection_of(topic)][key] = entry.messages_of(topic)
+    state = IndexState(database)
+    for collection in state.topic_collections():
+        pipeline = [{"$group": {"_id": "$_meta.rec", "n": {"$sum": 1}}}]
+        found = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}
+        _check(found == expected[collection], f"{collection} has {found}")
+
+
+def _check_catalog(store: hl.Store) -> None:
+    """The catalog is what the files say."""
+    rows = store.catalog.recordings()
+    labels = store.directory.labels()
+    _check(len(rows) == len(labels), f"{labels} are there, {len(rows)} in the catalog")
+    for label in labels:
+        described = describe_now(store.directory, store.catalog, label)
+        row = rows.get(described.entry.id)
+        _check(row is not None, f"{label} is not in the catalog")
+        _check(row == (described.files, described.entry), f"the catalog's row of {label} differs")
+        for number, table in described.tables.items():
+            kept = store.catalog.table(described.entry, number)
+            _check(kept.to_bytes() == table.to_bytes(), f"the chunks of {label} {number} differ")
+
+
+def look_quietly(case: Case) -> State | None:
+    """What `look` says; None when the store contradicts itself."""
+    with suppress(WrongError):
+        return look(case)
+    return None

@@ -1,0 +1,150 @@
+"""What another process does between two looks at the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlog.maintenance.index import ids_present
+from hybridlog_storage.catalog import channel_totals
+from hybridlog_storage.chunk_table import TableBuilder
+from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.errors import IndexChangedError, TopicError
+from hybridlog_storage.index_state import IndexState
+from tests.faults.cases import Bench
+from tests.faults.scenarios import scenario
+from tests.faults.stores import Case, look
+
+
+@pytest.fixture
+def case(bench: Bench) -> Iterator[Case]:
+    with scenario(bench, "tag").prepared.copy(bench.server, bench.path / "meanwhile") as copy:
+        yield copy
+
+
+def once(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have something happen after the names of all recordings were looked at."""
+    labels = StoreDirectory.labels
+    done: list[object] = []
+
+    def looked(self: StoreDirectory) -> list[str]:
+        found = labels(self)
+        if not done:
+            done.append(action())
+        return found
+
+    monkeypatch.setattr(StoreDirectory, "labels", looked)
+
+
+def renaming(path: Path) -> Callable[[], object]:
+    return lambda: (path / "recordings" / "a").rename(path / "recordings" / "new")
+
+
+def test_a_recording_that_is_renamed_is_not_missed(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once(renaming(case.path), monkeypatch)
+    with case.open() as store:
+        assert {entry.label for entry in store.recordings()} == {"new", "b"}
+        assert not store.repairs.unreadable
+
+
+def test_a_recording_that_is_renamed_stays_in_the_index(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = StoreDirectory(case.path)
+    before = ids_present(directory)
+    assert before is not None
+    assert len(before) == 2
+    once(renaming(case.path), monkeypatch)
+    assert ids_present(directory) == before
+
+
+def test_a_recording_that_is_removed_is_no_unreadable_one(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once(lambda: StoreDirectory(case.path).hide("a"), monkeypatch)
+    with case.open() as store:
+        assert {entry.label for entry in store.recordings()} == {"b"}
+        assert not store.repairs.unreadable
+    monkeypatch.undo()
+    assert look(case).recordings.keys() == {"b"}
+
+
+def test_a_mirror_that_is_late_says_nothing_of_the_index(case: Case) -> None:
+    with case.open() as store:
+        state = IndexState(store.connect())
+        (entry,) = store.select(["a"])
+        state.put(entry, "clearing", turn=7)
+        state.show(entry)
+        found = state.of([entry.key])[entry.key]
+        assert (found.state, found.turn, found.segments) == ("clearing", 7, {})
+
+
+def test_a_count_is_refused_while_documents_go(case: Case) -> None:
+    with case.open() as store:
+        store.kept.most_bytes = 0
+        database = store.connect()
+        query = store.topic("/number").where("n >= 0")
+        whole = query.count()
+        state = IndexState(database)
+        (entry,) = store.select(["a"])
+        with store.directory.writing(entry.label) as mine:  # as the other process does
+            assert mine
+            turn = state.of([entry.key])[entry.key].turn
+            state.put(entry, "clearing", turn=turn + 1)
+            database.delete("number", {"_meta.rec": entry.key})
+            with pytest.raises(IndexChangedError, match="another process"):
+                query.count()
+            with pytest.raises(IndexChangedError):
+                list(query.documents())
+            with pytest.raises(IndexChangedError):
+                list(query)
+            with pytest.raises(IndexChangedError):
+                query.at("end")
+            # What needs no index, and what is about the other recording, is answered.
+            assert store.topic("/number").count() == whole
+            assert len(list(store.topic("/number"))) == whole
+            assert store.query(["/number"], ["b"]).where("n >= 0").count() > 0
+        # Nobody holds it any more: the next question makes up for it.
+        assert store.topic("/number").where("n >= 0").count() == whole
+
+
+def test_what_goes_while_it_is_counted_is_noticed(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hybridlog_storage.database import Database
+
+    with case.open() as store, case.open() as other:
+        store.kept.most_bytes = 0
+        store.connect()
+        other.connect()
+        query = store.query(["/number"], ["a"]).where("n >= 0")
+        count, removed = Database.count, []
+
+        def counted(self: Database, *args: object, **options: object) -> int:
+            if not removed:
+                removed.append(True)
+                other.remove("a")
+            return count(self, *args, **options)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(Database, "count", counted)
+        with pytest.raises(IndexChangedError, match="removed"):
+            query.count()
+        with pytest.raises(TopicError):
+            store.query(["/number"], ["a"])
+
+
+def test_a_segment_without_messages_has_no_totals() -> None:
+    table = TableBuilder().build()
+    assert not len(table.parts)
+    assert channel_totals(table, None) == {}
+    assert channel_totals(table, np.zeros(0)) == {}
+
+
+def test_a_log_whose_last_segment_is_empty_is_recorded(bench: Bench) -> None:
+    state = scenario(bench, "tag").before
+    assert state.recordings["a"].entry["segments"] > len(state.recordings["a"].entry["spans"])

@@ -1,0 +1,41 @@
+"""Fifteen of all points, which are quick: at least one of each command and of each fault."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.faults.cases import Bench
+from tests.faults.scenarios import scenario
+from tests.faults.steps import Fault, Point
+
+SOME: list[tuple[str, Fault, str, int, bool]] = [
+    ("rm", "die", "rename", 0, True),
+    ("rm", "torn", "delete number", 0, False),
+    ("rm", "TERM", "update hybridlog.store", 0, True),
+    ("reindex", "die", "delete stamped", 0, True),
+    ("reindex", "INT", "insert number", 0, True),
+    ("reindex one", "database", "replace hybridlog.recordings", 1, False),
+    ("rename", "die", "rename", 0, False),
+    ("tag", "torn", "write journal", 0, False),
+    ("mark", "die", "write journal", 0, False),
+    ("mark", "ENOSPC", "sync journal", 0, False),
+    ("import", "torn", "write .00000", 0, False),
+    ("repair", "die", "rename 000000.mcap", 0, True),
+    ("record", "die", "rename 000000.mcap.open", 0, True),
+    ("open after a crash", "EIO", "sync journal", 0, True),
+    ("open without a journal", "torn", "write .journal", 0, False),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "step", "number", "after"),
+    SOME,
+    ids=[f"{name}: {fault} at {step}" for name, fault, step, _, _ in SOME],
+)
+def test_what_is_interrupted_is_finished_or_taken_back(
+    bench: Bench, name: str, fault: Fault, step: str, number: int, after: bool
+) -> None:
+    case = scenario(bench, name)
+    places = [at for at, told in enumerate(case.steps) if told.startswith(step)]
+    assert len(places) > number, case.steps
+    assert bench.problem(case, Point(fault, places[number], after)) is None

@@ -1,0 +1,492 @@
+"""Stores that came from somebody else, with symlinks in them: nothing outside is touched.
+
+Each kind of file and each folder of a store is replaced by a symlink, to something that is
+there and to something that is not. Whatever the commands then say, what lies outside is not
+read, written, removed or made.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.demo.write import write_bag
+from hybridlog_storage import mongod_keeper
+from hybridlog_storage.errors import HybridlogError, StoreError
+from hybridlog_storage.mongod import EmbeddedMongod
+from tests.cli.running import run, wait_for
+
+OLD = 1_000_000_000  # a time of reading that any reading changes
+
+FILES = {
+    "hybridlog.toml": "hybridlog.toml",
+    "catalog": "catalog.sqlite",
+    "catalog's journal": "catalog.sqlite-journal",
+    "catalog's log": "catalog.sqlite-wal",
+    "catalog's memory": "catalog.sqlite-shm",
+    "journal": "recordings/small/journal",
+    "lock": "recordings/small/writer.lock",
+    "segment": "recordings/small/000000.mcap",
+    "next segment": "recordings/small/000001.mcap",
+    "open segment": "recordings/small/000001.mcap.open",
+    "columns": "recordings/small/fields.columns",
+    "part of columns": "recordings/small/fields.columns.part",
+    "segment of a new recording": "recordings/live/000000.mcap.open",
+    "sign of a recorder": "recorders/live.json",
+    "sign of another recorder": "recorders/other.json",
+}
+FOLDERS = {
+    "recordings": "recordings",
+    "recording": "recordings/small",
+    "new recording": "recordings/live",
+    "removed recording": "recordings/.removed-small-0123abcd",
+    "recorders": "recorders",
+}
+MONGOD_FILES = (
+    "users.lock",
+    "keeper.lock",
+    "alive.lock",
+    "mongod.json",
+    "mongod.json.new",
+    "mongod.log",
+    "mongod.log.1",
+    "data/mongod.lock",
+    "data/WiredTiger",
+    "data/WiredTiger.wt",
+    "data/storage.bson",
+    "data/journal/WiredTigerLog.0000000001",
+    "data/deep/down/x",
+)
+MONGOD_FOLDERS = ("", "data", "data/journal", "data/diagnostic.data")
+
+# Other kinds of files, which mongod alone makes.
+OF_MONGOD = re.compile(r"mongod(-\d+)?(/.*)?")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "small.bag"
+    write_bag(path, duration_s=5, seed=2, topics=["/imu/data", "/joint_states"])
+    return path
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A MongoDB for all the stores whose own is not what is tried."""
+    with EmbeddedMongod(tmp_path_factory.mktemp("server") / "mongod") as user:
+        yield user.start()
+
+
+@pytest.fixture(scope="module")
+def template(bag: Path, server: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("template") / "store"
+    with hl.open(path, create=True, mongo=database(server, "template")) as store:
+        store.record(bag, name="small")
+    text = (path / "hybridlog.toml").read_text()
+    (path / "hybridlog.toml").write_text(re.sub("(?m)^mongo = .*\n", "", text))
+    return path
+
+
+def database(server: str, name: str) -> str:
+    return server.replace("/?", f"/{name}?")
+
+
+class Victims:
+    """What lies outside of a store, and must stay as it is."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        place.mkdir()
+
+    def file(self, content: bytes = b"precious") -> Path:
+        path = self.place / "file"
+        path.write_bytes(content)
+        return path
+
+    def folder(self, like: Path | None) -> Path:
+        """A folder that looks as the store's own did."""
+        path = self.place / "folder"
+        if like is not None and like.is_dir():
+            shutil.copytree(like, path)
+        else:
+            path.mkdir()
+            (path / "file").write_bytes(b"precious")
+        return path
+
+    def watch(self) -> None:
+        """From now on nobody may touch them."""
+        for path in [self.place, *self.place.rglob("*")]:
+            os.utime(path, ns=(OLD, OLD))
+        self.before = self.state()
+
+    def state(self) -> dict[str, tuple[object, ...]]:
+        found: dict[str, tuple[object, ...]] = {}
+        for path in [self.place, *sorted(self.place.rglob("*"))]:
+            about = path.lstat()
+            # The times of folders change by this look itself.
+            read = about.st_atime_ns if path.is_file() else None
+            found[str(path.relative_to(self.place))] = (
+                about.st_mode, about.st_size, about.st_mtime_ns, about.st_ino, read
+            )  # fmt: skip
+        return found
+
+    def check(self) -> None:
+        assert self.state() == self.before
+
+
+def test_reading_is_noticed(tmp_path: Path) -> None:
+    victims = Victims(tmp_path / "victims")
+    path = victims.file()
+    victims.watch()
+    victims.check()
+    path.read_bytes()
+    if path.stat().st_atime_ns == OLD:
+        pytest.skip("this file system does not say when a file was read")
+    with pytest.raises(AssertionError):
+        victims.check()
+
+
+def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
+    """Do with a store whatever the commands do; returns what they refuse."""
+    refused: list[HybridlogError] = []
+
+    def attempt(create: bool, *steps: object) -> None:
+        try:
+            with hl.open(path, mongo=mongo, create=create) as store:
+                for step in steps:
+                    try:
+                        step(store)  # type: ignore[operator]
+                    except HybridlogError as error:
+                        refused.append(error)
+        except HybridlogError as error:
+            refused.append(error)
+
+    def look(store: hl.Store) -> None:
+        assert {r.name for r in store.recordings()} <= {"small", "live", "again"}
+
+    def fetch(store: hl.Store) -> None:
+        list(store.all_topics())
+        store.all_topics().count()
+
+    def ask(store: hl.Store) -> None:
+        store.topic("/imu/data").where("linear_acceleration.x > -1000").count()
+        store.topic("/imu/data").fields("header.seq").to_pandas()
+
+    def record_live(store: hl.Store) -> None:
+        from hybridlog.live.door import Door, running
+
+        running(path)
+        with suppress(StoreError):
+            Door(path, "live", {}).close()
+        store.start("live").close()
+
+    def record(store: hl.Store) -> None:
+        store.record(bag, name="again", again=True)
+
+    attempt(False, look, fetch, ask)
+    attempt(False, lambda store: store.verify(), lambda store: store.reindex())
+    attempt(True, record_live, record, look, fetch)
+    attempt(False, lambda store: store.remove("small"))
+    attempt(False, look)
+    return refused
+
+
+def planted(template: Path, tmp_path: Path, name: str, target: Path) -> Path:
+    """A copy of a store with a symlink at a place."""
+    store = tmp_path / "store"
+    shutil.copytree(template, store, symlinks=True)
+    place = store / name
+    if place.is_dir():
+        shutil.rmtree(place)
+    place.unlink(missing_ok=True)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to(target)
+    return store
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_file_that_leads_out(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
+) -> None:
+    name = FILES[kind]
+    victims = Victims(tmp_path / "victims")
+    original = template / name
+    content = original.read_bytes() if original.is_file() else b"precious"
+    store = planted(template, tmp_path, name, victims.file(content))
+    victims.watch()
+    use(store, database(server, f"file{list(FILES).index(kind)}"), bag)
+    victims.check()
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_file_that_leads_to_nothing(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
+) -> None:
+    victims = Victims(tmp_path / "victims")
+    store = planted(template, tmp_path, FILES[kind], victims.place / "new")
+    victims.watch()
+    use(store, database(server, f"none{list(FILES).index(kind)}"), bag)
+    victims.check()
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_that_leads_out(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
+) -> None:
+    name = FOLDERS[kind]
+    victims = Victims(tmp_path / "victims")
+    like = template / ("recordings/small" if "recording" in kind[1:] else name)
+    store = planted(template, tmp_path, name, victims.folder(like))
+    victims.watch()
+    use(store, database(server, f"folder{list(FOLDERS).index(kind)}"), bag)
+    victims.check()
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_that_leads_to_nothing(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
+) -> None:
+    victims = Victims(tmp_path / "victims")
+    store = planted(template, tmp_path, FOLDERS[kind], victims.place / "new")
+    victims.watch()
+    use(store, database(server, f"gone{list(FOLDERS).index(kind)}"), bag)
+    victims.check()
+
+
+# --- the embedded MongoDB ---
+
+
+def hostile_mongod(tmp_path: Path, name: str, target: Path) -> Path:
+    directory = tmp_path / "mongod"
+    place = directory / name if name else directory
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to(target)
+    return directory
+
+
+def refuse(directory: Path) -> str:
+    with pytest.raises(StoreError, match=f"Remove {directory}") as caught:
+        EmbeddedMongod(directory, linger_s=0.2).start()
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", MONGOD_FILES)
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_file_of_mongods(tmp_path: Path, name: str, exists: bool) -> None:
+    victims = Victims(tmp_path / "victims")
+    target = victims.file(b"{}") if exists else victims.place / "new"
+    directory = hostile_mongod(tmp_path, name, target)
+    victims.watch()
+    assert Path(name).name in refuse(directory)
+    victims.check()
+    assert (directory / name).is_symlink()
+
+
+@pytest.mark.parametrize("name", MONGOD_FOLDERS)
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_folder_of_mongods(tmp_path: Path, name: str, exists: bool) -> None:
+    victims = Victims(tmp_path / "victims")
+    target = victims.folder(None) if exists else victims.place / "new"
+    directory = hostile_mongod(tmp_path, name, target)
+    victims.watch()
+    refuse(directory)
+    victims.check()
+
+
+@pytest.mark.parametrize("name", ["mongod.log", "data/x", "users.lock"])
+def test_what_is_no_plain_file(tmp_path: Path, name: str) -> None:
+    place = tmp_path / "mongod" / name
+    place.parent.mkdir(parents=True)
+    os.mkfifo(place)
+    began = time.monotonic()
+    refuse(tmp_path / "mongod")
+    assert time.monotonic() - began < 10
+
+
+def test_too_much_to_look_through(tmp_path: Path) -> None:
+    (tmp_path / "mongod" / "/".join("deep" for _ in range(50))).mkdir(parents=True)
+    assert "more than an index" in refuse(tmp_path / "mongod")
+
+
+def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
+    victims = Victims(tmp_path / "victims")
+    store = planted(template, tmp_path, "mongod", victims.folder(None))
+    victims.watch()
+    with hl.open(store) as away:
+        assert away.database is None
+        assert "Remove" in str(away.without_database)
+        assert away.topic("/imu/data").count() > 0
+    (store / "mongod").unlink()
+    with hl.open(store) as back:
+        assert back.database is not None
+        assert back.topic("/imu/data").where("header.seq >= 0").count() > 0
+    victims.check()
+
+
+def test_symlinks_that_come_while_mongod_runs(tmp_path: Path) -> None:
+    """The log is put aside, and the record written, without going by names."""
+    victims = Victims(tmp_path / "victims")
+    directory = tmp_path / "mongod"
+    directory.mkdir()
+    with (directory / "mongod.log").open("wb") as log:
+        log.truncate(11 << 20)
+    target = victims.file()
+    with EmbeddedMongod(directory, linger_s=0.2):
+        assert (directory / "mongod.log.1").stat().st_size == 11 << 20
+        for name in ("mongod.log", "mongod.json", "mongod.log.1"):
+            (directory / name).unlink()
+            (directory / name).symlink_to(target)
+        victims.watch()
+    wait_for(lambda: not (directory / "data/mongod.lock").read_bytes())
+    victims.check()
+
+
+def test_the_keeper_follows_no_symlink_by_itself(tmp_path: Path) -> None:
+    """Somebody may put one there after the keeper's starter has looked."""
+    victims = Victims(tmp_path / "victims")
+    target = victims.file(b'{"keeper": %d}' % os.getpid())
+    directory = tmp_path / "mongod"
+    directory.mkdir()
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
+    log = os.open(directory / "mongod.log", flags)
+    os.ftruncate(log, mongod_keeper.LOG_LIMIT + 1)
+    folder = os.open(directory, os.O_RDONLY)
+    job = mongod_keeper.Job(
+        command=[],
+        socket=str(tmp_path / "none" / "mongod.sock"),
+        record="mongod.json",
+        users_lock="users.lock",
+        log="mongod.log",
+        linger_s=0,
+        folder_fd=folder,
+        log_fd=log,
+        alive_fd=-1,
+    )
+    try:
+        for name in ("mongod.json", "mongod.json.new", "mongod.log.1", "users.lock"):
+            (directory / name).symlink_to(target)
+        victims.watch()
+        mongod_keeper._clean(job)
+        assert (directory / "mongod.json").is_symlink(), "what it leads to was not asked"
+        mongod_keeper._write_record(job, 1)
+        mongod_keeper._put_log_aside(job)
+        mongod_keeper._say(job, "done")
+        with pytest.raises(OSError):
+            mongod_keeper._open(job, "users.lock", os.O_RDWR)
+        victims.check()
+        assert json.loads((directory / "mongod.json").read_bytes())["mongod"] == 1
+        assert not (directory / "mongod.json").is_symlink()
+        aside = (directory / "mongod.log.1").lstat()
+        assert (aside.st_size, aside.st_mode & 0o777) == (mongod_keeper.LOG_LIMIT + 1, 0o600)
+        assert (directory / "mongod.log").read_text() == "hybridlog: done\n"
+        mongod_keeper._clean(job)
+        assert not (directory / "mongod.json").exists()
+    finally:
+        os.close(log)
+        os.close(folder)
+
+
+def test_a_record_leads_to_no_socket_of_another_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store that came with a record of where mongod listens takes nothing away."""
+    import socket
+    import tempfile
+
+    from hybridlog_storage.socket_directory import new_socket
+
+    with tempfile.TemporaryDirectory(prefix="hl-", dir="/tmp") as name:
+        monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", name)
+        other = new_socket(tmp_path / "other" / "mongod", "mongod.sock")
+        with socket.socket(socket.AF_UNIX) as theirs:
+            theirs.bind(str(other))
+            directory = tmp_path / "mongod"
+            directory.mkdir()
+            record = f'{{"socket": "{other}", "mongod": 1}}'
+            (directory / "mongod.json").write_text(record)
+            with EmbeddedMongod(directory, linger_s=0.2):
+                assert other.exists()
+        assert other.exists()
+
+
+# --- by the commands ---
+
+
+def test_the_commands(tmp_path: Path, bag: Path) -> None:
+    """As a user does it, with the store's own MongoDB, and several symlinks at once."""
+    store = tmp_path / "store"
+    run("record", bag, "-q", store=store)
+    wait_for(lambda: not (store / "mongod/mongod.json").exists())
+    victims = Victims(tmp_path / "victims")
+    targets = {
+        "mongod/mongod.log": "a",
+        "mongod/mongod.json.new": "b",
+        "recordings/small/writer.lock": "new",
+        "recorders/live.json": "d",
+    }
+    for name, victim in targets.items():
+        place = store / name
+        place.parent.mkdir(exist_ok=True)
+        place.unlink(missing_ok=True)
+        place.symlink_to(victims.place / victim)
+        if victim != "new":
+            (victims.place / victim).write_text(f"precious {victim}")
+    victims.watch()
+    commands: list[tuple[object, ...]] = [
+        ("ls",),
+        ("info",),
+        ("fetch", "-t", "/imu/data", "--count", "-q"),
+        ("fetch", "-t", "/imu/data", "--where", "header.seq >= 0", "--count", "-q"),
+        ("rm", "-y", "nosuch"),
+        ("verify", "-q"),
+        ("reindex", "-q"),
+        ("top", "--once"),
+        ("mark", "here"),
+        ("record", bag, "--again", "-q"),
+        ("record", "--replay", bag, "--name", "live", "--duration", "1s", "-q"),
+        ("rm", "-y", "small"),
+    ]
+    for command in commands:
+        run(*command, store=store, code=None)
+        victims.check()
+    shutil.rmtree(store / "mongod")
+    run(
+        "record",
+        "--replay",
+        bag,
+        "--name",
+        "live",
+        "--duration",
+        "1s",
+        "-q",
+        store=store,
+        code=None,
+    )
+    for command in commands:
+        run(*command, store=store, code=None)
+        victims.check()
+
+
+def test_every_kind_of_file_is_tried(tmp_path: Path, bag: Path) -> None:
+    """What a store really holds is on the lists above."""
+    seen: set[str] = set()
+    with hl.open(tmp_path / "store", create=True) as store:
+        live = store.start("live")
+        place = store.directory.path
+        seen |= {str(p.relative_to(place)) for p in place.rglob("*")}
+        live.close()
+        store.record(bag, name="small")
+        seen |= {str(p.relative_to(place)) for p in place.rglob("*")}
+    known = {*FILES.values(), *FOLDERS.values()}
+    alike = {name.replace("/live/", "/small/") for name in seen}
+    alike = {re.sub(r"/\d+\.mcap", "/000001.mcap", name) for name in alike}
+    assert {n for n in alike if not OF_MONGOD.fullmatch(n)} <= known

@@ -1,0 +1,201 @@
+"""After a power cut: what was promised is there, and what is missing is told."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog_storage import files
+from hybridlog_storage.database import Database
+from hybridlog_storage.errors import HybridlogError, SegmentError
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from tests.power import PowerCut
+
+NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
+CHANNEL = Channel("/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})
+OTHER = Channel("/b", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})
+COUNT = 40
+
+
+@pytest.fixture(scope="module")
+def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with EmbeddedMongod(tmp_path_factory.mktemp("power") / "mongod", linger_s=0) as running:
+        yield running.start()
+
+
+def message(number: int) -> bytes:
+    text = random.Random(number).randbytes(200 + 37 * number % 900).hex().encode()
+    return struct.pack("<I", len(text)) + text
+
+
+WANT = {
+    "/a": [message(n) for n in range(0, COUNT, 2)],
+    "/b": [message(n) for n in range(1, COUNT, 2)],
+}
+
+
+class Run:
+    """A recording that is made while the power may fail."""
+
+    def __init__(self, place: Path, mongod: str, sync: str, calls: int | None) -> None:
+        self.store = place / "store"
+        self._mongod, self._name = mongod, f"power-{place.name}-{sync}"
+        with hl.open(self.store, mongo=self._uri, create=True):
+            pass
+        self.power = PowerCut(self.store, calls)
+        self.written: list[int] = []
+        """Messages that were flushed with `sync="chunk"`: promised to be there."""
+        self.sealed = 0
+        self.is_closed = False
+        self.settings = SegmentSettings(chunk_size=2048, segment_size=9000, sync=sync)  # type: ignore[arg-type]
+
+    @property
+    def _uri(self) -> str:
+        return self._mongod.replace("/?", f"/{self._name}?")
+
+    def go(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        tell = RecordingWriter._tell
+
+        def told(writer: RecordingWriter, chunk: object, stored: object) -> None:
+            if not self.power.is_off:
+                self.written.append(len(stored.batch))  # type: ignore[attr-defined]
+            tell(writer, chunk, stored)  # type: ignore[arg-type]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "system", self.power)
+            patch.setattr(RecordingWriter, "_tell", told)
+            store = hl.open(self.store, mongo=self._uri)
+            try:
+                with suppress(HybridlogError, OSError):
+                    recording = store.start("run", settings=self.settings)
+                    for number in range(COUNT):
+                        recording.write(
+                            (CHANNEL, OTHER)[number % 2], message(number), log_time=1000 + number
+                        )
+                        if number % 8 == 7:
+                            recording._capture.writer.flush()
+                    recording.close()
+                    self.is_closed = not self.power.is_off
+            finally:
+                with suppress(HybridlogError, OSError):
+                    store.close()
+        with Database.connect(self._mongod, self._name) as database:
+            database.drop_all()
+
+
+def check(found: Path, run: Run, sync: str) -> str:
+    """What somebody finds, held against what was promised; returns the recording's status."""
+    try:
+        return look(found, run, sync)
+    except SegmentError:
+        assert sync == "never"  # nothing was promised but that this is told
+        return "unreadable"
+
+
+def look(found: Path, run: Run, sync: str) -> str:
+    with closing(hl.open(found, mongo=NOWHERE)) as store:
+        entries = store.recordings()
+        if sync == "never" and store.repairs.unreadable:
+            return "unreadable"
+        assert not store.repairs.unreadable
+        if not entries:
+            assert not run.is_closed
+            assert sync != "chunk" or not run.written
+            return "nothing"
+        (entry,) = entries
+        got: dict[str, list[bytes]] = {"/a": [], "/b": []}
+        if entry.channels:
+            for one in store.all_topics():
+                got[one.topic].append(bytes(one.raw))
+                assert bytes(one.raw) == message(one.log_time_ns - 1000)
+        lost = sum(row["count"] or 0 for row in entry.end.get("losses", ()))
+        count = sum(map(len, got.values()))
+        assert count == entry.messages
+        if entry.status == "complete":
+            assert got == WANT
+        if run.is_closed and sync != "never":
+            assert (entry.status, got) == ("complete", WANT)
+        if sync == "chunk":
+            assert count >= sum(run.written)
+        assert count + lost <= COUNT
+        # Once more: what was found is found again, byte for byte.
+        with closing(hl.open(found, mongo=NOWHERE)) as again:
+            assert again.recordings() == entries
+        return entry.status
+
+
+def calls_of(tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    run = Run(tmp_path / "whole", mongod, sync, None)
+    run.go(monkeypatch)
+    assert run.is_closed
+    assert check(run.store, run, sync) == "complete"
+    return run.power.calls
+
+
+@pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
+def test_a_power_cut_while_recording(
+    tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=12, fates=3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
+def test_power_cuts_at_every_call(
+    tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=1000, fates=4)
+
+
+def try_cuts(
+    tmp_path: Path,
+    mongod: str,
+    sync: str,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    cuts: int,
+    fates: int,
+) -> None:
+    calls = calls_of(tmp_path, mongod, sync, monkeypatch)
+    assert calls > 20
+    seen = set()
+    for number in range(1, calls + 1, max(calls // cuts, 1)):
+        run = Run(tmp_path / f"cut{number}", mongod, sync, number)
+        run.go(monkeypatch)
+        for fate in range(fates):
+            found = tmp_path / f"found{number}-{fate}"
+            run.power.after_cut(found, random.Random(f"{sync}{number}{fate}"))
+            seen.add(check(found, run, sync))
+    assert seen >= {"nothing", "recovered"}
+    told = {"nothing", "recovered", "complete", "damaged", "unproven"}
+    assert seen <= (told | {"unreadable"} if sync == "never" else told)
+
+
+def test_the_model_loses_what_is_not_synced(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    power = PowerCut(root)
+    with files.folder(root, 0) as fd:
+        one = power.open("one", 0o102, folder=fd)
+        power.writev(one, [memoryview(b"x" * 1000)])
+        power.sync(one)
+        power.writev(one, [memoryview(b"y" * 1000)])
+        power.rename("one", "two", folder=fd, new_folder=fd)
+    contents, names = set(), set()
+    for seed in range(40):
+        target = tmp_path / str(seed)
+        power.after_cut(target, random.Random(seed))
+        (found,) = target.iterdir()
+        names.add(found.name)
+        assert found.read_bytes()[:1000] == b"x" * 1000
+        contents.add(len(found.read_bytes()))
+    assert names == {"one", "two"}
+    assert {1000, 1512, 2000} <= contents
