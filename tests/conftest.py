@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -11,8 +12,16 @@ from hypothesis import HealthCheck, settings
 from tests import real_peers
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
-for name in ("HYBRIDLOG_STORE", "HYBRIDLOG_MONGO_URI"):
+for name in (
+    "HYBRIDLOG_STORE",
+    "HYBRIDLOG_MONGO_URI",
+    "HYBRIDLOG_MONGO_PASSWORD",
+    "HYBRIDLOG_MONGO_PASSWORD_FILE",
+):
     os.environ.pop(name, None)
+# What the tests agree to is nothing that whoever runs them has agreed to.
+_STATE = tempfile.TemporaryDirectory(prefix="hl-state-")
+os.environ["XDG_STATE_HOME"] = _STATE.name
 # Hundreds of commands are run, which need not all be compiled anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
@@ -23,6 +32,7 @@ settings.register_profile(
 settings.load_profile("any machine")
 
 LONGEST = (
+    "test_mutants",
     "test_model",
     "test_smoke",
     "test_docs",
@@ -51,9 +61,14 @@ for number, handler in (
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", 'slow: takes long; left out by -m "not slow"')
     config.addinivalue_line("markers", "peer(kind): speaks with a real peer, not one of ours")
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(real_peers.Attendance())
+
+
+def pytest_unconfigure() -> None:
+    _STATE.cleanup()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

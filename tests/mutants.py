@@ -1,0 +1,509 @@
+"""The faults that `test_mutants` puts into the code, by the module that they are in."""
+
+# ruff: noqa: E501 - a fragment of code is easiest to read on a line of its own
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from tests.mutate import Mutant
+
+AGREEMENT = "tests/query/test_agreement.py"
+JSON_ARRAYS = f"{AGREEMENT}::test_what_json_arrays_answer"
+MISSED = "tests/test_faults.py::test_each_message_that_is_missing_in_the_index_is_counted"
+INTERVALS = "tests/query/test_intervals.py"
+LEDGER = "tests/test_losses.py"
+
+
+def _of(file: str, *mutants: tuple[str, str, str, str]) -> Iterator[Mutant]:
+    """Mutants of one file: name, what is there, what stands for it, a test."""
+    for name, old, new, test in mutants:
+        yield Mutant(name, file, old, new, (test,))
+
+
+MUTANTS = [
+    *_of(
+        "hybridlog/query/evaluate.py",
+        (
+            "short-arrays-have-no-n",
+            "    if stat is not None:\n        found.extend(",
+            '    if stat is not None and stat != "n":\n        found.extend(',
+            JSON_ARRAYS,
+        ),
+        (
+            "true-is-no-number-in-a-summary",
+            "[value * 1 for value in values",
+            "[value for value in values",
+            f"{AGREEMENT}::test_of_ros_messages",
+        ),
+        (
+            "triggers-ignore-types",
+            "stat = types.statistic(node.field.parts)",
+            "stat = FieldTypes.of(None).statistic(node.field.parts)",
+            f"{AGREEMENT}::test_of_ros_messages",
+        ),
+        (
+            "summaries-have-no-elements",
+            "            values.extend(leaf[end] for leaf in leaves if _is_summary(leaf))\n",
+            "",
+            JSON_ARRAYS,
+        ),
+        (
+            "the-mean-is-rounded-twice",
+            "return math.fsum((*values, *rests))",
+            "return math.fsum(values)",
+            f"{AGREEMENT}::test_of_json",
+        ),
+        ("letters-of-all-scripts", "re.ASCII if", "re.NOFLAG if", f"{AGREEMENT}::test_of_patterns"),
+    ),
+    *_of(
+        "hybridlog/query/mongo_filter.py",
+        (
+            "long-json-arrays-have-no-elements",
+            "if _is_number(value) and order in _EXTREMES:",
+            'if _is_number(value) and order == "<=":',
+            JSON_ARRAYS,
+        ),
+        (
+            "arrays-in-arrays-have-no-elements",
+            "    if isinstance(asked.parts[-1], str):\n        return found",
+            "    if asked.parts:\n        return found",
+            JSON_ARRAYS,
+        ),
+        (
+            "a-field-called-n-is-a-count",
+            'each = {"$not": [{"$and"',
+            'each = {"$or": [True, {"$and"',
+            JSON_ARRAYS,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/tokens.py",
+        (
+            "any-element-of-any-element",
+            "if is_element and of_any:",
+            "if False:",
+            "tests/query/test_where.py::test_errors_point_at_the_place",
+        ),
+    ),
+    *_of(
+        "hybridlog/query/column_filter.py",
+        (
+            "ceil-for-floor",
+            '(math.ceil if operator in {"$lt", "$gte"} else math.floor)',
+            '(math.floor if operator in {"$lt", "$gte"} else math.ceil)',
+            "tests/query/test_column_filter.py",
+        ),
+        (
+            "floats-as-narrow-as-the-column",
+            "column.values.astype(np.float64, copy=False), operand",
+            "column.values, operand",
+            "tests/query/test_column_filter.py",
+        ),
+    ),
+    *_of(
+        "hybridlog/query/intervals.py",
+        (
+            "touching-intervals-meet-below",
+            'low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")',
+            'low = np.searchsorted(theirs[:, 1], mine[:, 0], "left")',
+            INTERVALS,
+        ),
+        (
+            "touching-intervals-meet-above",
+            'high = np.searchsorted(theirs[:, 0], mine[:, 1], "left")',
+            'high = np.searchsorted(theirs[:, 0], mine[:, 1], "right")',
+            INTERVALS,
+        ),
+        (
+            "the-longest-gap-overflows",
+            "np.minimum(begin, _LAST - self._max_gap) + self._max_gap",
+            "begin + self._max_gap",
+            f"{INTERVALS}::test_a_state_may_be_believed_for_ever",
+        ),
+    ),
+    *_of(
+        "hybridlog/recorder.py",
+        (
+            "nothing-behind-the-last-message",
+            "writer.totals.messages)\n    for extra in source.extras:",
+            "writer.totals.messages)\n    for extra in ():",
+            "tests/sources/test_mcap.py::test_what_stands_behind_the_last_message_is_recorded",
+        ),
+    ),
+    *_of(
+        "hybridlog/live/recorder.py",
+        (
+            "numbers-of-more-than-32-bits",
+            "sequence % _SEQUENCES",
+            "sequence",
+            "tests/live/test_recorder.py::"
+            "test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones",
+        ),
+    ),
+    *_of(
+        "hybridlog/live/recording.py",
+        (
+            "chunks-flushed-three-intervals-late",
+            "flush_older(interval * _FLUSHED - 2 * tick)",
+            "flush_older(3 * interval)",
+            "tests/live/test_recording.py::test_chunks_are_flushed_within_the_interval",
+        ),
+    ),
+    *_of(
+        "hybridlog/index_writer.py",
+        (
+            "missed-chunks-for-missed-messages",
+            "self.missed += sum(chunk.messages for chunk in self._forgotten)",
+            "self.missed += len(self._forgotten)",
+            "tests/live/test_recording.py::"
+            "test_a_database_that_refuses_to_the_end_leaves_what_segments_know",
+        ),
+        (
+            "one-missed-message-a-chunk",
+            "self.missed += len(chunk.batch)",
+            "self.missed += 1",
+            MISSED,
+        ),
+        (
+            "messages-sent-in-vain-are-not-missed",
+            "self.missed += parcel.messages",
+            "pass",
+            MISSED,
+        ),
+    ),
+    *_of(
+        "hybridlog/live_sources/foxglove_session.py",
+        (
+            "gaps-are-dropped-when-a-server-leaves",
+            "                numbers.finish()\n",
+            "                pass\n",
+            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+        ),
+    ),
+    *_of(
+        "hybridlog/live_sources/foxglove_numbers.py",
+        (
+            "a-gap-of-a-server-begins-at-its-end",
+            "self._first = self._time",
+            "self._first = received",
+            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+        ),
+    ),
+    *_of(
+        "hybridlog/live_sources/ros1_stream.py",
+        (
+            "a-gap-of-a-publisher-begins-at-its-end",
+            "                count,\n                first=self._last,\n",
+            "                count,\n                first=now,\n",
+            "tests/live_sources/test_ros1_parts.py::test_dropped_messages_are_counted",
+        ),
+    ),
+    *_of(
+        "hybridlog/losses.py",
+        ("a-loss-begins-late", "min(row.first, first)", "row.first", LEDGER),
+        ("a-loss-ends-early", "max(row.last, last)", "row.last", LEDGER),
+        ("a-row-ends-early", 'max(before["to"], row["to"])', 'row["to"]', LEDGER),
+        ("rows-apart-are-joined", "<= _JOINED_NS:", "<= 2 * _JOINED_NS:", LEDGER),
+        ("rows-of-wishes-never-come", "row.last - row.first >= _SLOW_NS", "False", LEDGER),
+    ),
+    *_of(
+        "storage/hybridlog_storage/append_file.py",
+        (
+            "a-file-ends-in-zeros",
+            "                files.system.truncate(self._fd, self.position)\n",
+            "                pass\n",
+            "tests/storage/test_append_file.py",
+        ),
+        (
+            "what-is-behind-the-last-block-is-lost",
+            "end = whole + BLOCK if rest else whole",
+            "end = whole",
+            "tests/storage/test_append_file.py",
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/durability.py",
+        (
+            "a-write-that-was-cut-short-skips-a-byte",
+            "return [view[done:], *views[index + 1 :]]",
+            "return [view[done + 1 :], *views[index + 1 :]]",
+            "tests/storage/test_append_file.py",
+        ),
+        (
+            "a-full-disk-is-any-error",
+            "if error.errno in NO_SPACE:",
+            "if False:",
+            "tests/live/test_recorder.py::test_a_full_disk_ends_it_and_what_comes_is_counted",
+        ),
+    ),
+]
+
+JOURNAL = "tests/storage/test_journal.py"
+POWER = "tests/test_power_cut.py"
+REPAIR = "tests/test_repair.py"
+IDENTITY = "tests/test_identity.py"
+ENTRIES = "tests/test_entries.py"
+RECOVERY = "tests/storage/test_recovery.py"
+SEGMENTS = "tests/storage/test_segments.py"
+CATALOG = "tests/storage/test_catalog.py"
+STEPS = "tests/faults/test_some.py"
+
+FORMAT_2 = [
+    *_of(
+        "storage/hybridlog_storage/journal.py",
+        (
+            "a-journal-is-not-synced",
+            "                    if self._sync:\n",
+            "                    if False:\n",
+            JOURNAL,
+        ),
+        ("a-new-journal-has-no-name", "if self._sync and size == 0:", "if False:", JOURNAL),
+        (
+            "a-torn-line-stays",
+            "                if whole < size:\n",
+            "                if False:\n",
+            JOURNAL,
+        ),
+        ("a-line-is-believed", 'if line[:9] != b"%08x " % crc32(line[9:]):', "if False:", JOURNAL),
+        (
+            "a-failed-append-stays",
+            "                    files.system.truncate(fd, whole)\n                    raise",
+            "                    raise",
+            JOURNAL,
+        ),
+        ("an-older-journal-is-not-kept", "        if old:\n", "        if False:\n", REPAIR),
+        (
+            "a-damaged-line-proves",
+            "return bool(self.begun) and not self.damaged and",
+            "return bool(self.begun) and",
+            ENTRIES,
+        ),
+        ("a-rebuilt-journal-proves", "and self.rebuilt is None", "", REPAIR),
+    ),
+    *_of(
+        "hybridlog/entries.py",
+        ("a-missing-segment-is-no-loss", "            found.lost.append(sealed)\n", "", ENTRIES),
+        (
+            "a-foreign-segment-is-believed",
+            "if its_id != recording:",
+            "if False:",
+            ENTRIES,
+        ),
+        ("a-swapped-segment-is-believed", "if its_number != number:", "if False:", ENTRIES),
+        (
+            "an-older-segment-is-believed",
+            "if sealed is not None and (summary.digest",
+            "if False and (summary.digest",
+            ENTRIES,
+        ),
+        ("losses-are-no-damage", "    if has_losses:\n", "    if False:\n", ENTRIES),
+        ("unproven-is-complete", "    if not inventory.is_proven:\n", "    if False:\n", ENTRIES),
+    ),
+    *_of(
+        "hybridlog/maintenance/opening.py",
+        (
+            "a-removal-is-not-finished",
+            "if state is not None and state.removing:",
+            "if False:",
+            f"{IDENTITY}::test_a_removal_that_was_announced_is_finished",
+        ),
+        (
+            "what-was-removed-is-not-swept",
+            "        for name in directory.hidden(REMOVED):\n",
+            "        for name in ():\n",
+            STEPS,
+        ),
+        (
+            "a-crash-has-no-end",
+            "if state is not None and state.end is None:",
+            "if False:",
+            f"{REPAIR}::test_a_recording_without_its_end_gets_one",
+        ),
+        (
+            "files-that-changed-are-believed",
+            "    if looks != listing.print:\n        return False\n",
+            "",
+            f"{IDENTITY}::test_the_copy_that_is_whole_answers",
+        ),
+        (
+            "a-lost-journal-stays-lost",
+            "        report.journals.append(label)\n",
+            "        pass\n",
+            REPAIR,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/removal.py",
+        (
+            "documents-of-a-removed-recording-stay",
+            "    state.clear(entry.key, state.topic_collections())\n",
+            "",
+            STEPS,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/lease.py",
+        (
+            "a-copied-store-is-taken-for-the-original",
+            "    if embedded or None in where or _has_moved(mark, place):",
+            "    if True:",
+            f"{IDENTITY}::test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing",
+        ),
+        (
+            "a-moved-store-is-taken-for-a-copy",
+            "or _has_moved(mark, place)",
+            "",
+            f"{IDENTITY}::test_a_moved_store_takes_its_index_along",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/imports.py",
+        (
+            "an-import-is-not-checked",
+            "return not any(True for _ in check.problems())",
+            "return True",
+            f"{IDENTITY}::test_what_is_damaged_is_not_imported",
+        ),
+        (
+            "an-import-begins-anew",
+            "        if not _is_there(path / name, summary.digest, summary.size):\n            _copy",
+            "        if True:\n            _copy",
+            f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
+        ),
+        (
+            "an-import-is-not-adopted",
+            "        Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))\n",
+            "",
+            f"{IDENTITY}::test_import",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/edit.py",
+        (
+            "a-mark-is-no-line",
+            "Journal(path).append(marked, sealed_event(sealed))",
+            "Journal(path).append(sealed_event(sealed))",
+            f"{IDENTITY}::test_names_tags_notes_and_marks_are_kept",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/repair.py",
+        (
+            "what-was-exchanged-stays",
+            "                files.rename(path / misfit.file, path / moving_name(misfit.file, misfit.belongs))\n",
+            "                pass\n",
+            REPAIR,
+        ),
+        (
+            "a-journal-that-lacked-a-segment-proves",
+            "            journal.event(journal.REBUILT, reason=reason),\n            *[",
+            "            *[",
+            REPAIR,
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/recovery.py",
+        (
+            "another-summary-takes-its-place",
+            "        if segment.complete().digest != digest:\n            return False\n",
+            "        segment.complete()\n",
+            REPAIR,
+        ),
+        (
+            "a-recovered-segment-has-no-end",
+            "if damage or not rebuilder.has_end:",
+            "if False:",
+            RECOVERY,
+        ),
+        ("a-recovery-is-not-announced", "        tell(found)\n", "", SEGMENTS),
+    ),
+    *_of(
+        "storage/hybridlog_storage/segment_file.py",
+        (
+            "a-sealed-segment-has-no-name",
+            "            files.sync_folder(final.parent)\n        except OSError",
+            "            pass\n        except OSError",
+            SEGMENTS,
+        ),
+        (
+            "a-segment-is-announced-when-it-has-its-name",
+            "            on_sealing(sealed)\n            if self.path != final:\n                files.rename(self.path, final)\n                self.path = final\n",
+            "            if self.path != final:\n                files.rename(self.path, final)\n                self.path = final\n            on_sealing(sealed)\n",
+            SEGMENTS,
+        ),
+        (
+            "a-sealed-segment-is-not-synced",
+            "self._file.finish(sync=sync)",
+            "self._file.finish(sync=False)",
+            SEGMENTS,
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/segment_reader.py",
+        (
+            "stored-bytes-are-believed",
+            "                if crc not in {None, crc32(part)}:\n",
+            "                if False:\n",
+            SEGMENTS,
+        ),
+        (
+            "indexes-are-believed",
+            '            if crc32(trailer) != place.trailer_crc:\n                raise SegmentError("its message indexes or arrival numbers changed")\n            return message_times',
+            "            return message_times",
+            SEGMENTS,
+        ),
+        (
+            "metadata-is-believed",
+            "        if crc32(data) != crc:\n",
+            "        if False:\n",
+            SEGMENTS,
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/catalog.py",
+        (
+            "rows-of-recordings-are-believed",
+            "                if _crc(*row) == crc:\n",
+            "                if True:\n",
+            f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "chunks-of-another-segment-are-believed",
+            "if row is None or _crc(*row[:4]) != row[4] or row[:3] != key:",
+            "if row is None:",
+            f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "stamps-are-believed",
+            "if row is None or _crc(*row[:4]) != row[4] or row[2] != entry.digests.get(str(number)):",
+            "if row is None:",
+            f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "a-chunk-that-touches-a-range-is-left-out",
+            "not (first < bounds[1] and last >= bounds[0])",
+            "not (first < bounds[1] and last > bounds[0])",
+            f"{CATALOG}::test_chunks_by_channel_time_and_clock",
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/index_state.py",
+        (
+            "an-index-of-other-segments-is-whole",
+            'return self.state == "complete" and dict(self.segments) == entry.digests',
+            'return self.state == "complete"',
+            "tests/storage/test_index_state.py",
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/files.py",
+        (
+            "symlinks-of-files-are-followed",
+            "system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)",
+            "system.open(path.name, flags, mode, folder=fd)",
+            "tests/storage/test_append_file.py",
+        ),
+    ),
+]
+MUTANTS += FORMAT_2
