@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import inspect
 import json
 import math
@@ -17,16 +16,14 @@ import sys
 import termios
 import threading
 import typing
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
-import zstandard
 
 import hybridlog as hl
 from hybridlog.cli.app import app
@@ -34,6 +31,18 @@ from hybridlog.cli.main import EXIT_CODES
 from hybridlog.query import times, topics, where
 from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError
+from tests.format_reader import (
+    Content,
+    FormatReader,
+    Recording,
+    Told,
+    collection_name,
+    index_key,
+    schema_hash,
+)
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -418,7 +427,7 @@ def test_the_two_commands_stand_where_the_machine_reads_them() -> None:
     assert len(lines) == 2
     assert all(line.startswith("    python3 -m venv .venv && ") for line in lines)
     assert lines[0].endswith(".venv/bin/hybridlog demo")
-    assert lines[1].endswith(".venv/bin/pytest -q")
+    assert lines[1].endswith(".venv/bin/pytest -q -m 'not slow'")
 
 
 def test_the_changelog_has_this_version() -> None:
@@ -502,7 +511,10 @@ def public(thing: type) -> dict[str, Any]:
 
 def documented_classes() -> list[type]:
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.maintenance import Finding, Tended, Verification
+    from hybridlog.maintenance.imports import ImportReport
+    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.report import RepairReport
+    from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.plan import Counters
     from hybridlog.recorder import RecordReport
@@ -510,7 +522,7 @@ def documented_classes() -> list[type]:
     from hybridlog_storage.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Verification, Finding, Tended]
+    checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
     asking = [hl.Query, hl.Message, Intervals, Interval]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
@@ -524,7 +536,7 @@ def test_every_public_name_is_described(thing: type) -> None:
     if thing.__name__ == "LiveRecording":
         members |= dict.fromkeys(("id", "ledger"))
     if thing is hl.Store:
-        attributes = "directory database without_database tended kept recent_chunks"
+        attributes = "directory catalog without_database repairs kept recent_chunks"
         members |= dict.fromkeys(attributes.split())
     assert set(rows) == set(members), set(rows) ^ set(members)
     for name, value in members.items():
@@ -619,179 +631,6 @@ def test_the_patterns_find_what_is_said() -> None:
 # --- the specification ----------------------------------------------------------------
 
 
-class Told(NamedTuple):
-    """A message as a reader tells it."""
-
-    seq: int
-    topic: str
-    encoding: str
-    schema: tuple[str, str, bytes] | None
-    log_time: int
-    publish_time: int | None
-    sequence: int
-    payload: bytes
-
-
-class SecondReader:
-    """Reads a store by `docs/format.md` alone."""
-
-    MAGIC: ClassVar[bytes] = b"\x89MCAP0\r\n"
-
-    def __init__(self, store: Path) -> None:
-        self.store = store
-        settings = dict(
-            line.split(" = ", 1)
-            for line in (store / "hybridlog.toml").read_text().splitlines()
-            if " = " in line
-        )
-        assert int(settings["format"]) == 1
-        self.store_id = json.loads(settings["store_id"])
-        self.payloads: dict[tuple[str, int, int, int], bytes] = {}
-        """By recording, segment, chunk and offset, as `_meta.ref` has them."""
-        self.chunks: dict[tuple[str, int, int], tuple[int, int]] = {}
-        """Length of chunk record and trailer."""
-        self.keys: dict[str, int] = {}
-        self.ends: dict[str, Any] = {}
-
-    def recordings(self) -> list[str]:
-        places = (self.store / "recordings").iterdir()
-        return sorted(p.name for p in places if p.is_dir() and p.name[0] != ".")
-
-    def messages(self, recording: str) -> list[Told]:
-        """All messages of a recording in the order of arrival."""
-        found: list[Told] = []
-        for path in sorted((self.store / "recordings" / recording).glob("*.mcap")):
-            found += self._segment(recording, int(path.name.removesuffix(".mcap")), path)
-        return sorted(found)
-
-    def _segment(self, recording: str, segment: int, path: Path) -> Iterator[Told]:
-        data = path.read_bytes()
-        assert data.startswith(self.MAGIC)
-        assert data.endswith(self.MAGIC)
-        schemas: dict[int, tuple[str, str, bytes]] = {}
-        channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
-        chunk: tuple[int, int, bytes] | None = None
-        at = 8
-        while True:
-            opcode, length = struct.unpack_from("<BQ", data, at)
-            start, body = at, Content(data[at + 9 : at + 9 + length])
-            at += 9 + length
-            if opcode == 0x01:
-                assert body.text() == "hybridlog"
-            elif opcode == 0x03:
-                number = body.take("<H")
-                name, encoding = body.text(), body.text()
-                schemas[number] = (name, encoding, body.block(body.take("<I")))
-            elif opcode == 0x04:
-                number, schema = body.take("<H"), body.take("<H")
-                channels[number] = (schema, body.text(), body.text(), body.mapping())
-            elif opcode == 0x0C:
-                self._metadata(recording, segment, body)
-            elif opcode == 0x06:
-                chunk = (start, length + 9, self._content(body))
-            elif opcode == 0x90:
-                assert chunk is not None
-                place, size, content = chunk
-                self.chunks[recording, segment, place] = (size, at - place - size)
-                assert body.take("<Q") == place
-                seqs = arrivals(body.rest())
-                for seq, (offset, head, payload) in zip(seqs, records(content), strict=True):
-                    self.payloads[recording, segment, place, offset] = payload
-                    number, sequence, log_time, publish_time = head
-                    schema, topic, encoding, metadata = channels[number]
-                    known = "hybridlog.no_publish_time" not in metadata
-                    yield Told(
-                        seq, topic, encoding, schemas[schema] if schema else None,
-                        log_time, publish_time if known else None, sequence, payload,
-                    )  # fmt: skip
-            elif opcode == 0x0F:
-                return
-
-    def _metadata(self, recording: str, segment: int, body: Content) -> None:
-        name, values = body.text(), body.mapping()
-        if name == "hybridlog.recording":
-            about = json.loads(values["json"])
-            assert (about["format"], about["segment"]) == (1, segment)
-            self.keys[recording] = about["key"]
-        elif name == "hybridlog.end":
-            self.ends[recording] = json.loads(values["json"])
-
-    @staticmethod
-    def _content(body: Content) -> bytes:
-        body.take("<Q"), body.take("<Q")
-        size, crc, compression = body.take("<Q"), body.take("<I"), body.text()
-        packed = body.block(body.take("<Q"))
-        content = packed
-        if compression:
-            assert compression == "zstd"
-            content = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        assert len(content) == size
-        assert zlib.crc32(content) == crc
-        return content
-
-
-class Content:
-    """Takes the content of a record apart."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._at = 0
-
-    def take(self, form: str) -> int:
-        (value,) = struct.unpack_from(form, self._data, self._at)
-        self._at += struct.calcsize(form)
-        return int(value)
-
-    def block(self, size: int) -> bytes:
-        self._at += size
-        return self._data[self._at - size : self._at]
-
-    def text(self) -> str:
-        return self.block(self.take("<I")).decode()
-
-    def mapping(self) -> dict[str, str]:
-        end = self.take("<I") + self._at
-        found = {}
-        while self._at < end:
-            name = self.text()
-            found[name] = self.text()
-        return found
-
-    def rest(self) -> bytes:
-        return self._data[self._at :]
-
-
-def arrivals(packed: bytes) -> list[int]:
-    raw = zstandard.ZstdDecompressor().decompressobj().decompress(packed)
-    found, seq = [], 0
-    for (difference,) in struct.iter_unpack("<q", raw):
-        seq += difference
-        found.append(seq)
-    return found
-
-
-def records(content: bytes) -> Iterator[tuple[int, tuple[int, int, int, int], bytes]]:
-    at = 0
-    while at < len(content):
-        opcode, length = struct.unpack_from("<BQ", content, at)
-        assert opcode == 0x05
-        yield (
-            at + 31,
-            struct.unpack_from("<HIQQ", content, at + 9),
-            content[at + 31 : at + 9 + length],
-        )
-        at += 9 + length
-
-
-def collection_name(topic: str) -> str:
-    """By the section "Collection names"."""
-    if re.fullmatch(r"(/[A-Za-z0-9]+(_[A-Za-z0-9]+)*)+", topic) and len(topic) <= 120:
-        return topic[1:].replace("/", "__")
-    plain = topic.removeprefix("/").replace("/", "__")
-    digest = hashlib.sha256(topic.encode()).hexdigest()
-    return re.sub("[^A-Za-z0-9_]", "_", plain)[:100] + "~" + digest[:8]
-
-
 def json_log(path: Path) -> None:
     """An MCAP with publish times, odd topics, and more than one channel on one of them."""
     from mcap.writer import Writer
@@ -830,22 +669,44 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, demo_bag: Path) -> Iterat
         yield store
 
 
+def entry_of(store: Path, label: str) -> RecordingEntry:
+    """What hybridlog says of a recording when it opens a store."""
+    with hl.open(store) as opened:
+        return next(entry for entry in opened.recordings() if entry.label == label)
+
+
+def bare(rows: Iterable[Mapping[str, Any]], *, of_files: bool) -> list[dict[str, Any]]:
+    """Rows of a loss ledger, those that follow from files without the reason, in one order."""
+    kept = [dict(row) for row in rows if (row["cause"] == "segment") == of_files]
+    for row in kept if of_files else ():
+        row.pop("reason", None)
+    return sorted(kept, key=lambda row: json.dumps(row, sort_keys=True))
+
+
 def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
-    second = SecondReader(recorded.directory.path)
+    second = FormatReader(recorded.directory.path)
     assert second.store_id == recorded.directory.settings.store_id
-    assert second.recordings() == ["cut", "robot", "weather"]
-    assert len(list((second.store / "recordings" / "robot").glob("*.mcap"))) > 2
-    for recording in second.recordings():
-        told = second.messages(recording)
+    assert second.labels() == ["cut", "robot", "weather"]
+    assert len(second.recording("robot").segments) > 2
+    for label in second.labels():
+        recording = second.recording(label)
+        (entry,) = recorded.select([label])
+        assert (recording.id, recording.status) == (entry.id, entry.status)
+        assert recording.journal is not None
+        assert (recording.journal.name, recording.journal.tags) == (entry.name, entry.tags)
+        assert recording.journal.store == second.store_id
+        for of_files in (False, True):
+            losses = bare(entry.end.get("losses", ()), of_files=of_files)
+            assert bare(recording.losses, of_files=of_files) == losses
+        told = sorted(message for _, message in recording.messages())
         schemas = {
             (lane.channel.topic, lane.channel.schema.name): lane.channel
-            for entry in recorded.select([recording])
             for lane in recorded.lanes(entry)
             if lane.channel.schema is not None
         }
         ours = sorted(
             (m.seq, m.topic, m.type, m.log_time_ns, m.publish_time_ns, m.sequence, m.raw)
-            for m in recorded.all_topics().in_recording(recording)
+            for m in recorded.all_topics().in_recording(label)
         )
         theirs = [(t.seq, t.topic, t.schema[0] if t.schema else "", *t[4:]) for t in told]
         assert theirs == ours
@@ -856,11 +717,203 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
                 assert channel.schema is not None
                 assert message.schema[1:] == (channel.schema.encoding, channel.schema.data)
                 assert message.encoding == channel.message_encoding
-    assert [second.ends[r]["status"] for r in ("cut", "robot", "weather")] == [
-        "damaged",
-        "complete",
-        "complete",
-    ]
+    statuses = [second.recording(label).status for label in second.labels()]
+    assert statuses == ["damaged", "complete", "complete"]
+
+
+@pytest.fixture(scope="module")
+def older(recorded: hl.Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Segment 1 of `robot` as a crash would have left it: whole, and with fewer messages."""
+    store = tmp_path_factory.mktemp("older") / "store"
+    robot = copied(recorded, store) / "robot"
+    (robot / "000001.mcap").rename(robot / "000001.mcap.open")
+    os.truncate(robot / "000001.mcap.open", (robot / "000001.mcap.open").stat().st_size // 2)
+    before, after = FormatReader(store).recording("robot"), entry_of(store, "robot")
+    assert (before.status, after.status) == ("unfinished", "damaged")
+    again = FormatReader(store).recording("robot")
+    assert again.status == "damaged"
+    assert bare(again.losses, of_files=True) == bare(after.end["losses"], of_files=True) != []
+    return robot / "000001.mcap"
+
+
+def copied(recorded: hl.Store, store: Path) -> Path:
+    """A copy of the files that are the truth; returns the directory of its recordings."""
+    hidden = shutil.ignore_patterns("mongod*", "catalog.sqlite*")
+    shutil.copytree(recorded.directory.path, store, ignore=hidden)
+    return store / "recordings"
+
+
+def lines_of(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True)
+
+
+def lose_segment(robot: Path, _older: Path) -> None:
+    (robot / "000001.mcap").unlink()
+
+
+def lose_last_segment(robot: Path, _older: Path) -> None:
+    max(robot.glob("*.mcap")).unlink()
+
+
+def swap_segments(robot: Path, _older: Path) -> None:
+    (robot / "000000.mcap").rename(robot / "aside")
+    (robot / "000001.mcap").rename(robot / "000000.mcap")
+    (robot / "aside").rename(robot / "000001.mcap")
+
+
+def repeat_segment(robot: Path, _older: Path) -> None:
+    shutil.copyfile(robot / "000000.mcap", robot / "000001.mcap")
+
+
+def use_older_segment(robot: Path, older: Path) -> None:
+    shutil.copyfile(older, robot / "000001.mcap")
+
+
+def use_foreign_segment(robot: Path, _older: Path) -> None:
+    shutil.copyfile(robot.with_name("weather") / "000000.mcap", robot / "000001.mcap")
+
+
+def add_foreign_segment(robot: Path, _older: Path) -> None:
+    shutil.copyfile(robot.with_name("weather") / "000000.mcap", robot / "000999.mcap")
+
+
+def cut_segment(robot: Path, _older: Path) -> None:
+    os.truncate(robot / "000001.mcap", (robot / "000001.mcap").stat().st_size - 1)
+
+
+def lose_journal(robot: Path, _older: Path) -> None:
+    (robot / "journal").unlink()
+
+
+def lose_journal_and_segment(robot: Path, _older: Path) -> None:
+    (robot / "journal").unlink()
+    (robot / "000001.mcap").unlink()
+
+
+def lose_first_line(robot: Path, _older: Path) -> None:
+    (robot / "journal").write_bytes(b"".join(lines_of(robot / "journal")[1:]))
+
+
+def flip_first_line(robot: Path, older: Path) -> None:
+    first, *rest = lines_of(robot / "journal")
+    (robot / "journal").write_bytes(b"".join([first.replace(b"robot", b"rObot", 1), *rest]))
+    add_foreign_segment(robot, older)
+
+
+def flip_checksum(robot: Path, _older: Path) -> None:
+    *rest, last = lines_of(robot / "journal")
+    (robot / "journal").write_bytes(b"".join([*rest, last[:8].upper() + b"_" + last[9:]]))
+
+
+def lose_last_lines(robot: Path, _older: Path) -> None:
+    (robot / "journal").write_bytes(b"".join(lines_of(robot / "journal")[:-2]))
+
+
+def tear_line(robot: Path, _older: Path) -> None:
+    *_, last = lines_of(robot / "journal")
+    (robot / "journal").write_bytes((robot / "journal").read_bytes() + last[:-1])
+
+
+FAULTS: dict[Callable[[Path, Path], None], str] = {
+    lose_segment: "damaged",
+    lose_last_segment: "damaged",
+    swap_segments: "damaged",
+    repeat_segment: "damaged",
+    use_older_segment: "damaged",
+    use_foreign_segment: "damaged",
+    add_foreign_segment: "complete",
+    cut_segment: "damaged",
+    lose_journal: "unproven",
+    lose_journal_and_segment: "unproven",
+    lose_first_line: "unproven",
+    flip_first_line: "unproven",
+    flip_checksum: "unproven",
+    lose_last_lines: "unproven",
+    tear_line: "complete",
+}
+"""What is done to a recording, and the status that follows."""
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_the_status_follows_from_the_page_alone(
+    fault: Callable[[Path, Path], None], recorded: hl.Store, older: Path, tmp_path: Path
+) -> None:
+    robot = copied(recorded, tmp_path / "store") / "robot"
+    fault(robot, older)
+    second = FormatReader(tmp_path / "store")
+    before = second.recording("robot")
+    entry = entry_of(tmp_path / "store", "robot")
+    after = second.recording("robot")  # hybridlog may have written the journal again
+    for recording in (before, after):
+        assert (recording.status, recording.id) == (FAULTS[fault], entry.id)
+        assert entry.status == recording.status
+        lost = bare(recording.losses, of_files=True)
+        assert lost == bare(entry.end.get("losses", ()), of_files=True)
+        assert bool(lost) == (recording.status == "damaged")
+        assert entry.segments == len(recording.segments)
+        counted = sum(p.messages for s in recording.segments.values() for p in s.parts)
+        assert entry.messages == counted
+        assert (recording.end or {})["status"] == entry.end["status"] == "complete"
+    with hl.open(tmp_path / "store") as store:
+        (whole,) = recorded.select(["robot"])
+        missing = sum(row["count"] for row in lost)
+        unknown = fault is lose_journal_and_segment
+        assert entry.messages + missing == whole.messages or unknown
+        seqs = [m.seq for m in store.all_topics().in_recording("robot")]
+        assert sorted(seqs) == sorted(m.seq for _, m in after.messages())
+
+
+def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path: Path) -> None:
+    from hybridlog.maintenance.report import RepairReport
+    from hybridlog.maintenance.verify import verify
+
+    robot = copied(recorded, tmp_path / "store") / "robot"
+    whole = FormatReader(tmp_path / "store").recording("robot").segments[1]
+    for number, behind in ((0, 60), (2, whole.chunks[2].length + 20)):
+        with (robot / "000001.mcap").open("r+b") as file:
+            file.seek(whole.chunks[number].offset + behind)
+            (byte,) = file.read(1)
+            file.seek(-1, os.SEEK_CUR)
+            file.write(bytes([byte ^ 4]))
+    second = FormatReader(tmp_path / "store").recording("robot")
+    assert sorted(second.damage) == [(1, 0), (1, 2)]
+    assert second.status == "damaged"
+    with hl.open(tmp_path / "store") as store:
+        found = verify(store.directory, store.catalog, None, RepairReport(), labels=["robot"])
+    places = {finding.place.split(" byte ")[0] for finding in found.findings}
+    assert places == {"000001.mcap"}
+    assert len(found.findings) == 2
+    with hl.open(tmp_path / "store", require_database=True) as store:
+        (entry,) = store.select(["robot"])
+        lost = bare(entry.end["losses"], of_files=True)
+    assert entry.status == "damaged"
+    assert lost == bare(second.losses, of_files=True)
+
+
+def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path: Path) -> None:
+    copied(recorded, tmp_path / "store")
+    with hl.open(tmp_path / "store") as store:
+        store.rename("robot", "Tuesday")
+        store.tag("Tuesday", place="lab", weather="rain")
+        store.untag("Tuesday", "weather")
+        store.note("Tuesday", "the left wheel squeaks")
+        entry = store.mark("Tuesday", "+2s", "bump", {"how": "hard"})
+    second = FormatReader(tmp_path / "store")
+    recording = second.recording(entry.label)
+    assert (entry.label, entry.status) == ("Tuesday", recording.status)
+    assert recording.journal is not None
+    assert recording.journal.name == "Tuesday"
+    assert recording.journal.tags == entry.tags == {"place": "lab"}
+    assert recording.journal.notes == [(n["at"], n["text"]) for n in entry.notes]
+    (mark,) = recording.journal.marks
+    assert {name: mark[name] for name in ("time", "text", "tags", "segment")} == entry.marks[0]
+    segment = recording.segments[mark["segment"]]
+    ((_, message),) = segment.chunk(0)
+    assert (message.topic, message.log_time) == ("/hybridlog/marks", mark["time"])
+    assert json.loads(message.payload) == {"text": "bump", "tags": {"how": "hard"}}
+    seqs = sorted(m.seq for _, m in recording.messages())
+    assert seqs == list(range(len(seqs)))
+    assert message.seq == seqs[-1]
 
 
 def test_the_index_is_as_specified(recorded: hl.Store) -> None:
@@ -868,8 +921,14 @@ def test_the_index_is_as_specified(recorded: hl.Store) -> None:
 
     from pymongo import MongoClient
 
-    second = SecondReader(recorded.directory.path)
-    told = {(r, m.seq): m for r in second.recordings() for m in second.messages(r)}
+    second = FormatReader(recorded.directory.path)
+    recordings = {(r := second.recording(label)).id[:16]: r for label in second.labels()}
+    told: dict[tuple[str, int], Told] = {}
+    payloads: dict[tuple[str, int, int, int], bytes] = {}
+    for key, recording in recordings.items():
+        for place, message in recording.messages():
+            told[key, message.seq] = message
+            payloads[(key, *place)] = message.payload
     record = json.loads((second.store / "mongod" / "mongod.json").read_text())
     uri = f"mongodb://{quote(record['socket'], safe='')}/?directConnection=true"
     with MongoClient[dict[str, Any]](uri) as client:
@@ -884,8 +943,7 @@ def test_the_index_is_as_specified(recorded: hl.Store) -> None:
                 meta = document["_meta"]
                 message = told[meta["rec"], meta["seq"]]
                 seen.add((meta["rec"], meta["seq"]))
-                key = struct.pack(">QIQ", message.log_time, second.keys[meta["rec"]], message.seq)
-                assert document["_id"] == key
+                assert document["_id"] == index_key(message.log_time, meta["rec"], message.seq)
                 assert (meta["topic"], meta["t"]) == (message.topic, message.log_time)
                 assert collection_name(meta["topic"]) == name
                 assert meta.get("pub") == message.publish_time
@@ -894,11 +952,11 @@ def test_the_index_is_as_specified(recorded: hl.Store) -> None:
                 assert epoch - 719_162 * 86_400_000 == message.log_time // 1_000_000
                 ref = meta["ref"]
                 place = (meta["rec"], ref["seg"], ref["chunk"], ref["off"])
-                assert second.payloads[place] == message.payload
+                assert payloads[place] == message.payload
                 assert ref["len"] == len(message.payload)
                 check_fields(message, document)
         assert seen == set(told)
-        check_catalog(second, database, told)
+        check_state(second, database, recordings)
 
 
 def check_fields(message: Told, document: dict[str, Any]) -> None:
@@ -931,49 +989,72 @@ def check_fields(message: Told, document: dict[str, Any]) -> None:
         assert document["ranges"] == summary
 
 
-def check_catalog(second: SecondReader, database: Any, told: dict[Any, Told]) -> None:
-    """By the section "Catalog"."""
-    assert database["hybridlog.store"].find_one() == {"_id": "store", "id": second.store_id}
-    chunks = {
-        (c["rec"], c["seg"], c["_id"]["off"]): (c["len"], c["trailer"])
-        for c in database["hybridlog.chunks"].find()
-    }
-    assert chunks == second.chunks
+def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Recording]) -> None:
+    """By the section "State of the index"."""
+    mark = database["hybridlog.store"].find_one({"_id": "store"})
+    assert mark.pop("host")
+    path = os.path.realpath(second.store)
+    assert mark == {"_id": "store", "id": second.store_id, "path": path}
+    assert database["hybridlog.chunks"].count_documents({}) == 0
     entries = {r["_id"]: r for r in database["hybridlog.recordings"].find()}
-    assert sorted(entries) == second.recordings()
-    digests = set()
-    for message in told.values():
-        if message.schema is not None:
-            name, encoding, data = message.schema
-            parts = (name.encode(), encoding.encode(), data)
-            digests.add(
-                hashlib.sha256(
-                    b"".join(len(p).to_bytes(8, "little") + p for p in parts)
-                ).hexdigest()
-            )
-    assert digests <= {s["_id"] for s in database["hybridlog.schemas"].find()}
-    for recording, entry in entries.items():
-        assert (entry["key"], entry["end"]) == (second.keys[recording], second.ends[recording])
-        counted = sum(c["stats"]["messages"] for c in entry["channels"])
-        assert counted == sum(r == recording for r, _ in told)
-    (loss,) = database["hybridlog.losses"].find({"rec": "cut"})
-    assert {k: v for k, v in loss.items() if k not in {"_id", "rec"}} == second.ends["cut"][
-        "losses"
-    ][0]
+    assert entries.keys() == recordings.keys()
+    for key, entry in entries.items():
+        recording = recordings[key]
+        segments = recording.segments
+        assert (entry["id"], entry["label"]) == (recording.id, recording.path.name)
+        assert (entry["status"], entry["end"]) == (recording.status, recording.end)
+        digests = {str(number): segment.digest for number, segment in segments.items()}
+        assert entry["digests"] == entry["index"]["segments"] == digests
+        assert entry["index"]["state"] == "complete"
+        assert entry["spans"] == [
+            [n, min(c.first for c in s.chunks), max(c.last for c in s.chunks)]
+            for n, s in segments.items()
+        ]
+        assert entry["chunks"] == sum(len(s.chunks) for s in segments.values())
+        assert entry["stored_bytes"] == sum(len(s.data) for s in segments.values())
+        channels = {n: c for s in segments.values() for n, c in s.channels.items()}
+        schemas = {n: s for segment in segments.values() for n, s in segment.schemas.items()}
+        assert [c["id"] for c in entry["channels"]] == sorted(channels)
+        for channel in entry["channels"]:
+            schema, topic, encoding, _ = channels[channel["id"]]
+            assert (channel["topic"], channel["message_encoding"]) == (topic, encoding)
+            assert channel["schema"] == (schema_hash(*schemas[schema]) if schema else None)
+            parts = [p for s in segments.values() for p in s.parts if p.channel == channel["id"]]
+            stats = channel["stats"]
+            assert stats["messages"] == sum(p.messages for p in parts)
+            assert stats["payload_bytes"] == sum(p.payload_bytes for p in parts)
+            assert stats["longest"] == max((p.last - p.first for p in parts), default=0)
 
 
 def test_the_specification_names_what_there_is() -> None:
     from dataclasses import fields
 
     from hybridlog.indexing import ARRAY_LIMIT
-    from hybridlog_storage import segment_format
-    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+    from hybridlog_storage import chunk_table, directory, index_state, journal, segment_format
+    from hybridlog_storage.catalog import CATALOG, ChannelStats, RecordingEntry
+    from hybridlog_storage.settings import FORMAT, StoreSettings
 
     text = (DOCS / "format.md").read_text("utf-8")
     for name in ("RECORDING_METADATA", "END_METADATA", "NO_PUBLISH_TIME", "PROFILE"):
         assert f"`{getattr(segment_format, name)}`" in text
-    assert f"opcode, {segment_format.ARRIVAL_OPCODE:#x}" in text
-    assert f"Format {segment_format.FORMAT_VERSION}." in text
+    for name in ("LOSSES_METADATA",):
+        assert f"`{getattr(segment_format, name)}`" in text
+    for name in ("ARRIVAL_OPCODE", "PADDING_OPCODE", "CHUNK_TABLE_OPCODE"):
+        assert f"opcode, {getattr(segment_format, name):#x}" in text
+    assert FORMAT == segment_format.FORMAT_VERSION
+    assert f"Format {FORMAT}." in text
     assert f"up to {ARRAY_LIMIT} elements" in text
-    for thing in (ChannelStats, RecordingEntry):
+    for thing in (ChannelStats, RecordingEntry, StoreSettings):
         assert all(f"`{f.name}`" in text for f in fields(thing))
+    for kind in (chunk_table.CHUNK, chunk_table.PART, chunk_table.OTHER):
+        assert all(f"`{name}`" in text for name in kind.names or ())
+    rows = sections(DOCS / "format.md", 3)["Events"]
+    events = {v for n, v in vars(journal).items() if n.isupper() and isinstance(v, str)}
+    for name in {*events, *journal.RESERVED} - {journal.JOURNAL}:
+        assert f"`{name}`" in rows, name
+    for state in typing.get_args(index_state.State):
+        assert f"`{state}`" in text
+    for name in (index_state.RECORDINGS, index_state.CHUNKS, index_state.STORE):
+        assert f"`{name}`" in text
+    for name in (CATALOG, directory.LOCK, journal.JOURNAL, directory.REMOVED, directory.IMPORTING):
+        assert name in sections(DOCS / "format.md", 2)["Directory"]

@@ -1,0 +1,624 @@
+"""A second reader of stores, written from `docs/format.md` alone.
+
+It shares no code with hybridlog: `struct`, `zlib`, `json` and `zstandard` are all it needs.
+Whatever it reads, it has checked before.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import struct
+import tomllib
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import zstandard
+
+MAGIC = b"\x89MCAP0\r\n"
+JOINED_NS = 12 * 10**9
+
+
+class Damaged(Exception):  # noqa: N818 - a word of the specification
+    """Something is not as the specification says."""
+
+
+def demand(condition: bool, what: str) -> None:
+    if not condition:
+        raise Damaged(what)
+
+
+class Told(NamedTuple):
+    """A message as a reader tells it."""
+
+    seq: int
+    topic: str
+    encoding: str
+    schema: tuple[str, str, bytes] | None
+    log_time: int
+    publish_time: int | None
+    sequence: int
+    payload: bytes
+
+
+class Chunk(NamedTuple):
+    """A row of `chunks`."""
+
+    offset: int
+    length: int
+    trailer: int
+    crc: int
+    trailer_crc: int
+    first: int
+    last: int
+    parts: int
+
+
+class Part(NamedTuple):
+    """A row of `parts`."""
+
+    channel: int
+    messages: int
+    payload_bytes: int
+    first: int
+    last: int
+    first_publish: int
+    last_publish: int
+
+
+class Other(NamedTuple):
+    """A row of `others`."""
+
+    offset: int
+    length: int
+    crc: int
+
+
+class Content:
+    """Takes the content of a record apart."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._at = 0
+
+    def take(self, form: str) -> int:
+        (value,) = struct.unpack_from(form, self._data, self._at)
+        self._at += struct.calcsize(form)
+        return int(value)
+
+    def block(self, size: int) -> bytes:
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+    def text(self) -> str:
+        return self.block(self.take("<I")).decode()
+
+    def mapping(self) -> dict[str, str]:
+        end = self.take("<I") + self._at
+        found = {}
+        while self._at < end:
+            name = self.text()
+            found[name] = self.text()
+        return found
+
+    def rest(self) -> bytes:
+        return self._data[self._at :]
+
+
+def records(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Offset, opcode and content of records that follow one another."""
+    at = 0
+    while at < len(data):
+        demand(at + 9 <= len(data), "a record is cut off")
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        demand(at + 9 + length <= len(data), "a record is cut off")
+        yield at, opcode, data[at + 9 : at + 9 + length]
+        at += 9 + length
+
+
+def unpacked(frame: bytes, size: int) -> bytes:
+    """The content of a zstd frame that has a checksum."""
+    demand(zstandard.get_frame_parameters(frame).has_checksum, "a frame without a checksum")
+    try:
+        found = zstandard.ZstdDecompressor().decompressobj().decompress(frame)
+    except zstandard.ZstdError as error:
+        raise Damaged(f"a frame: {error}") from error
+    demand(len(found) == size, "a frame of another size")
+    return found
+
+
+# --- the journal ----------------------------------------------------------------------
+
+_KEYS: dict[str, dict[str, type]] = {
+    "begun": {"id": str, "store": str, "name": str, "tags": dict, "source": dict, "created": int},
+    "sealed": {"segment": int, "file": str, "bytes": int, "digest": str, "channels": list},
+    "ended": {"end": dict},
+    "renamed": {"name": str},
+    "tagged": {"key": str, "value": str},
+    "untagged": {"key": str},
+    "noted": {"at": int, "text": str},
+    "marked": {"time": int, "text": str, "tags": dict, "segment": int},
+    "adopted": {"store": str},
+    "removing": {},
+    "rebuilt": {"reason": str},
+}
+
+
+class Journal:
+    """What a journal says, by the section "Journal"."""
+
+    def __init__(self, data: bytes) -> None:
+        whole, _, self.torn = data.rpartition(b"\n")
+        self.lines: list[dict[str, Any] | None] = []
+        if len(self.torn) < len(data):
+            self.lines = [self._line(line) for line in whole.split(b"\n")]
+        self.damaged = [n for n, line in enumerate(self.lines, 1) if line is None]
+        events = [line for line in self.lines if line is not None]
+        begun = [line for line in events if line["event"] == "begun"]
+        self.begun: dict[str, Any] = begun[0] if begun else {}
+        self.id: str = self.begun.get("id", "")
+        self.starts = bool(self.lines) and self.lines[0] is not None and bool(begun)
+        self.starts = self.starts and self.lines[0] is self.begun
+        self.store: str = self.begun.get("store", "")
+        self.name: str = self.begun.get("name", "")
+        self.tags: dict[str, str] = dict(self.begun.get("tags", {}))
+        self.notes: list[tuple[int, str]] = []
+        self.marks: list[dict[str, Any]] = []
+        self.sealed: dict[int, dict[str, Any]] = {}
+        self.replaced: list[tuple[dict[str, Any], dict[str, Any]]] = []
+        self.end: dict[str, Any] | None = None
+        self.is_rebuilt = False
+        self.is_removing = False
+        for line in events:
+            self._take(line)
+        self.marks = [mark for mark in self.marks if mark["segment"] in self.sealed]
+
+    @property
+    def is_proof(self) -> bool:
+        return self.starts and not self.damaged and not self.is_rebuilt
+
+    @staticmethod
+    def _line(line: bytes) -> dict[str, Any] | None:
+        if line[:9] != b"%08x " % zlib.crc32(line[9:]):
+            return None
+        try:
+            value = json.loads(line[9:].decode())
+        except ValueError:
+            return None
+        if not isinstance(value, dict) or not isinstance(value.get("event"), str):
+            return None
+        keys = _KEYS.get(value["event"], {})
+        return value if all(isinstance(value.get(k), t) for k, t in keys.items()) else None
+
+    def _take(self, line: dict[str, Any]) -> None:
+        match line["event"]:
+            case "sealed":
+                before = self.sealed.get(line["segment"])
+                if before is not None and before["digest"] != line["digest"]:
+                    self.replaced.append((before, line))
+                self.sealed[line["segment"]] = line
+            case "ended":
+                self.end = line["end"]
+            case "renamed":
+                self.name = line["name"]
+            case "tagged":
+                self.tags[line["key"]] = line["value"]
+            case "untagged":
+                self.tags.pop(line["key"], None)
+            case "noted":
+                self.notes.append((line["at"], line["text"]))
+            case "marked":
+                self.marks.append(line)
+            case "adopted":
+                self.store = line["store"]
+            case "rebuilt":
+                self.is_rebuilt = True
+            case "removing":
+                self.is_removing = True
+
+
+# --- segments -------------------------------------------------------------------------
+
+
+class Segment:
+    """A sealed segment whose summary and metadata have been checked.
+
+    Raises:
+        Damaged: They are not as the specification says.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = path.read_bytes()
+        data = self.data
+        demand(len(data) > 8 + 29 + 8 and data[-8:] == MAGIC, "no magic at the end")
+        opcode, length, start, offsets, crc = struct.unpack_from("<BQQQI", data, len(data) - 37)
+        demand((opcode, length) == (0x02, 20), "no footer")
+        demand(8 <= start <= offsets <= len(data) - 37, "a footer that leads elsewhere")
+        demand(zlib.crc32(data[start : len(data) - 12]) == crc, "the checksum of the summary")
+        self.digest = "sha256:" + hashlib.sha256(data[start:]).hexdigest()
+        self.schemas: dict[int, tuple[str, str, bytes]] = {}
+        self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        self._metadata: list[tuple[int, int, str]] = []
+        self._counts: dict[int, int] = {}
+        groups: list[int] = []
+        table = None
+        for _, opcode, body in records(data[start:offsets]):
+            if not groups or groups[-1] != opcode:
+                groups.append(opcode)
+            content = Content(body)
+            if opcode == 0x03:
+                number, name, encoding = content.take("<H"), content.text(), content.text()
+                self.schemas[number] = (name, encoding, content.block(content.take("<I")))
+            elif opcode == 0x04:
+                number, schema = content.take("<H"), content.take("<H")
+                about = (schema, content.text(), content.text(), content.mapping())
+                self.channels[number] = about
+            elif opcode == 0x0B:
+                content.block(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
+                for _ in range(content.take("<I") // 10):
+                    number = content.take("<H")
+                    self._counts[number] = content.take("<Q")
+            elif opcode == 0x0D:
+                self._metadata.append((content.take("<Q"), content.take("<Q"), content.text()))
+            elif opcode == 0x92:
+                table = body
+        known = [0x03, 0x04, 0x0B, 0x08, 0x0A, 0x0D, 0x92]
+        demand(groups == [g for g in known if g in groups], "the groups are not in order")
+        told = [body[0] for _, _, body in records(data[offsets : len(data) - 37])]
+        demand(told == groups, "the summary offsets")
+        demand(table is not None, "no chunk table")
+        assert table is not None
+        self._table(table, start)
+        self.about = self._json("hybridlog.recording")[0]
+        self.end = next(iter(self._json("hybridlog.end")), None)
+        self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
+
+    def _table(self, body: bytes, start: int) -> None:
+        n, m, k = struct.unpack_from("<III", body)
+        size = 52 * n + 48 * m + 20 * k
+        demand(size <= 1 << 28, "the chunk table is too large")
+        raw = unpacked(body[12:], size)
+        self.chunks = [Chunk(*row) for row in struct.iter_unpack("<QQQIIqqI", raw[: 52 * n])]
+        raw = raw[52 * n :]
+        self.parts = [Part(*row) for row in struct.iter_unpack("<IIQqqqq", raw[: 48 * m])]
+        self.others = [Other(*row) for row in struct.iter_unpack("<QQI", raw[48 * m :])]
+        pieces = [(c.offset, c.length) for c in self.chunks]
+        pieces += [(c.offset + c.length, c.trailer) for c in self.chunks]
+        pieces += [(o.offset, o.length) for o in self.others]
+        at = 0
+        for offset, length in sorted(pieces):
+            demand(offset == at and length > 0, "not every byte is covered once")
+            at += length
+        demand(at == start, "not every byte before the summary is covered")
+        demand(self.chunks == sorted(self.chunks), "the chunks are not in order")
+        demand(self.others == sorted(self.others), "the other stretches are not in order")
+        demand(sum(c.parts for c in self.chunks) == m, "the parts")
+        counts: dict[int, int] = {}
+        for number, chunk in enumerate(self.chunks):
+            parts = self.parts_of(number)
+            channels = [part.channel for part in parts]
+            demand(bool(parts) and channels == sorted(set(channels)), "the parts of a chunk")
+            demand(chunk.first == min(p.first for p in parts), "the first time of a chunk")
+            demand(chunk.last == max(p.last for p in parts), "the last time of a chunk")
+            for part in parts:
+                counts[part.channel] = counts.get(part.channel, 0) + part.messages
+        demand(counts == {c: n for c, n in self._counts.items() if n}, "the statistics")
+
+    def parts_of(self, number: int) -> list[Part]:
+        before = sum(chunk.parts for chunk in self.chunks[:number])
+        return self.parts[before : before + self.chunks[number].parts]
+
+    def _json(self, name: str) -> list[dict[str, Any]]:
+        """The metadata records of a name, after the checksums of the stretches they are in."""
+        found = []
+        for offset, length, its_name in self._metadata:
+            if its_name != name:
+                continue
+            (stretch,) = (
+                o
+                for o in self.others
+                if o.offset <= offset and offset + length <= o.offset + o.length
+            )
+            self._check(stretch)
+            ((_, opcode, body),) = records(self.data[offset : offset + length])
+            content = Content(body)
+            demand((opcode, content.text()) == (0x0C, name), "no metadata record")
+            found.append(json.loads(content.mapping()["json"]))
+        return found
+
+    def _check(self, piece: Other) -> None:
+        data = self.data[piece.offset : piece.offset + piece.length]
+        demand(zlib.crc32(data) == piece.crc, f"byte {piece.offset}")
+
+    def check_others(self) -> None:
+        for piece in self.others:
+            self._check(piece)
+
+    def chunk(self, number: int) -> Iterator[tuple[int, Told]]:
+        """Offset of the payload, and the message, of all messages of a chunk."""
+        place = self.chunks[number]
+        end = place.offset + place.length
+        record, trailer = self.data[place.offset : end], self.data[end : end + place.trailer]
+        demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
+        demand(zlib.crc32(trailer) == place.trailer_crc, "the checksum of a trailer")
+        ((_, opcode, body),) = records(record)
+        demand(opcode == 0x06, "no chunk")
+        content = self._content(Content(body), place)
+        messages = list(records(content))
+        *indexes, (_, opcode, arrivals) = records(trailer)
+        demand(opcode == 0x90, "no arrival record")
+        (owner,) = struct.unpack_from("<Q", arrivals)
+        demand(owner == place.offset, "the arrival record of another chunk")
+        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[8:], 8 * len(messages)))
+        listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
+        seq = 0
+        heads = []
+        for step, (at, opcode, message) in zip(steps, messages, strict=True):
+            demand(opcode == 0x05, "no message")
+            seq += step
+            channel, sequence, log_time, publish = struct.unpack_from("<HIQQ", message)
+            heads.append((channel, log_time, at))
+            schema, topic, encoding, metadata = self.channels[channel]
+            known = "hybridlog.no_publish_time" not in metadata
+            yield at + 31, Told(
+                seq, topic, encoding, self.schemas[schema] if schema else None,
+                log_time, publish if known else None, sequence, message[22:],
+            )  # fmt: skip
+        demand(sorted(heads) == sorted(listed), "the message indexes")
+        self._compare(number, messages)
+
+    @staticmethod
+    def _content(body: Content, place: Chunk) -> bytes:
+        times = body.take("<Q"), body.take("<Q")
+        demand(times == (place.first, place.last), "the times in the head of a chunk")
+        size, crc, compression = body.take("<Q"), body.take("<I"), body.text()
+        packed = body.block(body.take("<Q"))
+        demand(compression in {"", "zstd"}, "another compression")
+        content = packed
+        if compression:
+            content = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        demand(len(content) == size and zlib.crc32(content) == crc, "the content of a chunk")
+        return content
+
+    @staticmethod
+    def _index(opcode: int, index: bytes) -> Iterator[tuple[int, int, int]]:
+        demand(opcode == 0x07, "no message index")
+        channel, length = struct.unpack_from("<HI", index)
+        demand(length == len(index) - 6, "the length of a message index")
+        rows = list(struct.iter_unpack("<QQ", index[6:]))
+        demand([t for t, _ in rows] == sorted(t for t, _ in rows), "an index out of order")
+        for log_time, offset in rows:
+            yield channel, log_time, offset
+
+    def _compare(self, number: int, messages: Sequence[tuple[int, int, bytes]]) -> None:
+        """Hold the parts of a chunk against its messages."""
+        by_channel: dict[int, list[tuple[int, int, int]]] = {}
+        for _, _, message in messages:
+            channel, _, log_time, publish = struct.unpack_from("<HIQQ", message)
+            by_channel.setdefault(channel, []).append((log_time, publish, len(message) - 22))
+        for part in self.parts_of(number):
+            rows = by_channel.pop(part.channel)
+            logged, published, sizes = zip(*rows, strict=True)
+            demand(part.messages == len(rows), "the number of messages of a part")
+            demand(part.payload_bytes == sum(sizes), "the bytes of a part")
+            demand((part.first, part.last) == (min(logged), max(logged)), "the times of a part")
+            publish = (part.first_publish, part.last_publish)
+            demand(publish == (min(published), max(published)), "the publish times of a part")
+        demand(not by_channel, "a channel without a part")
+
+
+# --- recordings -----------------------------------------------------------------------
+
+
+class Recording:
+    """A recording: its journal, the segments that are believed, what follows from both."""
+
+    _NAME: ClassVar = re.compile(r"(\d{6}|[1-9]\d{6,})\.mcap(\.open)?")
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        journal = path / "journal"
+        self.journal = Journal(journal.read_bytes()) if journal.exists() else None
+        sealed: dict[int, Segment | None] = {}
+        self.open: set[int] = set()
+        for file in sorted(path.iterdir()):
+            match = self._NAME.fullmatch(file.name)
+            if match is None or not file.is_file():
+                continue
+            if match[2]:
+                self.open.add(int(match[1]))
+                continue
+            try:
+                sealed[int(match[1])] = Segment(file)
+            except Damaged:
+                sealed[int(match[1])] = None
+        self.id = self._id(sealed)
+        listed = self.journal.sealed if self.journal is not None else {}
+        self.segments = {
+            number: segment
+            for number, segment in sorted(sealed.items())
+            if segment is not None and self._is_believed(number, segment, listed.get(number))
+        }
+        self.unlisted = self.segments.keys() - listed.keys()
+        self.end = self._end()
+        self.damage = dict(self._damage())
+        self.lost = [*self._lost_segments(listed), *self._lost_in_crash(), *self._lost_chunks()]
+        self.status = self._status()
+
+    def _id(self, sealed: Mapping[int, Segment | None]) -> str:
+        if self.journal is not None and self.journal.id:
+            return self.journal.id
+        ids = [s.about["id"] for _, s in sorted(sealed.items()) if s is not None]
+        return Counter(ids).most_common(1)[0][0] if ids else ""
+
+    def _is_believed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
+        about = segment.about
+        if about["format"] != 2 or (about["id"], about["segment"]) != (self.id, number):
+            return False
+        are = segment.digest, len(segment.data)
+        return listed is None or are == (listed["digest"], listed["bytes"])
+
+    def _end(self) -> dict[str, Any] | None:
+        if self.journal is not None and self.journal.end is not None:
+            return self.journal.end
+        ends = [s.end for s in self.segments.values() if s.end is not None]
+        return ends[-1] if ends else None
+
+    def _damage(self) -> Iterator[tuple[tuple[int, int], str]]:
+        for number, segment in self.segments.items():
+            for chunk in range(len(segment.chunks)):
+                try:
+                    for _ in segment.chunk(chunk):
+                        pass
+                except Damaged as error:
+                    yield (number, chunk), str(error)
+
+    def _lost_segments(self, listed: Mapping[int, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+        for number, line in listed.items():
+            if number in self.segments or number in self.open:
+                continue
+            row = _row(line["file"], None, line["bytes"], 0, None, None, None)
+            rows = [c for c in line["channels"] if c["messages"]]
+            for c in rows:
+                about = (c["messages"], c["topic"], c["first"], c["last"])
+                yield _row(line["file"], None, line["bytes"], *about)
+            if not rows:
+                yield row
+
+    def _lost_in_crash(self) -> Iterator[dict[str, Any]]:
+        for before, after in self.journal.replaced if self.journal is not None else ():
+            left = {c["id"]: c["messages"] for c in after["channels"]}
+            for c in before["channels"]:
+                count = c["messages"] - left.get(c["id"], 0)
+                if count > 0:
+                    about = (count, c["topic"], c["first"], c["last"])
+                    yield _row(before["file"], None, None, *about)
+
+    def _lost_chunks(self) -> Iterator[dict[str, Any]]:
+        for number, chunk in self.damage:
+            segment = self.segments[number]
+            place = segment.chunks[chunk]
+            for part in segment.parts_of(chunk):
+                topic = segment.channels[part.channel][1]
+                about = (part.messages, topic, part.first, part.last)
+                yield _row(segment.path.name, place.offset, place.length, *about)
+
+    def _status(self) -> str:
+        if self._is_held() and (self.end is None or self.open):
+            return "open"
+        if self.open:
+            return "unfinished"
+        if self.lost:
+            return "damaged"
+        if self.journal is None or not self.journal.is_proof or self.unlisted:
+            return "unproven"
+        return str(self.end["status"]) if self.end is not None else "recovered"
+
+    def _is_held(self) -> bool:
+        try:
+            fd = os.open(self.path / "writer.lock", os.O_RDONLY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(fd)
+        return False
+
+    @property
+    def losses(self) -> list[dict[str, Any]]:
+        """All rows of the loss ledger, without the reasons of those that follow from files."""
+        said = list((self.end or {}).get("losses", ()))
+        for segment in self.segments.values():
+            said += segment.losses
+        return [*_joined(said), *self.lost]
+
+    def messages(self) -> Iterator[tuple[tuple[int, int, int], Told]]:
+        """All messages: segment, chunk and offset as in `_meta.ref`; the message."""
+        for number, segment in self.segments.items():
+            segment.check_others()
+            for chunk in range(len(segment.chunks)):
+                if (number, chunk) not in self.damage:
+                    for offset, message in segment.chunk(chunk):
+                        yield (number, chunk, offset), message
+
+
+def _row(
+    file: str,
+    offset: int | None,
+    length: int | None,
+    count: int,
+    topic: str | None,
+    first: int | None,
+    last: int | None,
+) -> dict[str, Any]:
+    return {
+        "cause": "segment", "file": file, "offset": offset, "length": length,
+        "count": count, "topic": topic, "from": first, "to": last,
+    }  # fmt: skip
+
+
+def _joined(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    found = [dict(row) for row in rows if row["from"] is None]
+    last: dict[tuple[str, str, str], dict[str, Any]] = {}
+    timed = [row for row in rows if row["from"] is not None]
+    for row in sorted(timed, key=lambda row: (row["from"], row["to"])):
+        key = (row["topic"] or "", row["cause"], row["reason"])
+        before = last.get(key)
+        if before is None or row["from"] - before["to"] > JOINED_NS:
+            last[key] = dict(row)
+            found.append(last[key])
+            continue
+        before["to"] = max(before["to"], row["to"])
+        counts = (before["count"], row["count"])
+        before["count"] = None if None in counts else sum(counts)
+    return found
+
+
+class FormatReader:
+    """Reads a store."""
+
+    def __init__(self, store: Path) -> None:
+        self.store = store
+        settings = tomllib.loads((store / "hybridlog.toml").read_text())
+        demand(settings["format"] == 2, "another format")
+        demand(not settings.get("requires", []), "a feature that is unknown")
+        self.store_id: str = settings["store_id"]
+
+    def labels(self) -> list[str]:
+        places = (self.store / "recordings").iterdir()
+        return sorted(
+            p.name for p in places if p.is_dir() and not p.is_symlink() and p.name[0] != "."
+        )
+
+    def recording(self, label: str) -> Recording:
+        return Recording(self.store / "recordings" / label)
+
+
+def collection_name(topic: str) -> str:
+    """By the section "Collection names"."""
+    if re.fullmatch(r"(/[A-Za-z0-9]+(_[A-Za-z0-9]+)*)+", topic) and len(topic) <= 120:
+        return topic[1:].replace("/", "__")
+    plain = topic.removeprefix("/").replace("/", "__")
+    digest = hashlib.sha256(topic.encode()).hexdigest()
+    return re.sub("[^A-Za-z0-9_]", "_", plain)[:100] + "~" + digest[:8]
+
+
+def index_key(log_time: int, key: str, seq: int) -> bytes:
+    """`_id` of an index document."""
+    return struct.pack(">Q8sQ", log_time, bytes.fromhex(key), seq)
+
+
+def schema_hash(name: str, encoding: str, data: bytes) -> str:
+    """As in `channels.schema`."""
+    parts = (name.encode(), encoding.encode(), data)
+    return hashlib.sha256(b"".join(struct.pack("<Q", len(p)) + p for p in parts)).hexdigest()
