@@ -30,7 +30,7 @@ def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
     batch: Any = stream.batches(count)[0]
     placed = found.Placed.of([_chunk(batch)])
     codec = codec_for(stream.channel())
-    assembler = found.DocumentAssembler(found.Origin("recording", 1, topic, False))
+    assembler = found.DocumentAssembler(found.Origin("0123456789abcdef", topic, False))
 
     def transcode() -> int:
         documents = 0
@@ -47,7 +47,7 @@ def bench_few(bags: Path, benchmark: Any) -> None:
     """Documents of chunks of four messages each, of twenty topics, all at once."""
     stream = read(bags / IMU, "/imu/data", 320)
     need("hybridlog.index_writer", "IndexWriter")  # before, each chunk was by itself
-    indexer = need("hybridlog.indexing", "ChunkIndexer").ChunkIndexer("recording", 1)
+    indexer = need("hybridlog.indexing", "ChunkIndexer").ChunkIndexer("0123456789abcdef" * 2)
     channels = {number: stream.channel() for number in range(20)}
     chunks = []
     for number, batch in enumerate(stream.batches(4)):
@@ -75,11 +75,15 @@ def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:
 
 def _chunk(batch: Any) -> Any:
     """A chunk of these messages."""
+    need("hybridlog_storage.chunk_table")  # before, chunks had no numbers
     return need("hybridlog_storage.chunk", "StoredChunk").StoredChunk(
         segment=1,
+        number=0,
         offset=4096,
         length=len(batch.buffer),
         trailer=0,
+        crc=0,
+        trailer_crc=0,
         batch=batch,
         seq=np.arange(len(batch)),
         compressed_size=len(batch.buffer),

@@ -106,12 +106,14 @@ def _compressed(store: Store, topic: str, start: int, end: int) -> float:
         ref = meta["ref"]
         lengths[meta["rec"], ref["seg"], ref["chunk"]] += ref["len"]
     total = 0.0
+    labels = {entry.key: entry.label for entry in store.recordings()}
     for recording, segment in {key[:2] for key in lengths}:
-        path = Path(store.directory.recording(recording), f"{segment:06d}.mcap")
+        path = Path(store.directory.recording(labels[recording]), f"{segment:06d}.mcap")
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         assert summary is not None
-        for chunk in summary.chunk_indexes:
-            size = lengths.get((recording, segment, chunk.chunk_start_offset), 0)
+        chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+        for number, chunk in enumerate(chunks):
+            size = lengths.get((recording, segment, number), 0)
             total += size / chunk.uncompressed_size * chunk.compressed_size
     return total

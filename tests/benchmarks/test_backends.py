@@ -469,6 +469,7 @@ def test_two_seconds_of_messages_go_in_together(
         "postgres_tuned": postgres,
         "sqlite_json1": sqlite,
     }[name]
+    monkeypatch.setattr(module, "BATCH_S", 1e9)  # only what they hold makes them go
     with opened(name, tmp_path) as backend:
 
         def count() -> int:
@@ -478,10 +479,8 @@ def test_two_seconds_of_messages_go_in_together(
             backend.insert(*message)
         assert count() == 0
         monkeypatch.setattr(module, "BATCH_BYTES", 0)
-        began = time.monotonic()
         backend.insert(*messages(0, 20, 21)[0])
         assert count() == 21
-        assert time.monotonic() - began < 2
         for message in messages(0, 21, 23):
             backend.insert(*message)
         backend.finish()
