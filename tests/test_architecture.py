@@ -45,7 +45,6 @@ ALLOWED = {
         "hybridlog_storage.mcap_content",
         "hybridlog_storage.mcap_scan",
         "hybridlog_storage.recovery",
-        "hybridlog_storage.segment_check",
         "hybridlog_storage.segment_file",
         "hybridlog_storage.segment_format",
         "hybridlog_storage.segment_reader",
@@ -59,7 +58,7 @@ ALLOWED = {
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
     "ruamel": ("hybridlog.live_sources.ros2_overrides", "hybridlog.sources.rosbag2_metadata"),
-    "sqlite3": ("hybridlog.sources.rosbag2_sqlite",),
+    "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
     "typer": ("hybridlog.cli",),
     "websockets": (
         "hybridlog.live_sources.foxglove_handshake",

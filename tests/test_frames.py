@@ -535,7 +535,7 @@ def test_ragged_builder_gives_back_every_row(chunks: list[list[list[float]]]) ->
 
 def document(n: int, /, **fields: Any) -> bytes:
     reference = {"seg": 3, "chunk": Int64(100 + n), "off": Int64(7 * n), "len": Int64(n)}
-    key = (1000 + n).to_bytes(8, "big") + (9).to_bytes(4, "big") + n.to_bytes(8, "big")
+    key = (1000 + n).to_bytes(8, "big") + (9).to_bytes(8, "big") + n.to_bytes(8, "big")
     meta = {"t": Int64(1000 + n), "seq": Int64(n), "ref": reference}
     return bson.encode({"_id": key, **fields, "_meta": meta})
 
@@ -560,7 +560,9 @@ def test_references_out_of_the_key() -> None:
     assert reference.seg.tolist() == [-1] * 5
 
 
-@pytest.mark.parametrize("strange", [{"x": 1}, {"_meta": {"t": "x", "seq": 1}}, {"_id": b"short"}])
+@pytest.mark.parametrize(
+    "strange", [{"x": 1}, {"_meta": {"t": "x", "seq": 1}}, {"_id": b"short"}, {"_id": bytes(20)}]
+)
 def test_foreign_documents_are_refused(strange: dict[str, Any]) -> None:
     with pytest.raises(StoreError, match="reindex"):
         reference_columns(bson.encode(strange))

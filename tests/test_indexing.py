@@ -53,6 +53,7 @@ MESSAGES = st.sampled_from(sorted(PAYLOADS)).flatmap(
 CHUNKS = st.lists(st.lists(MESSAGES, min_size=1, max_size=6), min_size=1, max_size=5)
 
 Message = tuple[int, bytes, int, int]
+RECORDING = "0123456789abcdef" * 2
 
 
 def chunk_of(messages: Sequence[Message], number: int) -> StoredChunk:
@@ -66,7 +67,18 @@ def chunk_of(messages: Sequence[Message], number: int) -> StoredChunk:
         np.array([publish_time for _, _, _, publish_time in messages], np.int64),
         np.zeros(len(messages), np.uint32),
     )
-    return StoredChunk(1 + number // 2, 1000 * number, 50, 5, batch, np.arange(len(messages)), 9)
+    return StoredChunk(
+        segment=1 + number // 2,
+        number=number % 2,
+        offset=1000 * number,
+        length=50,
+        trailer=5,
+        crc=number,
+        trailer_crc=100 + number,
+        batch=batch,
+        seq=np.arange(len(messages)),
+        compressed_size=9,
+    )
 
 
 def by_collection(parts: Iterable[Documents]) -> Mapping[str, list[bytes]]:
@@ -80,7 +92,7 @@ def by_collection(parts: Iterable[Documents]) -> Mapping[str, list[bytes]]:
 @given(CHUNKS)
 def test_chunks_together_are_what_they_are_apart(chunks: list[list[Message]]) -> None:
     stored = [chunk_of(messages, number) for number, messages in enumerate(chunks)]
-    indexer = ChunkIndexer("run", 3)
+    indexer = ChunkIndexer(RECORDING)
     documents, entries = indexer.documents_of(stored, CHANNELS)
     apart = [indexer.documents_of([chunk], CHANNELS) for chunk in stored]
     assert by_collection(documents) == by_collection(part for parts, _ in apart for part in parts)
@@ -90,10 +102,12 @@ def test_chunks_together_are_what_they_are_apart(chunks: list[list[Message]]) ->
 @given(CHUNKS)
 def test_an_entry_says_what_is_in_its_chunk(chunks: list[list[Message]]) -> None:
     stored = [chunk_of(messages, number) for number, messages in enumerate(chunks)]
-    _, entries = ChunkIndexer("run", 3).documents_of(stored, CHANNELS)
+    _, entries = ChunkIndexer(RECORDING).documents_of(stored, CHANNELS)
     for chunk, entry, messages in zip(stored, entries, chunks, strict=True):
-        assert (entry.segment, entry.offset) == (chunk.segment, chunk.offset)
-        assert (entry.length, entry.trailer) == (50, 5)
+        assert entry.recording == RECORDING
+        assert (entry.segment, entry.number) == (chunk.segment, chunk.number)
+        assert (entry.offset, entry.length, entry.trailer) == (chunk.offset, 50, 5)
+        assert (entry.crc, entry.trailer_crc) == (chunk.crc, chunk.trailer_crc)
         times = [log_time for _, _, log_time, _ in messages]
         assert (entry.first, entry.last) == (min(times), max(times))
         assert entry.messages == len(messages)

@@ -83,6 +83,27 @@ def test_a_loss_that_goes_on_is_one_row() -> None:
     assert len(joined(rows + ledger.take())) == 2
 
 
+def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
+    def rows(pause: int) -> int:
+        ledger = Ledger()
+        found = []
+        for first in (0, SECOND + pause):
+            ledger.note("/scan", Cause.QUEUE, 1, first=first, last=first + SECOND)
+            found += ledger.take()
+        return len(joined(found))
+
+    assert rows(12 * SECOND) == 1
+    assert rows(12 * SECOND + 1) == 2
+
+
+def test_what_the_user_wants_is_a_row_each_ten_seconds() -> None:
+    ledger = Ledger()
+    for last, count in ((0, 0), (10 * SECOND - 1, 0), (10 * SECOND, 1), (11 * SECOND, 0)):
+        ledger.note("/scan", Cause.THROTTLE, 1, first=last, last=last)
+        assert len(ledger.take()) == count
+    assert [row["count"] for row in ledger.take(everything=True)] == [1]
+
+
 def test_rows_without_times_stay_as_they_are() -> None:
     row = {"cause": "source damaged", "topic": None, "from": None, "to": None, "count": None}
     assert joined([row]) == [row]

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import bson
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -120,10 +121,10 @@ def test_damaged_logs_give_what_can_be_read(store: hl.Store, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["odd/empty-file.bag", "damaged/magic_only.bag", "CATALOGUE.md"])
 def test_what_is_no_log_leaves_nothing(store: hl.Store, name: str) -> None:
-    before = store.directory.recording_ids()
+    before = store.directory.labels()
     with pytest.raises(SourceError, match=Path(name).name):
         store.record(DATA / name)
-    assert store.directory.recording_ids() == before
+    assert store.directory.labels() == before
 
 
 def test_the_same_file_is_noticed(store: hl.Store) -> None:
@@ -132,30 +133,38 @@ def test_the_same_file_is_noticed(store: hl.Store) -> None:
     report = store.record(DATA / "real/tilt_laser.bag", again=True, name="twice")
     assert report.entry.messages == 4093
     store.remove("twice")
-    assert "twice" not in store.directory.recording_ids()
+    assert "twice" not in store.directory.labels()
 
 
 def test_segments_pass_the_official_readers(store: hl.Store) -> None:
-    for recording in store.directory.recording_ids():
+    assert sorted(r.label for r in store.recordings()) == store.directory.labels()
+    for entry in store.recordings():
         counted = 0
-        for _, path in store.directory.segments(recording):
+        for _, path in store.directory.segments(entry.label):
             data = path.read_bytes()
             list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
             reader = make_reader(io.BytesIO(data), validate_crcs=True)
             counted += sum(1 for _ in reader.iter_messages())
-        (entry,) = (r for r in store.recordings() if r.id == recording)
         assert counted == entry.messages
 
 
 def dump(store: hl.Store) -> dict[str, list[bytes]]:
-    """Everything in the database, as bytes."""
+    """Everything in the database, as bytes; but for how often it was begun anew."""
     assert store.database is not None
-    return {
+    found = {
         name: sorted(
             document for raw in store.database.find_raw(name) for document in split_documents(raw)
         )
         for name in store.database.list_collections()
     }
+    for name in ("hybridlog.recordings", "hybridlog.store"):
+        documents = [bson.decode(document) for document in found[name]]
+        found[name] = [
+            bson.encode({**d, "index": {**d.get("index", {}), "turn": 0}})
+            for d in documents
+            if d["_id"] != "turn"
+        ]
+    return found
 
 
 def split_documents(raw: bytes) -> list[bytes]:

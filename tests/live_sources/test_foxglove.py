@@ -776,23 +776,27 @@ def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
             session.end(is_stopped=True)
 
 
-def test_gaps_of_header_numbers_are_rows() -> None:
-    numbers = [*range(100), *range(105, 205)]
+@pytest.mark.parametrize("after", [100, 2])
+def test_gaps_of_header_numbers_are_rows(after: int) -> None:
+    """Also those that too few messages followed, when the server leaves."""
+    numbers = [*range(100), *range(105, 105 + after)]
     definition = "Header header\nfloat32 x"
 
     def script(peer: Peer) -> None:
         number = peer.offer(channel(encoding="ros1", schema=definition, topic="/scan"))[1]
         peer.send(*(message(number, 0, struct.pack("<Id", n, 0.5)) for n in numbers))
-        peer.wait()
+        if after > 8:
+            peer.wait()
 
     heard = Heard()
     with Server(script) as server, FoxgloveSource(server.url) as source:
         source.start(heard)
-        heard.until(lambda h: len(h.taken) == len(numbers))
-    (lost,) = heard.losses
-    assert lost[:3] == ("/scan", Cause.TRANSPORT, 5)
-    assert lost.detail == "header.seq went from 99 to 105"
-    assert (lost.first, lost.last) == (heard.taken[99].received, heard.taken[100].received)
+        heard.until(lambda h: len(h.taken) == len(numbers) and h.losses)
+        lost = heard.losses[0]
+        assert lost[:3] == ("/scan", Cause.TRANSPORT, 5)
+        assert lost.detail == "header.seq went from 99 to 105"
+        assert (lost.first, lost.last) == (heard.taken[99].received, heard.taken[100].received)
+    assert [loss.cause for loss in heard.losses].count(Cause.TRANSPORT) == 1
 
 
 # Those that are no Foxglove server.

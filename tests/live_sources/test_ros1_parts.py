@@ -336,6 +336,12 @@ def test_dropped_messages_are_counted(size: int) -> None:
         (Cause.TRANSPORT, 6),
     ]
     assert all(before <= loss.first <= loss.last <= time.time_ns() for loss in pipe.sink.losses)
+    # Each lies between the message before it and the one after.
+    times = [taken.received for taken in pipe.sink.taken]
+    assert [(loss.first, loss.last) for loss in pipe.sink.losses] == [
+        (times[9], times[10]),
+        (times[11], times[12]),
+    ]
 
 
 @pytest.mark.parametrize(

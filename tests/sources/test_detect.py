@@ -14,6 +14,7 @@ import zstandard
 from hybridlog.sources.detect import Format, open_source, sniff
 from hybridlog_storage.errors import SourceError
 from tests.data import DATA, needs_data
+from tests.other_user import User, needs_root, open_place
 
 
 @needs_data
@@ -100,13 +101,29 @@ def test_refused_old_bag(tmp_path: Path) -> None:
         open_source(tmp_path / "a.bag")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
 def test_permission(tmp_path: Path) -> None:
     file = tmp_path / "a.bag"
     file.write_bytes(b"#ROSBAG V2.0\n")
     file.chmod(0)
     with pytest.raises(SourceError, match="permission denied"):
         open_source(file)
+
+
+@needs_root
+def test_permission_of_another_user() -> None:
+    script = "import sys, pathlib; from hybridlog.sources.detect import open_source\n"
+    script += "try: open_source(pathlib.Path(sys.argv[1]))\n"
+    script += "except Exception as error: print(type(error).__name__, error)"
+    with open_place() as place:
+        file = place / "a.bag"
+        file.write_bytes(b"#ROSBAG V2.0\n")
+        file.chmod(0o600)
+        done = User(place).python("-c", script, file)
+        assert done.out.startswith("SourceError")
+        assert "permission denied" in done.out
+        file.chmod(0o644)
+        assert "permission denied" not in User(place).python("-c", script, file).out
 
 
 def test_permission_as_the_system_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

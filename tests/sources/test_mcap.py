@@ -18,6 +18,7 @@ from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Message, 
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+import hybridlog as hl
 from hybridlog.sources.base import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog.sources.mcap import McapSource
 from hybridlog_storage.errors import SourceError
@@ -587,3 +588,28 @@ def test_a_bomb_is_damage_and_no_allocation(put: Callable[[bytes], Path]) -> Non
     assert [m.log_time for m in found.messages] == [1]
     assert found.lost == [None, None]
     assert peak < 8 << 20
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_what_stands_behind_the_last_message_is_recorded(
+    tmp_path: Path, *, use_chunking: bool
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=use_chunking)  # a chunk comes last
+        writer.start()
+        writer.add_attachment(1, 1, "before", "text/plain", b"first")
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_attachment(2, 2, "behind", "text/plain", b"last")
+        writer.add_metadata("robot", {"name": "r2"})
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        entry = store.record(path).entry
+        folder = store.directory.path / "recordings" / entry.label
+        with (folder / "000000.mcap").open("rb") as stream:
+            reader = make_reader(stream)
+            found = {a.name: a.data for a in reader.iter_attachments()}
+            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert found == {"before": b"first", "behind": b"last"}
+    assert metadata["robot"] == {"name": "r2"}
