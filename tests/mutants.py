@@ -443,13 +443,13 @@ FORMAT_2 = [
         "storage/hybridlog_storage/segment_reader.py",
         (
             "stored-bytes-are-believed",
-            "                if crc not in {None, crc32(part)}:\n",
-            "                if False:\n",
+            "            if place.crc not in {None, crc32(record)}:\n",
+            "            if False:\n",
             SEGMENTS,
         ),
         (
             "indexes-are-believed",
-            '            if crc32(trailer) != place.trailer_crc:\n                raise SegmentError("its message indexes or arrival numbers changed")\n            return message_times',
+            "        if crc32(trailer) == place.trailer_crc:\n            return message_times",
             "            return message_times",
             SEGMENTS,
         ),

@@ -11,10 +11,11 @@ import stat
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Metadata, MetadataIndex, Statistics
@@ -27,6 +28,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.chunk_table import ChunkTable
 from hybridlog_storage.compression import decompress
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content, read_record
 from hybridlog_storage.messages import Buffer, Channel
@@ -52,7 +54,6 @@ from hybridlog_storage.segment_format import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch
@@ -324,7 +325,8 @@ class SegmentReader:
         Args:
             place: Where it lies. Its checksums, where they are known, are compared before a
                 byte of the chunk is believed. Without them everything is held against the
-                checksum of the content.
+                checksum of the content. Message indexes that are damaged are not needed: the
+                messages and the arrival numbers have checksums of their own.
 
         Raises:
             SegmentError: it is not there, or it is damaged; names file and offset.
@@ -332,16 +334,14 @@ class SegmentReader:
         data = self.read(place.offset, place.length + place.trailer)
         record, trailer = data[: place.length], data[place.length :]
         try:
-            for part, crc, what in (
-                (record, place.crc, "its checksum differs"),
-                (trailer, place.trailer_crc, "its message indexes or arrival numbers changed"),
-            ):
-                if crc not in {None, crc32(part)}:
-                    raise SegmentError(what)
+            if place.crc not in {None, crc32(record)}:
+                raise SegmentError("its checksum differs")
             content, compressed = open_chunk(record, is_checked=place.crc is not None)
             if place.crc is None or place.trailer_crc is None:
                 batch = parse_content(content).batch
                 _check_around(record, trailer, batch)
+            elif crc32(trailer) != place.trailer_crc:
+                batch = parse_content(content).batch
             else:
                 found = messages_at(content, message_starts(trailer))
                 if found is None:
@@ -369,7 +369,7 @@ class SegmentReader:
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, from its message indexes alone.
 
-        Where the checksum of the trailer is not known, the chunk is read instead.
+        Where these are damaged, or their checksum is not known, the chunk is read instead.
 
         Returns:
             int64[n], ns, ascending, by channel id.
@@ -377,16 +377,12 @@ class SegmentReader:
         Raises:
             SegmentError: they are not there, or damaged; names file and offset.
         """
-        if place.trailer_crc is None:
-            chunk = self.read_chunk(place)
-            place = replace(place, trailer_crc=chunk.trailer_crc)
         trailer = self.read(place.offset + place.length, place.trailer)
-        try:
-            if crc32(trailer) != place.trailer_crc:
-                raise SegmentError("its message indexes or arrival numbers changed")
+        if crc32(trailer) == place.trailer_crc:
             return message_times(trailer)
-        except SegmentError as error:
-            raise self._damaged(place, error) from error
+        batch = self.read_chunk(place).batch
+        channels = distinct(batch.channel).tolist()
+        return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
 
     def read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
         """Arrival numbers of a chunk's messages, without reading the chunk.

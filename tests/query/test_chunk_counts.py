@@ -153,8 +153,13 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
             query = opened.topic("/state").between("+5s", "+165s")
             assert query.count() == 160  # by the index
             assert query.counters.chunks_read == 0
-            with pytest.raises(SegmentError, match=f"{chunk.offset} of .*{path.name}"):
-                alone.topic("/state").between("+5s", "+165s").count()
+            query = alone.topic("/state").between("+5s", "+165s")
+            if damage in {"time", "place"}:
+                # The messages have a checksum of their own, and so have the arrival numbers.
+                assert query.count() == len(list(query)) == 160
+            else:
+                with pytest.raises(SegmentError, match=f"{chunk.offset} of .*{path.name}"):
+                    query.count()
             # Within one range the chunk is not looked at.
             assert alone.topic("/state").between("+20s", "+165s").count() == 145
     finally:
