@@ -869,7 +869,13 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
 
     robot = copied(recorded, tmp_path / "store") / "robot"
     whole = FormatReader(tmp_path / "store").recording("robot").segments[1]
-    for number, behind in ((0, 60), (2, whole.chunks[2].length + 20)):
+    # In a chunk, in an arrival record, and in a message index, which no message needs.
+    places = (
+        (0, 60),
+        (2, whole.chunks[2].length + whole.chunks[2].trailer - 3),
+        (3, whole.chunks[3].length + 20),
+    )
+    for number, behind in places:
         with (robot / "000001.mcap").open("r+b") as file:
             file.seek(whole.chunks[number].offset + behind)
             (byte,) = file.read(1)
@@ -880,9 +886,8 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert second.status == "damaged"
     with hl.open(tmp_path / "store") as store:
         found = verify(store.directory, store.catalog, None, RepairReport(), labels=["robot"])
-    places = {finding.place.split(" byte ")[0] for finding in found.findings}
-    assert places == {"000001.mcap"}
-    assert len(found.findings) == 2
+    assert {f.place.split(" byte ")[0] for f in found.findings} == {"000001.mcap"}
+    assert len(found.findings) == 3
     with hl.open(tmp_path / "store", require_database=True) as store:
         (entry,) = store.select(["robot"])
         lost = bare(entry.end["losses"], of_files=True)
