@@ -26,6 +26,7 @@ from hybridlog_storage.catalog import (
 )
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.directory import Listing, StoreDirectory
     from hybridlog_storage.journal import JournalState, SealedSegment
-    from hybridlog_storage.segment_file import Sealed
 
     Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
     Reason = Callable[[int, Channel], str | None]
@@ -291,25 +291,10 @@ def _status(
 def _losses_of_segment(inventory: Inventory, sealed: SealedSegment) -> list[dict[str, Any]]:
     """Rows of the loss ledger for a segment that the journal lists and nobody can read."""
     reasons = [m.reason for m in inventory.misfits if m.segment == sealed.segment]
-    row = {
-        "cause": Cause.SEGMENT.value,
-        "file": sealed.file,
-        "offset": None,
-        "length": sealed.bytes,
-        "reason": "; ".join(reasons) or "it cannot be read",
-    }
-    rows = [
-        {
-            **row,
-            "count": channel["messages"],
-            "topic": channel["topic"],
-            "from": channel["first"],
-            "to": channel["last"],
-        }
-        for channel in sealed.channels
-        if channel["messages"]
-    ]
-    return rows or [{**row, "count": 0, "topic": None, "from": None, "to": None}]
+    reason = "; ".join(reasons) or "it cannot be read"
+    lost = [channel for channel in sealed.channels if channel["messages"]]
+    nothing = {"messages": 0, "topic": None, "first": None, "last": None}
+    return [_loss(sealed.file, reason, c, length=sealed.bytes) for c in lost or [nothing]]
 
 
 def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
@@ -320,19 +305,8 @@ def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
         for channel in before.channels:
             count = channel["messages"] - left.get(channel["id"], 0)
             if count > 0:
-                rows.append(
-                    {
-                        "cause": Cause.SEGMENT.value,
-                        "file": before.file,
-                        "offset": None,
-                        "length": None,
-                        "reason": "a crash took what was written last",
-                        "count": count,
-                        "topic": channel["topic"],
-                        "from": channel["first"],
-                        "to": channel["last"],
-                    }
-                )
+                reason = "a crash took what was written last"
+                rows.append(_loss(before.file, reason, {**channel, "messages": count}))
     return rows
 
 
@@ -346,23 +320,38 @@ def _losses_of_chunks(
         if summary is None or number >= len(summary.table.chunks):
             continue
         chunk = summary.table.chunks[number]
-        last = int(summary.table.chunks["parts"][: number + 1].sum())
-        for part in summary.table.parts[last - int(chunk["parts"]) : last]:
+        bounds = summary.table.part_bounds()
+        for part in summary.table.parts[bounds[number] : bounds[number + 1]]:
             channel = summary.channels.get(int(part["channel"]))
-            rows.append(
-                {
-                    "cause": Cause.SEGMENT.value,
-                    "file": inventory.listing.sealed[segment],
-                    "offset": int(chunk["offset"]),
-                    "length": int(chunk["length"]),
-                    "reason": reason,
-                    "count": int(part["messages"]),
-                    "topic": channel.topic if channel is not None else None,
-                    "from": int(part["first"]),
-                    "to": int(part["last"]),
-                }
-            )
+            told = {
+                "topic": channel.topic if channel is not None else None,
+                **{name: int(part[name]) for name in ("messages", "first", "last")},
+            }
+            place = {"offset": int(chunk["offset"]), "length": int(chunk["length"])}
+            rows.append(_loss(inventory.listing.sealed[segment], reason, told, **place))
     return rows
+
+
+def _loss(
+    file: str,
+    reason: str,
+    channel: Mapping[str, Any],
+    *,
+    offset: int | None = None,
+    length: int | None = None,
+) -> dict[str, Any]:
+    """A row of the loss ledger for messages of a channel that were stored in a file."""
+    return {
+        "cause": Cause.SEGMENT.value,
+        "file": file,
+        "offset": offset,
+        "length": length,
+        "reason": reason,
+        "count": channel["messages"],
+        "topic": channel["topic"],
+        "from": channel["first"],
+        "to": channel["last"],
+    }
 
 
 def _fill_stats(entry: RecordingEntry, inventory: Inventory, stamps: Stamps) -> None:
@@ -405,7 +394,7 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
         sealed = listed.get(number)
         if sealed is not None:
             before = [old for old, _ in state.replaced if old.segment == number] if state else []
-            lines += map(_sealed_again, [*before, sealed])
+            lines += map(sealed_event, [*before, sealed])
         else:
             lines.append(sealed_line(inventory, number))
     if state is not None:
@@ -430,51 +419,23 @@ def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
     }
 
 
-def _sealed_again(sealed: SealedSegment) -> journal.Event:
-    return journal.event(
-        journal.SEALED,
-        segment=sealed.segment,
-        file=sealed.file,
-        bytes=sealed.bytes,
-        digest=sealed.digest,
-        channels=[dict(channel) for channel in sealed.channels],
-    )
-
-
 def sealed_line(inventory: Inventory, number: int) -> journal.Event:
-    """The line that lists a segment which lies there."""
+    """The journal line that lists a segment which lies there."""
     summary = inventory.summaries[number]
-    totals = channel_totals(summary.table, None)
-    return journal.event(
-        journal.SEALED,
-        segment=number,
-        file=inventory.listing.sealed[number],
-        bytes=summary.size,
-        digest=summary.digest,
-        channels=[
-            {
-                "id": channel_id,
-                "topic": summary.channels[channel_id].topic,
-                "messages": stats.messages,
-                "payload_bytes": stats.payload_bytes,
-                "first": stats.first,
-                "last": stats.last,
-            }
-            for channel_id, stats in sorted(totals.items())
-            if channel_id in summary.channels
-        ],
-    )
+    channels = sealed_channels(summary.table, summary.channels)
+    file = inventory.listing.sealed[number]
+    return sealed_event(Sealed(number, file, summary.size, summary.digest, channels))
 
 
-def sealed_event(sealed: Sealed) -> journal.Event:
-    """The line that announces that a segment is about to get its final name."""
+def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
+    """The journal line that lists a segment."""
     return journal.event(
         journal.SEALED,
         segment=sealed.segment,
         file=sealed.file,
         bytes=sealed.bytes,
         digest=sealed.digest,
-        channels=[asdict(channel) for channel in sealed.channels],
+        channels=[dict(c) if isinstance(c, Mapping) else asdict(c) for c in sealed.channels],
     )
 
 

@@ -337,7 +337,7 @@ FORMAT_2 = [
         "hybridlog/maintenance/removal.py",
         (
             "documents-of-a-removed-recording-stay",
-            "    state.clear(entry.key, state.topic_collections())\n",
+            "    forget(state, entry.key)\n",
             "",
             STEPS,
         ),

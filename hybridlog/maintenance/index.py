@@ -123,7 +123,7 @@ def _tend(
         How many chunks were indexed; None when all were in the index.
     """
     state = IndexState(database)
-    (indexed,) = state.of([entry.key]).values() or (None,)  # as it is now that nobody writes it
+    indexed = state.one(entry.key)  # as it is now that nobody writes it
     if indexed is None or not indexed.is_whole(entry):
         return catch_up(directory, catalog, database, entry.label, progress)
     if not entry.is_decoded:
@@ -152,7 +152,7 @@ def _remove_strangers(
         return
     for key, indexed in known.items():
         if key not in present:
-            forget(state, key, indexed)
+            forget(state, key)
             report.removed.append(indexed.id or key)
 
 
@@ -189,7 +189,7 @@ def _ids_of(directory: StoreDirectory, labels: Iterable[str]) -> set[str] | None
     return found
 
 
-def forget(state: IndexState, key: str, indexed: Indexed | None) -> None:
+def forget(state: IndexState, key: str) -> None:
     """Remove all documents of a recording; its place in the mirror goes last."""
     state.clear(key, state.topic_collections())
     state.remove(key)
@@ -254,7 +254,7 @@ def _prepare(
         What the index says of the recording now, and the offsets of chunks that are in it, of
         segments that are not in it whole.
     """
-    (indexed,) = state.of([entry.key]).values() or (None,)
+    indexed = state.one(entry.key)
     done = state.places(entry.key)
     if (
         indexed is not None
@@ -439,15 +439,20 @@ def reindex(
                 left.append(label)
                 continue
             entry = put_entry(directory, catalog, label)
-            (indexed,) = state.of([entry.key]).values() or (None,)
-            turn = 1 if indexed is None else indexed.turn + 1
-            state.put(entry, "clearing", turn=turn)
             # What lies outside of its times takes a look at every document.
-            span = entry.span if everything else None
-            state.clear(entry.key, state.topic_collections(), span)
-            state.put(entry, "indexing", turn=turn)
+            _clear(state, entry, entry.span if everything else None)
             catch_up(directory, catalog, database, label, progress)
     return left
+
+
+def _clear(state: IndexState, entry: RecordingEntry, span: tuple[int, int] | None = None) -> None:
+    """Remove the documents of a recording that is about to be indexed from its beginning."""
+    indexed = state.one(entry.key)
+    turn = 1 if indexed is None else indexed.turn + 1
+    # Until all of them are gone, the next opening begins with that.
+    state.put(entry, "clearing", turn=turn)
+    state.clear(entry.key, state.topic_collections(), span)
+    state.put(entry, "indexing", turn=turn)
 
 
 def remove_rest(
@@ -496,11 +501,7 @@ def remove_rest(
         entry = known[key]
         with directory.writing(entry.label) as mine:
             if mine:
-                (indexed,) = state.of([key]).values() or (None,)
-                turn = 1 if indexed is None else indexed.turn + 1
-                state.put(entry, "clearing", turn=turn)
-                state.clear(key, state.topic_collections())
-                state.put(entry, "indexing", turn=turn)
+                _clear(state, entry)
                 catch_up(directory, catalog, database, entry.label, progress)
 
 

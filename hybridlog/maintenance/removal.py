@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from hybridlog.maintenance.index import forget
 from hybridlog.maintenance.opening import announce_removal
 from hybridlog.maintenance.report import being_written
 from hybridlog_storage.index_state import IndexState
@@ -51,11 +52,10 @@ def remove(
 
 def _clear(state: IndexState, entry: RecordingEntry) -> None:
     """Remove a recording from the index."""
-    (indexed,) = state.of([entry.key]).values() or (None,)
+    indexed = state.one(entry.key)
     if indexed is not None:
         state.put(entry, "removing", turn=indexed.turn + 1)
-    state.clear(entry.key, state.topic_collections())
-    state.remove(entry.key)
+    forget(state, entry.key)
 
 
 def remove_copy(directory: StoreDirectory, label: str) -> None:

@@ -96,6 +96,10 @@ class IndexState:
     def __init__(self, database: Database) -> None:
         self._db = database
 
+    def one(self, key: str) -> Indexed | None:
+        """What the index says of a recording, by its key; None when it does not know it."""
+        return self.of([key]).get(key)
+
     def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
         """By key of the recording: what the index says of these, or of all."""
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
