@@ -1,4 +1,4 @@
-"""The index as questions see it: an answer counts only if nothing was removed meanwhile.
+"""Guards answers from MongoDB against another process that removes or rebuilds the index.
 
 Another process may remove a recording, or make its index again, at any moment. It says so
 in the database before the first document goes. So whoever asks looks there once more after

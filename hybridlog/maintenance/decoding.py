@@ -1,4 +1,4 @@
-"""What only decoded messages tell, for a catalog that has lost it: found out again."""
+"""Decodes messages again to restore header stamps and decoding failures in the catalog."""
 
 from __future__ import annotations
 

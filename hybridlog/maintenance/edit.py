@@ -1,4 +1,4 @@
-"""What people write about a recording that has ended: names, tags, notes and marks."""
+"""Edits recordings that have ended: name, tags, notes and marks."""
 
 from __future__ import annotations
 

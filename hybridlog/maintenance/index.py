@@ -1,4 +1,4 @@
-"""Keeping the index in MongoDB what the segments say: catching up, and making it anew."""
+"""Brings the MongoDB index up to date with the segments, and rebuilds it from them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def bring_up_to_date(
 
 
 def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
-    """Tell a catalog that was made again which chunks have no documents; whether it had to be."""
+    """Restore the catalog's list of unreadable chunks from the index; True if it had changed."""
     with suppress(CatalogError):
         if catalog.damage(entry.id) == indexed.damage:
             return False
@@ -105,7 +105,7 @@ def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
 
 
 def _is_settled(indexed: Indexed | None, entry: RecordingEntry) -> bool:
-    """Whether nothing is left to be done for a recording that is in the index whole."""
+    """Whether a completely indexed recording needs no further work."""
     is_shown = indexed is not None and not indexed.has_list and indexed.mirrors(entry)
     return is_shown and entry.is_decoded
 
@@ -360,7 +360,7 @@ def _chunks(
 
 
 def _small(table: ChunkTable) -> list[bool]:
-    """Of each chunk, whether its messages are small."""
+    """For each chunk, whether its messages are small enough for `fields.columns`."""
     chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
     sizes = np.bincount(chunk_of, table.parts["payload_bytes"], len(table.chunks))
     counts = np.bincount(chunk_of, table.parts["messages"], len(table.chunks))
@@ -394,7 +394,7 @@ def finish(
 
 
 def _stamps(state: IndexState, inventory: Inventory) -> Iterator[tuple[int, str, NDArray[np.void]]]:
-    """What decoded messages told, a segment at a time."""
+    """Number, digest and stamp rows of each segment that has indexed chunks."""
     indexed = state.chunks(inventory.id[:16])
     for segment, chunks in groupby(indexed, key=lambda chunk: chunk.segment):
         summary = inventory.summaries.get(segment)

@@ -1,4 +1,4 @@
-"""What happens when a store is opened: crashes are recovered, the catalog is brought up to date.
+"""Opens a store: recovers recordings after a crash and brings the catalog up to date.
 
 No server is asked. A recording whose files look as they did when its catalog row was made
 is believed without opening them.
@@ -377,7 +377,7 @@ def _recover_segments(
 
 
 def _end_of(inventory: Inventory) -> dict[str, Any]:
-    """How a recording ended whose journal does not say it."""
+    """The `end` of a recording whose journal has no `ended` line."""
     return dict(inventory.end or {"status": "recovered", "cut_bytes": 0, "damage": []})
 
 
@@ -422,7 +422,7 @@ def _put_entry(
 
 
 def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Give a recording back what the catalog has lost of it.
+    """Restore catalog rows of a recording that were lost.
 
     Raises:
         StoreError: Its files cannot be read any more, or differ from what is known of them.

@@ -1,4 +1,4 @@
-"""Reading everything, and holding what was made from the segments against them."""
+"""Checks every byte of segments and journals, and compares catalog and index with them."""
 
 from __future__ import annotations
 

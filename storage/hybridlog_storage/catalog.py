@@ -68,7 +68,7 @@ _STAMPS = np.dtype(
         ("skew_max", "<i8"),
     ]
 )
-"""What only the decoded messages tell of a channel in a chunk; a row for each of `parts`."""
+"""Values that come from decoded messages; one row for each row of `ChunkTable.parts`."""
 _TABLES: Final = """
 create table meta (key text primary key, value text not null) without rowid;
 create table recordings (
@@ -331,17 +331,16 @@ def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
 def stamps_of(
     table: ChunkTable, chunks: Mapping[int, Mapping[int, ChannelStats]]
 ) -> NDArray[np.void]:
-    """What the decoded messages of a segment's chunks tell, a row for each of `table.parts`.
+    """Header stamps and decoding failures of a segment, one row for each row of `table.parts`.
 
     Args:
         table: The segment's chunks.
         chunks: Statistics of each channel, by number of a chunk that could be decoded.
     """
     rows = np.zeros(len(table.parts), _STAMPS)
-    ends = np.cumsum(table.chunks["parts"])
-    starts = ends - table.chunks["parts"]
+    bounds = table.part_bounds().tolist()
     for number, told in chunks.items():
-        for row in range(int(starts[number]), int(ends[number])):
+        for row in range(bounds[number], bounds[number + 1]):
             stats = told.get(int(table.parts["channel"][row]))
             if stats is None:
                 continue
@@ -873,15 +872,17 @@ def chunk_entries(
     if not wanted.any():
         return []
     chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-    ends = np.cumsum(table.chunks["parts"])
+    edges = table.part_bounds().tolist()
     silent = {c.id for c in entry.channels if not c.has_publish_time}
     found = []
     for number in np.unique(chunk_of[wanted]).tolist():
         chunk = table.chunks[number]
-        rows = slice(int(ends[number]) - int(chunk["parts"]), int(ends[number]))
+        rows = range(edges[number], edges[number + 1])
         stats = {
-            int(part["channel"]): _stats(part, stamps[row] if stamps is not None else None, silent)
-            for row, part in zip(range(rows.start, rows.stop), parts[rows], strict=True)
+            int(parts["channel"][row]): _stats(
+                parts[row], stamps[row] if stamps is not None else None, silent
+            )
+            for row in rows
         }
         found.append(
             ChunkEntry(

@@ -1,4 +1,4 @@
-"""What MongoDB says of the index itself: which recordings are in it, and how far.
+"""Tracks in MongoDB which recordings are indexed, and how far.
 
 `hybridlog.recordings` mirrors the catalog for other programs, and says of each recording
 whether all of its index documents are there and from which segments they were made. A
