@@ -155,6 +155,12 @@ RecordingOption = Annotated[
         autocompletion=complete_recording,
     ),
 ]
+OnlyRecordings = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Only these recordings.", metavar="RECORDING", autocompletion=complete_recording
+    ),
+]
 OneRecording = Annotated[
     str,
     typer.Argument(
@@ -941,12 +947,7 @@ def reindex(
 
 @app.command()
 def verify(
-    recording: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Only these recordings.", metavar="RECORDING", autocompletion=complete_recording
-        ),
-    ] = None,
+    recording: OnlyRecordings = None,
     store: StoreOption = None,
     mongo: MongoOption = None,
     as_json: JsonOption = False,
@@ -963,12 +964,7 @@ def verify(
 
 @app.command()
 def repair(
-    recording: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Only these recordings.", metavar="RECORDING", autocompletion=complete_recording
-        ),
-    ] = None,
+    recording: OnlyRecordings = None,
     store: StoreOption = None,
     moved: Annotated[
         bool,
