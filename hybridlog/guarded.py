@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from hybridlog_storage.errors import IndexChangedError
 from hybridlog_storage.index_state import IndexState
 
 if TYPE_CHECKING:
-    from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.index_state import Progressed
@@ -64,26 +63,43 @@ class Belief:
         )
 
 
+class Believe(Protocol):
+    """Reads the state of the index of some recordings."""
+
+    def __call__(
+        self, database: Database, keys: Collection[str], *, anew: bool = False
+    ) -> Belief: ...
+
+
 class GuardedIndex:
     """Asks the index about some recordings. Thread safe.
 
     The methods are those of `Database`, and raise what those raise.
 
     Args:
-        store: Whose index.
-        database: The same, connected.
+        database: The index.
         entries: The recordings.
+        believe: Reads the state of the index of recordings, given by key; with `anew`, from
+            the database.
+        on_change: Called when another process has changed the index.
 
     Raises:
         IndexChangedError: Not all documents of these recordings are there.
     """
 
-    def __init__(self, store: Store, database: Database, entries: Sequence[RecordingEntry]) -> None:
+    def __init__(
+        self,
+        database: Database,
+        entries: Sequence[RecordingEntry],
+        believe: Believe,
+        on_change: Callable[[], None],
+    ) -> None:
         self.database = database
-        self._store = store
+        self._believe = believe
+        self._on_change = on_change
         self._entries = entries
         self._keys = {entry.key for entry in entries}
-        self._belief = store.belief(database, self._keys)
+        self._belief = believe(database, self._keys)
         self._refuse(self._belief)
 
     def count(self, collection: str, asked: _Filter | None = None, *, by_key: bool = False) -> int:
@@ -134,12 +150,12 @@ class GuardedIndex:
         if IndexState(self.database).turn() == self._belief.turn:
             return
         before = self._belief
-        self._belief = self._store.belief(self.database, self._keys, anew=True)
+        self._belief = self._believe(self.database, self._keys, anew=True)
         self._refuse(self._belief)
         for entry in self._entries:
             then, now = before.recordings[entry.key], self._belief.recordings[entry.key]
             if then is not None and (now is None or now.turn != then.turn):
-                self._store.refresh()
+                self._on_change()
                 raise IndexChangedError(
                     f"The index of recording {entry.label!r} was changed by another process "
                     "while it was asked. Ask again."
@@ -149,5 +165,5 @@ class GuardedIndex:
         for entry in self._entries:
             problem = belief.problem(entry)
             if problem is not None:
-                self._store.refresh()
+                self._on_change()
                 raise IndexChangedError(problem)

@@ -3,45 +3,25 @@
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog import consent, field_indexes
-from hybridlog.columns.kept import KeptColumns
-from hybridlog.columns.stored import FieldColumns
-from hybridlog.entries import channels_of, take_inventory, text
+from hybridlog.entries import text
 from hybridlog.field_indexes import FieldIndex
-from hybridlog.guarded import Belief, GuardedIndex
-from hybridlog.losses import topics_of
-from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
 from hybridlog.maintenance.report import Progress, RepairReport, being_written
-from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.intervals import span_of
-from hybridlog.query.plan import Lane
-from hybridlog.query.predicate import Predicate
-from hybridlog.query.recent_chunks import RecentChunks
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
-from hybridlog.query.topics import resolve
-from hybridlog.reader import Query
+from hybridlog.session import Session
 from hybridlog_storage import journal
-from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.directory import StoreDirectory
-from hybridlog_storage.errors import (
-    CatalogError,
-    DatabaseError,
-    DiskFullError,
-    HybridlogError,
-    StoreError,
-    TopicError,
-    UsageError,
-)
-from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.settings import EMBEDDED, NAME, with_password
+from hybridlog_storage.errors import DatabaseError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.settings import EMBEDDED, NAME
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
@@ -52,11 +32,8 @@ if TYPE_CHECKING:
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
-    from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
-_MOST_OPEN = 256  # segments, and files of columns
-_MOST_WORDS = 128  # topics and predicates whose meaning is remembered
 
 
 def store_path(path: str | Path | None = None) -> Path:
@@ -125,11 +102,9 @@ class Store:
         progress: Called while an index is brought up to date.
 
     Attributes:
+        session: What it holds while it is open.
         directory: Where it lies.
-        without_database: Why MongoDB is unavailable; None while it is not known to be.
-        repairs: What had to be mended when it was opened.
-        kept: Columns of what is asked for again and again.
-        recent_chunks: Chunks that single messages were read from.
+        catalog: Recordings, channels, chunks and schemas, in a local file.
     """
 
     def __init__(
@@ -140,32 +115,7 @@ class Store:
         progress: Progress | None = None,
     ) -> None:
         self.directory = directory
-        self.without_database: HybridlogError | None = None
-        self.repairs = RepairReport()
-        self._database: Database | None = None
-        self._mongod: EmbeddedMongod | None = None
-        self._wanted = mongo
-        self._uri: str | None = None
-        self._progress = progress
-        self._connecting = threading.RLock()
-        self._is_indexed = False  # the recordings that are known are in the index
-        self._recordings: list[RecordingEntry] | None = None
-        self._belief: Belief | None = None
-        self._schemas: dict[str, Schema] = {}
-        self._lanes: dict[str, list[Lane]] = {}
-        self._segments: dict[tuple[str, int], SegmentReader] = {}
-        self._columns: dict[str, FieldColumns | None] = {}
-        self._chunk_lists = ChunkLists()
-        self.kept = KeptColumns(self)
-        self.recent_chunks = RecentChunks()
-        self._lock = threading.Lock()
-        self.catalog = open_catalog(directory)
-        self._learn()
-        try:
-            self.recordings()
-        except BaseException:
-            self.catalog.close()
-            raise
+        self.session = Session(directory, mongo, progress)
 
     def __enter__(self) -> Self:
         """The store itself."""
@@ -178,163 +128,63 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {self.directory.path}>"
 
-    # Connection.
+    @property
+    def catalog(self) -> Catalog:
+        """Recordings, channels, chunks and schemas, in a local file."""
+        return self.session.catalog
 
     @property
-    def connected(self) -> Database | None:
-        """The index, if a question has needed it already."""
-        return self._database
+    def repairs(self) -> RepairReport:
+        """What was repaired when the store was opened."""
+        return self.session.repairs
+
+    # The index.
 
     @property
     def database(self) -> Database | None:
-        """The index; None if MongoDB is unavailable. It is connected to when first asked for."""
-        if self.without_database is None and not (self._database and self._is_indexed):
-            with suppress(HybridlogError):
-                self.connect()
-        return self._database
+        """The index; connected to when first asked for, None if MongoDB is unavailable."""
+        return self.session.database
+
+    @property
+    def without_database(self) -> HybridlogError | None:
+        """Why MongoDB is unavailable; None while that is not known."""
+        return self.session.unavailable
+
+    @property
+    def index_place(self) -> str:
+        """Where the index is, in words; MongoDB is not asked."""
+        return self.session.connection.place
 
     def connect(self) -> Database:
-        """Connect to the index, and bring it up to date.
+        """Connect to the index and bring it up to date.
 
         Raises:
             DatabaseError: MongoDB does not answer.
             StoreError: it holds the index of another store, or this store is a copy.
         """
-        from hybridlog.maintenance import index
-
-        with self._connecting:
-            if self._database is not None and self._is_indexed:
-                return self._database
-            try:
-                if self._database is None:
-                    self._database = self._another_database()
-                    self._claim(self._database)
-                repairs = RepairReport()
-                has_changed = index.bring_up_to_date(
-                    self.directory,
-                    self.catalog,
-                    self._database,
-                    self.recordings(),
-                    report=repairs,
-                    progress=self._progress,
-                )
-            except BaseException as error:
-                self.disconnect()
-                if isinstance(error, HybridlogError):
-                    self.without_database = error
-                raise
-            self.without_database = None
-            self.repairs.indexed.update(repairs.indexed)
-            self.repairs.unreadable.update(repairs.unreadable)
-            self.repairs.removed += repairs.removed
-            if has_changed:
-                self.refresh()
-            self._is_indexed = True
-            return self._database
-
-    def _another_database(self) -> Database:
-        """A connection; the embedded MongoDB is started if it is not there (any more).
-
-        Raises:
-            DatabaseError: it does not answer.
-        """
-        from hybridlog_storage.database import Database
-
-        if self._uri is None:
-            self._uri = self._wanted or consent.trusted_uri(
-                self.directory.settings, self.directory.path
-            )
-        uri = self._uri
-        if uri == EMBEDDED:
-            from hybridlog_storage.mongod import EmbeddedMongod
-
-            self._mongod = self._mongod or EmbeddedMongod(self.directory.mongod)
-            try:
-                uri = self._mongod.start()
-            except StoreError as error:
-                # A store that cannot be written has no embedded MongoDB; its segments do.
-                raise DatabaseError(str(error)) from error
-        else:
-            uri = with_password(uri)
-        return Database.connect(uri)
-
-    @property
-    def index_place(self) -> str:
-        """Where the index is, without asking it."""
-        if self._database is not None:
-            return f"database {self._database.name} at {self._database.address}"
-        uri = self._wanted or self.directory.settings.mongo or EMBEDDED
-        if uri == EMBEDDED:
-            return "the MongoDB that comes with hybridlog"
-        from hybridlog_storage.database import without_secrets
-
-        return without_secrets(uri)
-
-    def disconnect(self) -> None:
-        """Leave the database; what remains is reading by time."""
-        if self._database is not None:
-            self._database.close()
-        self._database = None
-        self._belief = None
-        if self._mongod is not None:
-            self._mongod.stop()
-        self._mongod = None
-
-    def close(self) -> None:
-        """Give everything back. May be called more than once."""
-        with self._lock:
-            for reader in self._segments.values():
-                reader.close()
-            self._segments.clear()
-        self._columns.clear()
-        self.recent_chunks.clear()
-        self.disconnect()
-        self.catalog.close()
+        return self.session.connect()
 
     def database_for(self, purpose: str) -> Database:
-        """The database.
+        """The index.
 
         Raises:
             DatabaseError: it is unavailable; says what it was needed for, and why it is.
         """
-        if self.database is None:
-            raise DatabaseError(f"{purpose} needs MongoDB. {self.without_database or ''}".strip())
-        return self.database
+        return self.session.database_for(purpose)
 
-    def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
-        """The index, to ask about some recordings.
+    def refresh(self) -> None:
+        """Drop what was read of the catalog, to see what others have recorded."""
+        self.session.invalidate()
 
-        Raises:
-            DatabaseError: it is unavailable; says what it was needed for, and why it is.
-            IndexChangedError: another process removes documents of these recordings.
-        """
-        return GuardedIndex(self, self.database_for(purpose), recordings)
+    def close(self) -> None:
+        """Close files and connections. May be called more than once."""
+        self.session.close()
 
-    def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
-        """What the index has said of some recordings, since the catalog was read.
-
-        Args:
-            database: The index.
-            keys: Of the recordings.
-            anew: Ask it now.
-        """
-        found = self._belief = Belief.of(database, keys, None if anew else self._belief)
-        return found
-
-    # What is in it.
+    # Recordings and topics.
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first."""
-        if self._recordings is None:
-            try:
-                self._recordings = repair_on_open(self.directory, self.catalog, self.repairs)
-            except DiskFullError as error:
-                # What is there can be read all the same, and removed.
-                self.repairs.disk_full = error
-                self.catalog.close()
-                self.catalog = open_catalog(self.directory, in_memory=True)
-                self._recordings = repair_on_open(self.directory, self.catalog, self.repairs)
-        return self._recordings
+        return self.session.recordings()
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its label.
@@ -342,33 +192,7 @@ class Store:
         Raises:
             TopicError: there is none.
         """
-        for entry in self.recordings():
-            if recording in {entry.id, entry.label}:
-                return entry
-        raise TopicError(f"Recording {recording!r} is not in the store any more.")
-
-    def refresh(self) -> None:
-        """Forget what was read of the catalog."""
-        self._recordings = None
-        self._is_indexed = False
-        self._belief = None
-        self._schemas = {}
-        self._lanes.clear()
-        with self._lock:
-            self._columns.clear()  # closed by the last thread that reads from them
-            self._segments.clear()
-        self._chunk_lists.clear()
-        self.kept.clear()
-        self.recent_chunks.clear()
-        self._learn()
-
-    def _learn(self) -> None:
-        """Remember from now on what words of questions mean: to find out takes half of a count.
-
-        Anew, not emptied: who looks something up at this moment looks into what was before.
-        """
-        self._resolved = lru_cache(_MOST_WORDS)(self._resolve)
-        self._compiled = lru_cache(_MOST_WORDS)(self._compile)
+        return self.session.entry(recording)
 
     def select(self, names: Sequence[str]) -> list[RecordingEntry]:
         """Recordings by label, by name, by id, or by the beginning of one of these.
@@ -376,59 +200,11 @@ class Store:
         Raises:
             TopicError: there is no such recording, or there are several.
         """
-        everything = self.recordings()
-        chosen: list[RecordingEntry] = []
-        for given in names:
-            name = self.repairs.copies.get(given, given)
-            found = (
-                [r for r in everything if name in {r.label, r.id}]
-                or [r for r in everything if r.name == name]
-                or [r for r in everything if r.label.startswith(name)]
-                or [r for r in everything if len(name) >= 4 and r.id.startswith(name)]
-            )
-            if len(found) != 1:
-                candidates = ", ".join(r.label for r in (found or everything)[:10]) or "none"
-                problem = "is ambiguous" if found else "is not in the store"
-                raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
-            if found[0] not in chosen:
-                chosen.append(found[0])
-        return chosen
+        return self.session.select(names)
 
     def topics(self) -> list[str]:
-        """Names of all topics, sorted; also of those of which all messages are lost."""
-        return sorted({topic for r in self.recordings() for topic in topics_of(r)})
-
-    def lanes(self, recording: RecordingEntry) -> list[Lane]:
-        """The channels of a recording, with what reads them."""
-        lanes = self._lanes.get(recording.id)
-        if lanes is None:
-            channels = self._channels(recording)
-            lanes = [Lane(recording, i, c) for i, c in sorted(channels.items())]
-            self._lanes[recording.id] = lanes
-        return lanes
-
-    def _channels(self, recording: RecordingEntry) -> dict[int, Channel]:
-        """The channels of a recording, by id."""
-        wanted = {c.schema for c in recording.channels if c.schema is not None}
-        if not wanted <= self._schemas.keys():
-            # Recordings have most of them in common.
-            entries = (*self.recordings(), recording)
-            used = {c.schema for r in entries for c in r.channels if c.schema is not None}
-            with suppress(CatalogError):
-                self._schemas = self.catalog.schemas(used)
-        if not wanted <= self._schemas.keys():
-            # The catalog has lost one.
-            return channels_of(take_inventory(self.directory, recording.label).summaries.values())
-        return {
-            c.id: Channel(
-                c.topic,
-                c.message_encoding,
-                self._schemas[c.schema] if c.schema is not None else None,
-                c.metadata,
-                has_publish_time=c.has_publish_time,
-            )
-            for c in recording.channels
-        }
+        """Names of all topics, sorted; also of those whose messages are all lost."""
+        return self.session.topics()
 
     # Asking.
 
@@ -442,13 +218,7 @@ class Store:
         Raises:
             TopicError: a name fits nothing, or several topics; lists the candidates.
         """
-        return self._resolved(names).again()
-
-    def _resolve(self, names: tuple[str, ...]) -> Query:
-        known = self.topics()
-        if not names:
-            raise TopicError("Which topic? " + _listed(known))
-        return self.query(resolve(names, known))
+        return Query(self.session, Question(*self.session.resolve(names)))
 
     def all_topics(self) -> Query:
         """A question about everything."""
@@ -456,102 +226,7 @@ class Store:
 
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all."""
-        wanted = set(topics)
-        named = None if recordings is None else {r.id for r in self.select(recordings)}
-        chosen = tuple(
-            r.id
-            for r in self.recordings()
-            if (named is None or r.id in named) and not wanted.isdisjoint(topics_of(r))
-        )
-        if wanted and not chosen:
-            raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
-        return Query(self, tuple(topics), chosen)
-
-    def predicate(
-        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> Predicate:
-        """A predicate on some topics of some recordings.
-
-        Raises:
-            WhereError: it cannot be understood, or does not fit the fields.
-        """
-        return self._compiled(text, topics, recordings)
-
-    def _compile(
-        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> Predicate:
-        from hybridlog.query.where import compile_filter
-
-        types = Query(self, topics, recordings).field_types()
-        return Predicate(compile_filter(text, field_types=types))
-
-    def chunks(
-        self,
-        recording: RecordingEntry,
-        channels: Sequence[int],
-        bounds: tuple[int, int] | None,
-        clock: str,
-    ) -> list[ChunkEntry]:
-        """Chunks that may hold messages of some channels in a time range."""
-        if bounds is None or clock != "log" or recording.status == "open":
-            return self._fetch_chunks(recording, channels, bounds, clock)
-        fetch = partial(self._fetch_chunks, recording, channels)
-        return self._chunk_lists.find(recording.id, channels, bounds, fetch)
-
-    def chunks_before(
-        self, recording: RecordingEntry, channels: Sequence[int], span: tuple[int, int]
-    ) -> Iterator[tuple[ChunkEntry, int]]:
-        """Chunks that may hold the last message of some channels by a time.
-
-        Args:
-            recording: Of which.
-            channels: Channel ids.
-            span: Log time of the recording's first message, and the time, ns.
-
-        Yields:
-            See `ChunkLists.before`.
-        """
-        fetch = partial(self._fetch_chunks, recording, channels)
-        if recording.status == "open":
-            return latest_first(frozenset(channels), span, fetch)
-        return self._chunk_lists.before(recording.id, channels, span, fetch)
-
-    def _fetch_chunks(
-        self,
-        recording: RecordingEntry,
-        channels: Sequence[int],
-        bounds: tuple[int, int] | None,
-        clock: str = "log",
-    ) -> list[ChunkEntry]:
-        try:
-            return self.catalog.chunks(recording, channels, bounds, clock)
-        except CatalogError:
-            put_again(self.directory, self.catalog, recording)
-            return self.catalog.chunks(recording, channels, bounds, clock)
-
-    def segment(self, recording: str, number: int) -> SegmentReader:
-        """The reader of a sealed segment of a recording, by id or label, kept open. Thread safe."""
-        key = (recording, number)
-        with self._lock:
-            reader = self._segments.get(key)
-            if reader is None:
-                _make_room(self._segments)
-                path = self.directory.recording(self.entry(recording).label)
-                reader = SegmentReader(path / f"{number:06d}.mcap", number)
-                self._segments[key] = reader
-            return reader
-
-    def columns(self, recording: str) -> FieldColumns | None:
-        """The columns that lie beside the segments of a recording; None without good ones."""
-        with self._lock:
-            if recording not in self._columns:
-                _make_room(self._columns)
-                self._columns[recording] = None
-                with suppress(FileNotFoundError, StoreError, TopicError):  # the index has the same
-                    path = self.directory.recording(self.entry(recording).label)
-                    found = FieldColumns(path)
-                    self._columns[recording] = found
-            return self._columns[recording]
+        return Query(self.session, Question(*self.session.having(topics, recordings)))
 
     # Changing.
 
@@ -609,17 +284,18 @@ class Store:
             self.database_for("Starting a recording"),
             name,
             options or LiveOptions(**choices),
-            renew=self._another_database,
+            renew=self.session.connection.another,
             on_close=self._after,
         )
 
     def _after(self, report: RecordReport) -> None:
         """A recording has ended."""
         self.refresh()
-        if report.failure is None and (self._database is None or self._database.ping()):
+        connected = self.session.connected
+        if report.failure is None and (connected is None or connected.ping()):
             return
         # MongoDB has ended meanwhile. If it can be had again, the rest is indexed.
-        self.disconnect()
+        self.session.disconnect()
         try:
             self.connect()
         except HybridlogError as error:
@@ -783,8 +459,9 @@ class Store:
         self.refresh()
         (entry,) = self.select([recording])
         edit.append(self.directory, self.catalog, entry, lines)
-        if self.connected is not None:
-            index.mirror(self.catalog, self.connected, entry.id)
+        connected = self.session.connected
+        if connected is not None:
+            index.mirror(self.catalog, connected, entry.id)
         self.refresh()
         return self.entry(entry.id)
 
@@ -866,42 +543,10 @@ class Store:
         return done
 
     def take_over(self) -> None:
-        """Say that this store lies here now: it was moved, and its index comes along.
+        """Record in the index that this store lies here now: it was moved.
 
         Raises:
             DatabaseError: MongoDB does not answer.
             StoreError: the database holds the index of another store.
         """
-        from hybridlog.maintenance import lease
-        from hybridlog_storage.index_state import IndexState
-
-        self.disconnect()
-        with self._another_database() as database:
-            state = IndexState(database)
-            place = lease.place_of(self.directory)
-            lease.check(state.mark(), place, database, embedded=True)
-            state.claim(place)
-        self.without_database = None
-
-    def _claim(self, database: Database) -> None:
-        """Make sure that the database is this store's, and nobody else's."""
-        from hybridlog.maintenance import lease
-        from hybridlog_storage.index_state import IndexState
-
-        state = IndexState(database)
-        place = lease.place_of(self.directory)
-        if lease.check(state.mark(), place, database, embedded=self._uri == EMBEDDED):
-            state.claim(place)
-
-
-def _make_room(opened: dict[Any, Any]) -> None:
-    """Let go of the file that was opened first, if there are many.
-
-    It is closed when the last thread that reads from it lets go of it, too.
-    """
-    if len(opened) >= _MOST_OPEN:
-        del opened[next(iter(opened))]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return "There are: " + ", ".join(names[:20]) if names else "The store is empty."
+        self.session.take_over()

@@ -1,0 +1,248 @@
+"""Intervals from messages: where a predicate holds, when fields change, time around events."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined, span_of
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+class IntervalQueries:
+    """Answers one question with intervals.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Count what the answer costs.
+    """
+
+    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+        self._session = session
+        self._question = question
+        self._planner = Planner(session, question, counters)
+
+    def states(self, max_gap: DurationLike | None) -> Intervals:
+        """Where the predicate holds; see `Query.intervals`."""
+        self._check("A state")
+        gap = None if max_gap is None else parse_duration(max_gap)
+        if gap == 0:
+            raise UsageError("A message that is believed for no time makes no interval.")
+        return Intervals.of(
+            (part.recording.id, rows)
+            for part, span in self._spans()
+            for rows in self._states_in(part, span, gap)
+        )
+
+    def changes(
+        self, fields: Sequence[str], pause: DurationLike, tolerance: float
+    ) -> Intervals:
+        """When fields change; see `Query.changes`."""
+        self._check("A change")
+        if not tolerance >= 0 or tolerance == np.inf:
+            raise UsageError(f"A tolerance is a number from 0 on, not {tolerance}.")
+        quiet = parse_duration(pause)
+        paths = [field.replace("[*]", "").replace("[]", "") for field in fields]
+        return Intervals.of(
+            (part.recording.id, rows)
+            for part, span in self._spans()
+            for rows in self._changes_in(part, span, paths, tolerance, Changing(quiet))
+        )
+
+    def windows(self, before: DurationLike, after: DurationLike) -> Intervals:
+        """Time around each message; see `Query.windows`."""
+        if len(self._question.topics) > 1 and not self._question.returns_all:
+            raise UsageError(
+                "Windows around only some messages of several topics: ask for one topic, or "
+                "without `limit` and `every`."
+            )
+        if parse_duration(before) == parse_duration(after) == 0:
+            raise UsageError("How long before or after? A window needs one of them.")
+        found = []
+        for entry, times in self._times():
+            rows = np.stack([times, times, np.ones_like(times)], axis=1)
+            found.append((entry.key, entry.id, rows))
+        # Windows that begin together are in the order of the recordings' keys.
+        ordered = sorted(found, key=lambda item: item[0])
+        wide = Intervals.of((name, rows) for _, name, rows in ordered).widened(before, after)
+        return wide.within({e.id: _extent(e) for e in self._session.recordings()})
+
+    def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """In which spans of log time of a recording any message lies.
+
+        Args:
+            recording: Id of the recording.
+            spans: int64[n, 2], begin and end, ns; they may overlap.
+
+        Returns:
+            bool[n].
+
+        Raises:
+            UsageError: the question has `limit` or `every`.
+        """
+        question = self._question
+        if not question.returns_all:
+            raise UsageError("Any message counts: limit and every do not fit.")
+        if recording not in question.recordings or not len(spans):
+            return np.zeros(len(spans), np.bool_)
+        rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
+        covered = joined(rows[np.argsort(rows[:, 0], kind="stable")])
+        near = Intervals.of([(recording, covered)])
+        if question.during is not None:
+            near = question.during.common(near).merged()
+        part = replace(question, recordings=(recording,), during=near)
+        inner = IntervalQueries(self._session, part, self._planner.counters)
+        found = [np.empty(0, np.int64), *(times for _, times in inner._times())]
+        times = np.sort(np.concatenate(found))
+        first, end = np.searchsorted(times, spans[:, 0]), np.searchsorted(times, spans[:, 1])
+        inside: NDArray[np.bool_] = first < end
+        return inside
+
+    def _times(self) -> Iterator[tuple[RecordingEntry, NDArray[np.int64]]]:
+        """Log times of the messages of the answer, by recording."""
+        if not self._question.returns_all:
+            plan = self._planner.scan_plan()
+            for run in self._planner.runs(plan):
+                entry_of = [channel.recording for channel in plan.channels]
+                for index in np.unique(run.batch.channel).tolist():
+                    yield entry_of[index], run.batch.log_time[run.batch.channel == index]
+            return
+        for part in self._planner.parts():
+            for found in self._planner.outcomes(part):
+                yield part.recording, found.log_time[found.holds]
+
+    def _spans(self) -> Iterator[tuple[Part, Span]]:
+        """The one part of each recording, unbounded, with each span that is asked about."""
+        whole = replace(self._question, bounds=None, during=None)
+        parts = {p.recording.id: p for p in Planner(
+            self._session, whole, self._planner.counters).parts()}
+        for recording, span in RangeResolver(self._session, self._question).spans():
+            if recording.id in parts:
+                yield parts[recording.id], span
+
+    def _states_in(self, part: Part, span: Span, gap: int | None) -> Iterator[NDArray[np.int64]]:
+        holding = Holding(gap)
+        before = self._last_before(part, span)
+        if before is not None:
+            # The last message before the range still speaks for its beginning.
+            time, holds = before
+            yield clipped(
+                holding.add(np.array([time]), np.array([holds]), counted=False), span
+            )
+        for found in self._planner.outcomes(_bounded(part, span)):
+            yield clipped(holding.add(found.log_time, found.holds), span)
+        yield clipped(holding.finish(span_of(part.recording)[1]), span)
+
+    def _last_before(self, part: Part, span: Span) -> tuple[int, bool] | None:
+        """Time and outcome of the last message before a span, whether it matches or not."""
+        for begin in _earlier(part, span):
+            last = None
+            for found in self._planner.outcomes(_bounded(part, (begin, span[0]))):
+                if len(found.log_time):
+                    last = int(found.log_time[-1]), bool(found.holds[-1])
+            if last is not None:
+                return last
+        return None
+
+    def _changes_in(
+        self, part: Part, span: Span, paths: Collection[str], tolerance: float, changing: Changing
+    ) -> Iterator[NDArray[np.int64]]:
+        carried = self._row_before(part, span, paths)
+        for found in self._planner.values(_bounded(part, span), paths):
+            if not len(found.log_time):
+                continue
+            differs, carried = _steps(carried, found.records, tolerance)
+            yield changing.add(found.log_time[differs])
+        yield changing.finish()
+
+    def _row_before(
+        self, part: Part, span: Span, paths: Collection[str]
+    ) -> pa.StructArray | None:
+        """The fields of the last matching message before a span."""
+        for begin in _earlier(part, span):
+            last = None
+            for found in self._planner.values(_bounded(part, (begin, span[0])), paths):
+                if len(found.records):
+                    last = found.records.slice(len(found.records) - 1)
+            if last is not None:
+                return last
+        return None
+
+    def _check(self, subject: str) -> None:
+        question = self._question
+        if len(question.topics) != 1:
+            raise UsageError(
+                f"{subject} is one topic's; this question has {len(question.topics)}: name one "
+                f"of {', '.join(question.topics[:10])}."
+            )
+        if not question.returns_all or question.reverse:
+            raise UsageError(
+                f"{subject} is found in all messages: limit, every and reverse do not fit."
+            )
+
+
+_BACK_NS = 1_000_000_000
+_FURTHER = 64
+
+
+def _earlier(part: Part, span: Span) -> Iterator[int]:
+    """Beginnings of ever longer spans that end where a span begins; the recording's last."""
+    entry_span = part.recording.span
+    if entry_span is None or span[0] <= entry_span[0]:
+        return
+    back = _BACK_NS
+    while span[0] - back > entry_span[0]:
+        yield span[0] - back
+        back *= _FURTHER
+    yield entry_span[0]
+
+
+def _bounded(part: Part, span: Span) -> Part:
+    return replace(part, bounds=span, clock="log", windows=None)
+
+
+def _steps(
+    carried: pa.StructArray | None, records: pa.StructArray, tolerance: float
+) -> tuple[NDArray[np.bool_], pa.StructArray]:
+    """Which rows differ from the row before them, and the last row."""
+    import pyarrow as pa
+
+    from hybridlog.query.rows_differ import rows_differ
+
+    last = records.slice(len(records) - 1)
+    together = records
+    if carried is not None:
+        tables = [pa.Table.from_struct_array(part) for part in (carried, records)]
+        joined_table = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
+        together = joined_table.to_struct_array().combine_chunks()
+    if isinstance(together, pa.ChunkedArray):
+        together = pa.concat_arrays(together.chunks)
+    rows = np.arange(1, len(together))
+    differs = rows_differ(together, rows, rows - 1, tolerance)
+    if carried is None:
+        differs = np.concatenate([[False], differs])
+    return differs, last
+
+
+def _extent(entry: RecordingEntry) -> Span:
+    """Log time in which a recording has messages, or may have some by now."""
+    if entry.span is None:
+        return 0, TIME_LIMIT - 1
+    begin, end = span_of(entry)
+    return begin, TIME_LIMIT - 1 if entry.status == "open" else end

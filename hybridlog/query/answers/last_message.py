@@ -1,0 +1,175 @@
+"""The message that was current at a time: the last one not after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.message import Documents, Message, messages_in
+from hybridlog.query.chunk_lists import earlier_and_earlier
+from hybridlog.query.intervals import span_of
+from hybridlog.query.planner import Planner
+from hybridlog.query.times import TimeLike, parse_time
+
+if TYPE_CHECKING:
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question, Span
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.messages import Batch
+
+
+def message_at(
+    session: Session, question: Question, counters: Counters, moment: TimeLike
+) -> Message | None:
+    """The last message not after a time, in whichever recording it is; None if there is none."""
+    moments: list[tuple[int, int, RecordingEntry]] = []
+    for recording in session.chosen(question.recordings):
+        start, end = span_of(recording)
+        now = parse_time(moment, start=start, end=end)
+        if start < end and start <= now:
+            moments.append((min(now, end - 1), start, recording))
+    best: tuple[tuple[int, str, int], Message] | None = None
+    # The recording that could hold the latest message is asked first: mostly it does.
+    for latest, start, recording in sorted(moments, key=itemgetter(0), reverse=True):
+        if best is not None and latest < best[0][0]:
+            break
+        found = _last_of(session, question, counters, recording, (start, latest))
+        if found is not None:
+            place = found.log_time_ns, recording.key, found.seq
+            if best is None or place > best[0]:
+                best = place, found
+    return best[1] if best is not None else None
+
+
+def just_before(question: Question, recording: str, begin: int, latest: int) -> Question:
+    """The question about the last message of a recording in `[begin, latest]`, ns."""
+    return replace(
+        question,
+        recordings=(recording,),
+        bounds=(begin, latest + 1),
+        clock="log",
+        reverse=True,
+        limit=1,
+        every=1,
+    )
+
+
+def _last_of(
+    session: Session,
+    question: Question,
+    counters: Counters,
+    recording: RecordingEntry,
+    span: Span,
+) -> Message | None:
+    """The last message of a recording in `[start, latest]`, ns."""
+    if question.predicate is not None:
+        start, latest = span
+        for begin in earlier_and_earlier(latest, start):
+            narrow = just_before(question, recording.id, begin, latest)
+            planner = Planner(session, narrow, counters)
+            plan = planner.scan_plan()
+            for run in planner.runs(plan):
+                return next(messages_in(plan.channels, run))
+        return None
+    wanted = set(question.topics)
+    channels = {
+        channel.channel_id: channel
+        for channel in session.channels(recording)
+        if channel.channel.topic in wanted
+    }
+
+    def load(entry: ChunkEntry) -> StoredChunk:
+        chunk = session.segment(recording.id, entry.segment).read_chunk(entry.place)
+        counters.chunks_read += 1
+        counters.bytes_read += chunk.length + chunk.trailer
+        return chunk
+
+    def read(entry: ChunkEntry) -> StoredChunk:
+        key = recording.id, entry.segment, entry.number
+        return session.recent_chunks.get(key, partial(load, entry))
+
+    chunks = session.chunks_before(recording, list(channels), span)
+    found = last_message(chunks, channels, span[1], read)
+    if found is None:
+        return None
+    batch = found.batch.take(slice(found.row, found.row + 1))
+    counters.add_messages(batch)
+    return Message(
+        channels[batch.channel.item()],
+        log_time=found.log_time,
+        publish_time=batch.publish_time.item(),
+        sequence=batch.sequence.item(),
+        seq=found.seq,
+        view=batch.payload(0),
+        documents=Documents(channels, batch),
+        row=0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A message in a chunk.
+
+    Attributes:
+        log_time: ns.
+        seq: Arrival number in its recording.
+        batch: The messages of its chunk; `channel` holds channel ids.
+        row: Which of them it is.
+    """
+
+    log_time: int
+    seq: int
+    batch: Batch
+    row: int
+
+
+def last_message(
+    chunks: Iterable[tuple[ChunkEntry, int]],
+    channels: Collection[int],
+    latest: int,
+    read: Callable[[ChunkEntry], StoredChunk],
+) -> Found | None:
+    """The message with the greatest log time, of several the one that arrived last.
+
+    Args:
+        chunks: Those of one recording that may hold it, see `ChunkLists.before`.
+        channels: Ids of the channels that are asked about.
+        latest: The time, ns.
+        read: Gives the content of a chunk.
+
+    Raises:
+        SegmentError: a chunk is not there, or damaged.
+    """
+    best: Found | None = None
+    for entry, last in chunks:
+        if best is not None and last < best.log_time:
+            break
+        chunk = read(entry)
+        others = not all(channel in channels for channel in entry.stats)
+        row = _last_row(chunk.batch, channels if others else None, latest)
+        if row is not None:
+            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
+            if best is None or place > (best.log_time, best.seq):
+                best = Found(*place, chunk.batch, row)
+    return best
+
+
+def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> int | None:
+    """The row of the last message; `channels` is None when the batch has no others."""
+    fits = batch.log_time <= latest
+    if channels is not None:
+        is_wanted = np.zeros(max(channels) + 2, np.bool_)  # the last one stands for all others
+        is_wanted[list(channels)] = True
+        fits &= is_wanted.take(batch.channel, mode="clip")
+    (rows,) = fits.nonzero()
+    if not len(rows):
+        return None
+    # Rows are in the order of arrival: of equal times the last one counts.
+    return int(rows[-1 - batch.log_time[rows][::-1].argmax()])

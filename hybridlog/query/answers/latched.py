@@ -1,0 +1,94 @@
+"""Latched messages: those still in force when a slice begins."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+
+if TYPE_CHECKING:
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question, RecordedChannel
+    from hybridlog.session import Session
+    from hybridlog_storage.messages import Batch, Channel
+
+_TRANSIENT_LOCAL = re.compile(r"durability:\s*(?:1|transient_local)\b")
+_MAX_DEPTH = 1000
+
+
+def depth_of(channel: Channel) -> int:
+    """How many of a channel's last messages a late subscriber gets; 0 without latching.
+
+    A ROS 1 connection latches one message. A ROS 2 channel mixes the publishers of its
+    topic, and the depth of each does not tell how many there are: all are kept, up to a bound.
+    """
+    metadata = channel.metadata
+    if metadata.get("latching") in {"1", "true"}:
+        return 1
+    if _TRANSIENT_LOCAL.search(metadata.get("offered_qos_profiles", "")):
+        return _MAX_DEPTH
+    return 0
+
+
+def in_force(
+    session: Session, question: Question, counters: Counters
+) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+    """Latched messages from before the time range of a question, to be put in front of it.
+
+    Their log time becomes the beginning of the range, so that the slice spans no more
+    than was asked for; the publish time keeps saying when they were sent.
+    """
+    latching: dict[str, set[str]] = {}
+    for channel in Planner(session, question, counters).channels():
+        if depth_of(channel.channel):
+            latching.setdefault(channel.recording.id, set()).add(channel.channel.topic)
+    for recording, begin in RangeResolver(session, question).beginnings():
+        topics = sorted(latching.get(recording.id, ()))
+        if not topics:
+            continue
+        before = replace(
+            question,
+            topics=tuple(topics),
+            recordings=(recording.id,),
+            bounds=(0, begin),
+            clock="log",
+            predicate=None,
+            during=None,
+            limit=None,
+            every=1,
+            reverse=True,
+        )
+        yield from _last(session, before, counters, begin)
+
+
+def _last(
+    session: Session, before: Question, counters: Counters, begin: int
+) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+    """The last messages of each latching channel, oldest first."""
+    planner = Planner(session, before, counters)
+    plan = planner.scan_plan()
+    room = [depth_of(channel.channel) for channel in plan.channels]
+    found: list[Batch] = []
+    for run in planner.runs(plan):
+        rows = []
+        for row, index in enumerate(run.batch.channel.tolist()):
+            if room[index] > 0:
+                room[index] -= 1
+                rows.append(row)
+        if rows:
+            found.append(run.batch.take(np.array(rows[::-1], np.intp)))
+        if not any(room):
+            break
+    has_publish_time = np.array([c.channel.has_publish_time for c in plan.channels])
+    for batch in reversed(found):
+        batch.publish_time = np.where(
+            has_publish_time[batch.channel], batch.publish_time, batch.log_time
+        )
+        batch.log_time = np.full(len(batch), begin, np.int64)
+        yield batch, plan.channels

@@ -1,0 +1,438 @@
+"""Reads chunks in order of log time and yields their messages in order.
+
+Chunks are sorted by the log time at which they begin. The scan reads each once, in that
+order, and yields a message as soon as no later chunk can hold an earlier one. The order
+(log time, recording, arrival) is total; memory is bounded by the chunks that overlap in
+time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from hybridlog.indexing import STAMP
+from hybridlog.query.counters import Counters
+from hybridlog.query.times import TIME_LIMIT
+from hybridlog.schema.column import header_stamps
+from hybridlog_storage.copying import interleave, joined
+from hybridlog_storage.distinct import distinct
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.message_filter import MessageFilter
+    from hybridlog.query.question import Clock, RecordedChannel, Span
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segment_reader import SegmentReader
+
+_LOOK_AHEAD = 4
+_MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
+_SMALL_CHUNK_BYTES = 128 << 10  # copying such a chunk is faster than decoding it alone
+_MERGED_BYTES = 1 << 20  # small chunks are decoded together up to this size
+
+ChunkKey = tuple[str, int, int]
+"""Recording id, segment number, chunk number in the segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class RowSelection:
+    """The messages of some chunks that an index found.
+
+    Attributes:
+        offsets: Payload offsets in each chunk, sorted, by chunk; int64[k].
+        unindexed: Indexes of channels that no index was asked about: every message of
+            theirs is read, and a filter decides.
+    """
+
+    offsets: Mapping[ChunkKey, NDArray[np.int64]]
+    unindexed: Collection[int] = ()
+
+
+Selector = Callable[[Sequence["ChunkTask"]], RowSelection]
+"""Asks an index which messages of some chunks may match."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingScan:
+    """What to read of one recording.
+
+    Attributes:
+        recording: The recording.
+        channels: Index of each wanted channel in the plan's channels, by channel id.
+        bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
+        chunks: The chunks that may hold it.
+        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all
+            times.
+    """
+
+    recording: RecordingEntry
+    channels: Mapping[int, int]
+    bounds: Span | None
+    chunks: Sequence[ChunkEntry]
+    windows: NDArray[np.int64] | None = None
+
+    def touches(self, first: int, last: int) -> bool:
+        """Whether a chunk may have messages in a window.
+
+        Args:
+            first: Log time of its first message, ns.
+            last: Log time of its last message, ns.
+        """
+        if self.windows is None:
+            return True
+        place = int(np.searchsorted(self.windows[:, 1], first, "right"))
+        return place < len(self.windows) and bool(self.windows[place, 0] <= last)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkTask:
+    """A chunk to read, and what is wanted from it."""
+
+    scan: RecordingScan
+    chunk: ChunkEntry
+    first: int
+    last: int
+    messages: int
+
+    @property
+    def key(self) -> ChunkKey:
+        """Where the chunk lies."""
+        return self.scan.recording.id, self.chunk.segment, self.chunk.number
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRun:
+    """Messages in order.
+
+    Attributes:
+        batch: The messages; `channel` is the index of each message's channel in the plan.
+        seq: int64[n], arrival numbers in their recordings.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> MessageRun:
+        """The chosen rows."""
+        return MessageRun(self.batch.take(rows), self.seq[rows])
+
+
+@dataclass(slots=True)
+class ScanPlan:
+    """What to read, in which order.
+
+    Attributes:
+        channels: Every channel that is read.
+        scans: What to read of each recording.
+        clock: The clock of the bounds.
+        selector: Narrows chunks down to candidates; None reads everything.
+        filters: Decides on each message of a channel, by index of the channel.
+        reverse: Latest message first.
+        counters: Count what is read.
+    """
+
+    channels: list[RecordedChannel]
+    scans: list[RecordingScan]
+    clock: Clock = "log"
+    selector: Selector | None = None
+    filters: Mapping[int, MessageFilter] = field(default_factory=dict)
+    reverse: bool = False
+    counters: Counters = field(default_factory=Counters)
+
+    def tasks(self) -> list[ChunkTask]:
+        """The chunks to read, in the order of the scan."""
+        found = []
+        for scan in self.scans:
+            for chunk in scan.chunks:
+                span = chunk.span(scan.channels)
+                if span is not None and scan.touches(*span):
+                    count = sum(s.messages for c, s in chunk.stats.items() if c in scan.channels)
+                    found.append(ChunkTask(scan, chunk, *span, count))
+        if self.reverse:
+            return sorted(found, key=lambda t: (-t.last, t.key))
+        return sorted(found, key=lambda t: (t.first, t.key))
+
+
+class ChunkScan:
+    """Carries out a plan.
+
+    Args:
+        plan: What to read.
+        reader_of: Gives the reader of a segment, by recording id and number.
+        ahead: Whether to read ahead; a caller that takes a few messages need not.
+    """
+
+    def __init__(
+        self,
+        plan: ScanPlan,
+        reader_of: Callable[[str, int], SegmentReader],
+        *,
+        ahead: bool = True,
+    ) -> None:
+        self._plan = plan
+        self._reader_of = reader_of
+        self._reads_ahead = ahead
+
+    def runs(self) -> Iterator[MessageRun]:
+        """All messages, in order."""
+        started = time.monotonic()
+        plan = self._plan
+        waiting: list[MessageRun] = []
+        try:
+            for run, following in self._loaded():
+                if len(run.batch):
+                    waiting.append(run)
+                ready, waiting = self._split(waiting, following)
+                if ready:
+                    whole = _in_order(ready, plan)
+                    plan.counters.elapsed_s = time.monotonic() - started
+                    yield whole
+        finally:
+            plan.counters.elapsed_s = time.monotonic() - started
+
+    def unordered(self) -> Iterator[MessageRun]:
+        """All messages, one large chunk or many small ones at a time, in no order."""
+        plan = self._plan
+        started = time.monotonic()
+        small: list[MessageRun] = []
+        size = 0
+        for run, _ in self._loaded():
+            if not len(run.batch):
+                continue
+            length = len(run.batch.buffer)
+            if small and (length > _SMALL_CHUNK_BYTES or size + length > _MERGED_BYTES):
+                yield _merged(small)
+                small, size = [], 0
+            if length > _SMALL_CHUNK_BYTES:
+                yield run
+                continue
+            small.append(run)
+            size += length
+        if small:
+            yield _merged(small)
+        plan.counters.elapsed_s = time.monotonic() - started
+
+    def _selected(self, tasks: list[ChunkTask]) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+        """Leave out the chunks that hold no candidate."""
+        selector = self._plan.selector
+        if selector is None:
+            yield from ((task, None) for task in tasks)
+            return
+        for group in _groups(tasks):
+            selection = selector(group)
+            for task in group:
+                held = (index for c, index in task.scan.channels.items() if c in task.chunk.stats)
+                if task.key in selection.offsets or any(c in selection.unindexed for c in held):
+                    yield task, selection
+
+    def _loaded(self) -> Iterator[tuple[MessageRun, ChunkTask | None]]:
+        """The wanted messages of each chunk, and the chunk after it."""
+        tasks = self._plan.tasks()
+        size = sum(task.chunk.length for task in tasks)
+        if size < _MIN_THREADED_BYTES or not self._reads_ahead:
+            yield from self._ahead(tasks, lambda *item: _Deferred(partial(self._load, *item)))
+            return
+        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
+            try:
+                yield from self._ahead(tasks, lambda *item: pool.submit(self._load, *item))
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    def _ahead(
+        self,
+        tasks: list[ChunkTask],
+        start: Callable[[ChunkTask, RowSelection | None], _Loading],
+    ) -> Iterator[tuple[MessageRun, ChunkTask | None]]:
+        counters = self._plan.counters
+        loading: deque[tuple[ChunkTask, _Loading]] = deque()
+        upcoming = self._selected(tasks)
+        while True:
+            while len(loading) < _LOOK_AHEAD:
+                item = next(upcoming, None)
+                if item is None:
+                    break
+                loading.append((item[0], start(*item)))
+            if not loading:
+                return
+            run, size, unreadable = loading.popleft()[1].result()
+            counters.chunks_read += 1
+            counters.bytes_read += size
+            counters.unreadable += unreadable
+            yield run, loading[0][0] if loading else None
+
+    def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
+        entry = task.chunk
+        reader = self._reader_of(task.scan.recording.id, entry.segment)
+        chunk = reader.read_chunk(entry.place)
+        run = self._wanted(task, chunk, selection)
+        run, unreadable = self._filtered(run)
+        return run, chunk.length + chunk.trailer, unreadable
+
+    def _wanted(
+        self, task: ChunkTask, chunk: StoredChunk, selection: RowSelection | None
+    ) -> MessageRun:
+        batch, seq = chunk.batch, chunk.seq
+        table = np.full(int(batch.channel.max()) + 1, -1, np.int32)
+        for channel_id, index in task.scan.channels.items():
+            if channel_id < len(table):
+                table[channel_id] = index
+        channel = table[batch.channel]
+        mask = channel >= 0
+        if selection is not None:
+            mask &= _is_selected(selection, task.key, batch, channel)
+        bounds = task.scan.bounds
+        if bounds is not None:
+            mask &= self._inside(batch, channel, mask, bounds)
+        windows = task.scan.windows
+        if windows is not None:
+            place = np.searchsorted(windows[:, 1], batch.log_time, "right")
+            begins = np.append(windows[:, 0], TIME_LIMIT - 1)
+            mask &= begins[place] <= batch.log_time
+        if mask.all():
+            batch.channel = channel
+            return MessageRun(batch, seq)
+        rows = np.flatnonzero(mask)
+        own = batch.take(rows)
+        own.channel = channel[rows]
+        return MessageRun(own, seq[rows])
+
+    def _filtered(self, run: MessageRun) -> tuple[MessageRun, int]:
+        """The messages that satisfy the predicate, and how many could not be read."""
+        filters = self._plan.filters
+        if not filters or not len(run.batch):
+            return run, 0
+        holds = np.ones(len(run.batch), np.bool_)
+        unreadable = 0
+        for index in distinct(run.batch.channel).tolist():
+            if index in filters:
+                rows = np.flatnonzero(run.batch.channel == index)
+                channel = self._plan.channels[index]
+                found = filters[index].matches(channel, run.take(rows))
+                holds[rows] = found.holds
+                unreadable += found.unreadable
+        return (run if holds.all() else run.take(holds)), unreadable
+
+    def _inside(
+        self,
+        batch: Batch,
+        channel: NDArray[np.int32],
+        mask: NDArray[np.bool_],
+        bounds: Span,
+    ) -> NDArray[np.bool_]:
+        begin, end = bounds
+        if self._plan.clock == "log":
+            times = batch.log_time
+        elif self._plan.clock == "publish":
+            times = batch.publish_time
+        else:
+            times = np.full(len(batch), -1, np.int64)
+            for index in distinct(channel[mask]).tolist():
+                rows = np.flatnonzero(mask & (channel == index))
+                part = batch.take(rows)
+                decoded = self._plan.channels[index].codec.columns(
+                    part.buffer, part.offset, part.length, {STAMP}
+                )
+                stamps = header_stamps(decoded.records)
+                if stamps is not None:
+                    times[rows[decoded.rows]] = stamps
+        return (times >= begin) & (times < end)
+
+    def _split(
+        self, waiting: list[MessageRun], following: ChunkTask | None
+    ) -> tuple[list[MessageRun], list[MessageRun]]:
+        """The messages that no later chunk can precede, and the rest."""
+        if following is None:
+            return waiting, []
+        ready, rest = [], []
+        for run in waiting:
+            times = run.batch.log_time
+            now = times > following.last if self._plan.reverse else times < following.first
+            if now.all():
+                ready.append(run)
+            elif now.any():
+                ready.append(run.take(now))
+                rest.append(run.take(~now))
+            else:
+                rest.append(run)
+        return ready, rest
+
+
+_Loaded = tuple[MessageRun, int, int]
+"""Messages, bytes read, messages that the predicate could not be asked of."""
+
+
+class _Loading(Protocol):
+    """A chunk on its way."""
+
+    def result(self) -> _Loaded: ...
+
+
+@dataclass(slots=True)
+class _Deferred:
+    """A chunk that is read when its result is asked for."""
+
+    load: Callable[[], _Loaded]
+
+    def result(self) -> _Loaded:
+        return self.load()
+
+
+def _is_selected(
+    selection: RowSelection, key: ChunkKey, batch: Batch, channel: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    mask = np.isin(channel, list(selection.unindexed))
+    offsets = selection.offsets.get(key)
+    if offsets is not None and len(offsets):
+        at = np.minimum(np.searchsorted(offsets, batch.offset), len(offsets) - 1)
+        mask |= offsets[at] == batch.offset
+    return mask
+
+
+def _merged(runs: list[MessageRun]) -> MessageRun:
+    """Several runs as one: decoding each alone costs more than copying it."""
+    return MessageRun(joined([r.batch for r in runs]), np.concatenate([r.seq for r in runs]))
+
+
+def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
+    """Merge runs, sorted by log time, recording and arrival."""
+    if len(runs) == 1 and not plan.reverse and _is_in_order(runs[0]):
+        return runs[0]
+    keys = np.array([int(channel.recording.key, 16) for channel in plan.channels], np.uint64)
+    times = np.concatenate([r.batch.log_time for r in runs])
+    channels = np.concatenate([r.batch.channel for r in runs])
+    seq = np.concatenate([r.seq for r in runs])
+    order = np.lexsort((seq, keys[channels], times))
+    if plan.reverse:
+        order = order[::-1]
+    if len(runs) == 1:
+        return runs[0].take(order)
+    return MessageRun(interleave([r.batch for r in runs], order), seq[order])
+
+
+def _is_in_order(run: MessageRun) -> bool:
+    """Whether a run of one chunk is sorted; strictly rising log times suffice."""
+    return bool((run.batch.log_time[1:] > run.batch.log_time[:-1]).all())
+
+
+def _groups(tasks: list[ChunkTask], limit: int = 50_000) -> Iterator[list[ChunkTask]]:
+    """Runs of chunks whose messages are selected with one query."""
+    group: list[ChunkTask] = []
+    messages = 0
+    for task in tasks:
+        group.append(task)
+        messages += task.messages
+        if messages >= limit:
+            yield group
+            group, messages = [], 0
+    if group:
+        yield group

@@ -1,0 +1,64 @@
+"""Counts the cost of an answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Batch
+
+
+@dataclass(slots=True)
+class Counters:
+    """The cost of an answer, and what it lacks.
+
+    Attributes:
+        messages: Messages in the answer.
+        payload_bytes: Bytes of their payloads.
+        bytes_read: Bytes read from segments and tables.
+        chunks_read: Chunks read and decompressed.
+        documents_read: Index documents received from MongoDB.
+        reduced: Messages left out because only their fields were recorded.
+        unreadable: Messages a predicate was asked of that do not fit their definition.
+        elapsed_s: Wall time, seconds.
+    """
+
+    messages: int = 0
+    payload_bytes: int = 0
+    bytes_read: int = 0
+    chunks_read: int = 0
+    documents_read: int = 0
+    reduced: int = 0
+    unreadable: int = 0
+    elapsed_s: float = 0.0
+
+    def reset(self) -> None:
+        """Set every counter to zero."""
+        for each in fields(self):
+            setattr(self, each.name, each.default)
+
+    def add(self, other: Counters) -> None:
+        """Add the counts of a part of the answer; the wall time stays."""
+        for each in fields(self):
+            if each.name != "elapsed_s":
+                total = getattr(self, each.name) + getattr(other, each.name)
+                setattr(self, each.name, total)
+
+    def add_messages(self, batch: Batch) -> None:
+        """Count messages that go into the answer."""
+        self.messages += len(batch)
+        self.payload_bytes += batch.payload_bytes
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Start at zero and measure the wall time of the block."""
+        self.reset()
+        started = time.monotonic()
+        try:
+            yield
+        finally:
+            self.elapsed_s = time.monotonic() - started

@@ -1,0 +1,126 @@
+"""Answers by reading and decoding messages."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.indexing import rows_by_channel
+from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
+from hybridlog.query.engines.base import Need, Outcomes, Values
+from hybridlog.query.message_filter import MessageFilter, can_decide
+
+if TYPE_CHECKING:
+    from hybridlog.query.chunk_scan import ChunkTask
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog.session import Session
+
+_START_S = 1e-3  # seconds to begin
+_BYTE_S = 2e-9  # seconds to read and decompress a byte
+_MESSAGE_S = 1.5e-6  # seconds to decode a message by columns
+
+
+class PayloadScan:
+    """Reads the chunks of the parts; needs nothing but the segments.
+
+    Args:
+        session: The open store.
+        counters: Count what is read.
+    """
+
+    def __init__(self, session: Session, counters: Counters) -> None:
+        self._session = session
+        self._counters = counters
+
+    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:  # noqa: ARG002
+        """By bytes and messages; None if only MongoDB understands the predicate."""
+        if part.predicate is not None and not can_decide(part.predicate):
+            return None
+        size = sum(stats.payload_bytes for stats in part.stats)
+        each = _BYTE_S * size + _MESSAGE_S * part.messages
+        return _START_S + part.share * each
+
+    def count(self, parts: Sequence[Part]) -> int:
+        """Read the messages and count those that match."""
+        scan = ChunkScan(self.plan(parts), self._session.segment)
+        return sum(len(run.batch) for run in scan.unordered())
+
+    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+        """Read the messages in order and decide on each."""
+        plan = self.plan([part], filtered=False)
+        decide = _filter_of(part)
+        for run in ChunkScan(plan, self._session.segment).runs():
+            holds = np.ones(len(run.batch), np.bool_)
+            if decide is not None:
+                for index, rows in rows_by_channel(run.batch.channel):
+                    found = decide.matches(plan.channels[index], run.take(rows))
+                    holds[rows] = found.holds
+                    self._counters.unreadable += found.unreadable
+            yield Outcomes(run.batch.log_time, run.seq, holds)
+
+    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+        """Read the messages that match in order and decode the fields."""
+        plan = self.plan([part])
+        for run in ChunkScan(plan, self._session.segment).runs():
+            changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
+            for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
+                channel = plan.channels[int(own.batch.channel[0])]
+                if channel.is_reduced:
+                    self._counters.reduced += len(own.batch)
+                    continue
+                decoded = channel.codec.arrow(
+                    own.batch.buffer, own.batch.offset, own.batch.length, fields
+                )
+                good = decoded.rows
+                yield Values(own.batch.log_time[good], own.seq[good], decoded.records)
+
+    def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:  # noqa: ARG002
+        """Nothing is known before the messages are read."""
+        return RowSelection({})
+
+    def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
+        """What to read for some parts.
+
+        Args:
+            parts: Of one question.
+            filtered: Whether only messages that match are wanted.
+        """
+        channels: list[RecordedChannel] = []
+        filters: dict[int, MessageFilter] = {}
+        of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
+        for part in parts:
+            _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
+            decide = _filter_of(part) if filtered else None
+            for channel in part.channels:
+                indexes[channel.channel_id] = len(channels)
+                if decide is not None:
+                    filters[len(channels)] = decide
+                channels.append(channel)
+        scans = [self._scan(part, indexes) for part, indexes in of_recording.values()]
+        clock = parts[0].clock if parts else "log"
+        return ScanPlan(channels, scans, clock, filters=filters, counters=self._counters)
+
+    def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
+        """The chunks of a recording that may hold what is wanted."""
+        bounds, clock = part.bounds, part.clock
+        if part.windows is not None and part.is_by_log_time:
+            windows = part.log_windows
+            bounds, clock = (0, 0), "log"
+            if len(windows):
+                bounds = int(windows[0, 0]), int(windows[-1, 1])
+        is_empty = bounds is not None and bounds[0] >= bounds[1]
+        chunks = (
+            []
+            if is_empty
+            else self._session.chunks(part.recording, list(indexes), bounds, clock)
+        )
+        return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
+
+
+def _filter_of(part: Part) -> MessageFilter | None:
+    if part.predicate is None:
+        return None
+    return MessageFilter(part.predicate, part.field_types)

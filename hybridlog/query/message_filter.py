@@ -1,0 +1,160 @@
+"""Decides a predicate on messages that were read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.tree import And, Not, Opaque, Or, Predicate
+from hybridlog_storage.errors import DefinitionError, PayloadError, WhereError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.predicate.tree import Node
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog_storage.messages import Batch
+
+
+_ONLY_INDEXED = ("_meta.inserted_at", "_meta.error", "_meta.ref")
+"""Values that stand in index documents and not in messages."""
+
+
+def can_decide(predicate: Predicate) -> bool:
+    """Whether the messages alone decide a predicate, without MongoDB."""
+    if any(path.startswith(_ONLY_INDEXED) for path in predicate.fields()):
+        return False
+    return not _has_opaque(predicate.root)
+
+
+def residual(predicate: Predicate) -> Predicate | None:
+    """The part of a predicate that messages decide when MongoDB has decided the rest.
+
+    Raises:
+        WhereError: a part that only MongoDB understands is joined to one that it may get
+            wrong by something else than *and*.
+    """
+    items = predicate.root.items if isinstance(predicate.root, And) else (predicate.root,)
+    left = [item for item in items if not isinstance(item, Opaque)]
+    if any(map(_has_opaque, left)):
+        raise WhereError(
+            "This filter mixes operators that only MongoDB understands with conditions that it "
+            "does not answer exactly, such as regular expressions: join them with $and."
+        )
+    if not left:
+        return None
+    return Predicate(left[0] if len(left) == 1 else And(tuple(left)), predicate.text)
+
+
+def _has_opaque(node: Node) -> bool:
+    if isinstance(node, Opaque):
+        return True
+    if isinstance(node, Not):
+        return _has_opaque(node.item)
+    return isinstance(node, And | Or) and any(map(_has_opaque, node.items))
+
+
+class Matches(NamedTuple):
+    """The outcome for some messages.
+
+    Attributes:
+        holds: bool[n], whether the predicate holds.
+        unreadable: How many do not fit their definition, so that they have no fields.
+    """
+
+    holds: NDArray[np.bool_]
+    unreadable: int
+
+
+class MessageFilter:
+    """Decides one predicate on decoded messages. Thread safe.
+
+    Args:
+        predicate: The condition.
+        types: Types of the fields by path; None where no definition fixes them.
+    """
+
+    def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:
+        self._predicate = predicate
+        self._types = types
+        self._test = to_bool(predicate.root, types)
+        self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
+
+    def matches(self, channel: RecordedChannel, run: MessageRun) -> Matches:
+        """Decide on messages of one channel."""
+        if channel.is_reduced or not channel.codec.indexed:
+            return self._one_by_one(channel, run, np.arange(len(run.batch)))
+        from hybridlog.query.predicate.to_mask import to_mask
+
+        batch = run.batch
+        decoded = channel.codec.arrow(
+            batch.buffer, batch.offset, batch.length, self._fields - {"_meta"}
+        )
+        records = decoded.records
+        if "_meta" in self._fields:
+            records = _with_meta(records, channel, run.take(decoded.rows))
+        mask = to_mask(self._predicate.root, self._types, records)
+        if mask is None:
+            return self._one_by_one(channel, run, np.arange(len(batch)))
+        holds = np.zeros(len(batch), np.bool_)
+        holds[decoded.rows] = mask
+        unreadable = np.setdiff1d(np.arange(len(batch)), decoded.rows, assume_unique=True)
+        if len(unreadable):
+            rest = self._one_by_one(channel, run, unreadable)
+            holds[unreadable] = rest.holds[unreadable]
+        return Matches(holds, len(unreadable))
+
+    def _one_by_one(
+        self, channel: RecordedChannel, run: MessageRun, rows: NDArray[np.intp]
+    ) -> Matches:
+        holds = np.zeros(len(run.batch), np.bool_)
+        unreadable = 0
+        for row in rows.tolist():
+            try:
+                fields = dict(channel.codec.plain(run.batch.payload(row)))
+            except (PayloadError, DefinitionError):
+                fields = {}
+                unreadable += 1
+            if "_meta" in self._fields:
+                fields["_meta"] = _meta_of(channel, run.batch, run.seq, row)
+            holds[row] = self._test(fields)
+        return Matches(holds, unreadable)
+
+
+def _meta_of(
+    channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64], row: int
+) -> dict[str, Any]:
+    meta: dict[str, Any] = {
+        "t": int(batch.log_time[row]),
+        "rec": channel.recording.key,
+        "topic": channel.channel.topic,
+        "seq": int(seq[row]),
+    }
+    if channel.channel.has_publish_time:
+        meta["pub"] = int(batch.publish_time[row])
+    return meta
+
+
+def _with_meta(
+    records: pa.StructArray, channel: RecordedChannel, run: MessageRun
+) -> pa.StructArray:
+    """The same records with the fields of `_meta` that a message itself tells."""
+    import pyarrow as pa
+
+    rows = len(run.batch)
+    columns: dict[str, Any] = {
+        "t": pa.array(run.batch.log_time),
+        "rec": pa.array([channel.recording.key] * rows, pa.string()),
+        "topic": pa.array([channel.channel.topic] * rows, pa.string()),
+        "seq": pa.array(run.seq),
+    }
+    if channel.channel.has_publish_time:
+        columns["pub"] = pa.array(run.batch.publish_time)
+    meta = pa.StructArray.from_arrays(list(columns.values()), names=list(columns))
+    names = [field.name for field in records.type]
+    return pa.StructArray.from_arrays([*records.flatten(), meta], names=[*names, "_meta"])

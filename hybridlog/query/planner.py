@@ -1,0 +1,312 @@
+"""Splits a question into parts and chooses an engine for each.
+
+This is the only place that chooses. A part is one topic of one recording: an ended, a
+running and a damaged recording may need different engines. Each engine tells what its
+answer would cost; the cheapest one answers, and if it fails, the next one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from hybridlog.indexing import STAMP
+from hybridlog.query.chunk_scan import ChunkScan, ChunkKey, MessageRun, RowSelection
+from hybridlog.query.engines.base import Need
+from hybridlog.query.engines.chunk_index import ChunkIndex
+from hybridlog.query.engines.mongo import Mongo
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.statistics import Statistics
+from hybridlog.query.message_filter import MessageFilter, can_decide, residual
+from hybridlog.query.question import Part
+from hybridlog.query.ranges import RangeResolver
+from hybridlog_storage.errors import (
+    DatabaseError,
+    IndexChangedError,
+    SegmentError,
+    TopicError,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.engines.base import Engine, Outcomes, Values
+    from hybridlog.query.question import Question, RecordedChannel
+    from hybridlog.session import Session
+
+_READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
+_T = TypeVar("_T")
+_RETRIED = (DatabaseError, IndexChangedError, SegmentError)
+"""Failures of one engine that another engine may not have."""
+
+
+class Planner:
+    """Answers one question.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Count what the answer costs.
+    """
+
+    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+        self.session = session
+        self.question = question
+        self.counters = counters
+        self._ranges = RangeResolver(session, question)
+        self._mongo = Mongo(session, counters)
+        self._scan = PayloadScan(session, counters)
+        self._engines: tuple[Engine, ...] = (
+            Statistics(),
+            ChunkIndex(session, counters),
+            self._mongo,
+            self._scan,
+        )
+
+    def parts(self) -> list[Part]:
+        """The question, split by recording and topic; recordings oldest first.
+
+        Raises:
+            TimeError: the time range is empty, or outside of all recordings.
+            TopicError: a topic does not have the clock that was asked for.
+        """
+        wanted = set(self.question.topics)
+        found = []
+        for recording, bounds, windows in self._ranges.resolve():
+            by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
+            for channel in self.session.channels(recording):
+                if channel.channel.topic in wanted:
+                    self._check_clock(channel)
+                    by_topic[channel.channel.topic].append(channel)
+            found.extend(
+                Part(
+                    recording,
+                    topic,
+                    tuple(channels),
+                    bounds,
+                    self.question.clock,
+                    windows,
+                    self.question.predicate,
+                )
+                for topic, channels in by_topic.items()
+            )
+        return found
+
+    def channels(self) -> list[RecordedChannel]:
+        """Every channel that the question is about."""
+        wanted = set(self.question.topics)
+        return [
+            channel
+            for entry in self.session.chosen(self.question.recordings)
+            for channel in self.session.channels(entry)
+            if channel.channel.topic in wanted
+        ]
+
+    # Answers.
+
+    def count(self) -> int:
+        """Number of messages in the answer; payloads are read only if nothing else can tell."""
+        every = self.question.every
+        by_topic: dict[str, list[Part]] = defaultdict(list)
+        for part in self.parts():
+            by_topic[part.topic].append(part)
+        if every == 1:
+            total = self._count([part for parts in by_topic.values() for part in parts])
+        else:
+            total = sum(-(-self._count(parts) // every) for parts in by_topic.values())
+        limit = self.question.limit
+        return total if limit is None else min(total, limit)
+
+    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+        """For each message of a part, whether it matches, in order."""
+        return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
+
+    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+        """Fields of the messages of a part that match, in order."""
+        return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
+
+    def runs(self, plan: ScanPlan | None = None) -> Iterator[MessageRun]:
+        """The messages of the answer, in order.
+
+        Args:
+            plan: What `scan_plan` gave, for a caller that needs its channels.
+        """
+        question = self.question
+        if question.limit == 0:
+            return
+        plan = plan or self.scan_plan()
+        ahead = question.limit is None or question.limit > _READ_AHEAD_FROM
+        runs = ChunkScan(plan, self.session.segment, ahead=ahead).runs()
+        for run in runs if question.returns_all else _thinned(runs, plan, question):
+            self.counters.add_messages(run.batch)
+            yield run
+
+    def unordered(self, plan: ScanPlan) -> Iterator[MessageRun]:
+        """The messages of an answer without `limit` and `every`, in no order."""
+        for run in ChunkScan(plan, self.session.segment).unordered():
+            self.counters.add_messages(run.batch)
+            yield run
+
+    def scan_plan(self) -> ScanPlan:
+        """What to read for the messages of the answer."""
+        return self._plan_of(self.parts())
+
+    def _plan_of(self, parts: Sequence[Part]) -> ScanPlan:
+        plan = self._scan.plan(parts, filtered=False)
+        plan.reverse = self.question.reverse
+        if self.question.predicate is None or not parts:
+            return plan
+        selecting: dict[int, list[Part]] = defaultdict(list)
+        unindexed: set[int] = set()
+        filters: dict[int, MessageFilter] = {}
+        place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
+        for part in parts:
+            engine = self._choose(part, Need.SELECTION)[0]
+            indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
+            if engine is self._scan:
+                unindexed.update(indexes)
+                decide = part.predicate
+            else:
+                selecting[self._engines.index(engine)].append(part)
+                decide = self._undecided(part) if engine is self._mongo else None
+            if decide is not None:
+                filters.update(dict.fromkeys(indexes, MessageFilter(decide, part.field_types)))
+        plan.filters = filters
+
+        def select(tasks: Sequence[ChunkTask]) -> RowSelection:
+            offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
+            for number, chosen in selecting.items():
+                for key, rows in self._engines[number].select(chosen, tasks).offsets.items():
+                    offsets[key].append(rows)
+            merged = {key: np.sort(np.concatenate(rows)) for key, rows in offsets.items()}
+            return RowSelection(merged, unindexed)
+
+        plan.selector = select if selecting else None
+        return plan
+
+    def _undecided(self, part: Part) -> object:
+        """The share of a part's predicate that MongoDB does not decide exactly."""
+        assert part.predicate is not None
+        return None if self._mongo.filter_of(part).is_exact else residual(part.predicate)
+
+    # Choosing.
+
+    def _choose(self, part: Part, need: Need, fields: Collection[str] = ()) -> list[Engine]:
+        """The engines that can answer, the cheapest first.
+
+        Raises:
+            DatabaseError: only MongoDB can, and it is unavailable.
+        """
+        costs = [(engine.cost(part, need, fields), engine) for engine in self._engines]
+        able = sorted(
+            ((cost, number) for number, (cost, _) in enumerate(costs) if cost is not None),
+        )
+        if not able:
+            self.session.database_for("A MongoDB filter")
+            raise DatabaseError("No engine answers this question.")
+        return [costs[number][1] for _, number in able]
+
+    def _count(self, parts: Sequence[Part]) -> int:
+        groups: dict[int, list[Part]] = defaultdict(list)
+        narrowed: list[Part] = []
+        for part in parts:
+            if self._is_narrowed(part):
+                narrowed.append(part)
+                continue
+            engine = self._choose(part, Need.COUNT)[0]
+            groups[self._engines.index(engine)].append(part)
+        total = 0
+        for number, group in groups.items():
+            try:
+                total += self._engines[number].count(group)
+            except _RETRIED:
+                total += sum(self._count_otherwise(part, number) for part in group)
+        if narrowed:
+            scan = ChunkScan(self._plan_of(narrowed), self.session.segment)
+            total += sum(len(run.batch) for run in scan.unordered())
+        return total
+
+    def _is_narrowed(self, part: Part) -> bool:
+        """Whether MongoDB finds candidates, and the messages decide."""
+        if part.predicate is None or self.session.database is None:
+            return False
+        best = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
+        return best in ([], [self._scan]) and not self._mongo.filter_of(part).is_exact
+
+    def _count_otherwise(self, part: Part, failed: int) -> int:
+        """The count of an engine that failed, by the next ones."""
+        others = [e for e in self._choose(part, Need.COUNT) if e is not self._engines[failed]]
+        failure: Exception | None = None
+        for engine in others:
+            try:
+                return engine.count([part])
+            except _RETRIED as error:
+                failure = failure or error
+        if failure is not None:
+            raise failure
+        return self._engines[failed].count([part])
+
+    def _first(
+        self,
+        part: Part,
+        need: Need,
+        ask: Callable[[Engine], Iterator[_T]],
+        fields: Collection[str] = (),
+    ) -> Iterator[_T]:
+        """Items of the cheapest engine; of the next one if it fails before its first item."""
+        failure: Exception | None = None
+        for engine in self._choose(part, need, fields):
+            found = ask(engine)
+            try:
+                first = next(found, None)
+            except _RETRIED as error:
+                failure = failure or error
+                continue
+            if first is not None:
+                yield first
+                yield from found
+            return
+        assert failure is not None
+        raise failure
+
+    def _check_clock(self, channel: RecordedChannel) -> None:
+        if self.question.bounds is None or channel.is_reduced:
+            return
+        topic, clock = channel.channel.topic, self.question.clock
+        if clock == "header" and not any(p.path == STAMP for p in channel.codec.paths()):
+            raise TopicError(f"{topic} has no {STAMP}: use the log clock, or another topic.")
+        if clock == "publish" and not channel.channel.has_publish_time:
+            raise TopicError(
+                f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
+            )
+
+
+def _thinned(
+    runs: Iterator[MessageRun], plan: ScanPlan, question: Question
+) -> Iterator[MessageRun]:
+    """Every n-th message of each topic, up to the limit."""
+    number = {topic: n for n, topic in enumerate(question.topics)}
+    topic_of = np.array([number[c.channel.topic] for c in plan.channels], np.intp)
+    seen = np.zeros(len(number), np.int64)
+    given = 0
+    for run in runs:
+        keep = np.ones(len(run.batch), np.bool_)
+        if question.every > 1:
+            topics = topic_of[run.batch.channel]
+            for topic in np.unique(topics).tolist():
+                rows = np.flatnonzero(topics == topic)
+                keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
+                seen[topic] += len(rows)
+        rows = np.flatnonzero(keep)
+        if question.limit is not None:
+            rows = rows[: question.limit - given]
+        given += len(rows)
+        if len(rows):
+            yield run if len(rows) == len(run.batch) else run.take(rows)
+        if question.limit is not None and given >= question.limit:
+            return

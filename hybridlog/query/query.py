@@ -1,0 +1,500 @@
+"""The question that a user holds: built step by step, answered when it is looked at.
+
+```python
+scans = store.topic("scan").between("+10s", "+11s").where("ranges.min < 0.5")
+for message in scans: ...
+frame = scans.to_pandas()
+```
+
+Each step gives a new query; nothing is read before the answer is asked for. `counters`
+then tells what the answer has cost.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from hybridlog.message import messages_in
+from hybridlog.query.answers.last_message import just_before, message_at
+from hybridlog.query.answers.latched import in_force
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.predicate.from_mongo import from_mongo
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.question import Clock, Question
+from hybridlog.query.ranges import RangeResolver
+from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog.query.intervals import Intervals
+    from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.times import DurationLike, TimeLike
+    from hybridlog.session import Session
+    from hybridlog_storage.messages import Batch
+
+_NUMBERS = {
+    "bool", "byte", "char", "float32", "float64",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}  # fmt: skip
+
+
+class Query:
+    """A question about some topics of an open store. Immutable: each step gives a new one.
+
+    Args:
+        session: The open store.
+        question: The question.
+
+    Attributes:
+        question: The question, as a value that can be compared, hashed and pickled.
+        counters: What the last answer has cost.
+    """
+
+    def __init__(self, session: Session, question: Question) -> None:
+        self.question = question
+        self.counters = Counters()
+        self._session = session
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.topics[:3]) + (", …" if len(self.topics) > 3 else "")
+        parts = [names, f"{len(self.question.recordings)} recordings"]
+        if self.question.bounds is not None:
+            parts.append(f"between {self.question.bounds[0]} and {self.question.bounds[1]}")
+        if self.question.predicate is not None:
+            parts.append(f"where {self.question.predicate}")
+        return f"<Query {'; '.join(parts)}>"
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Full names of the topics."""
+        return self.question.topics
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Ids of the recordings."""
+        return self.question.recordings
+
+    # Steps.
+
+    def copy(self) -> Query:
+        """The same question with counters of its own."""
+        return Query(self._session, self.question)
+
+    def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
+        """Only messages with `begin <= time < end`.
+
+        Args:
+            begin: An int is nanoseconds since the epoch, a float seconds; text is ISO 8601,
+                or relative to each recording (`+5s`, `-10s`); None for its start.
+            end: The same; None for its end.
+        """
+        return self._with(bounds=(begin, end))
+
+    def clock(self, clock: str) -> Query:
+        """The time that `between` refers to: `log` (default), `publish` or `header`.
+
+        Raises:
+            UsageError: another word.
+        """
+        if clock not in {"log", "publish", "header"}:
+            raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
+        return self._with(clock=cast(Clock, clock))
+
+    def where(self, predicate: str | Mapping[str, object]) -> Query:
+        """Only messages that satisfy a predicate; several are joined by *and*.
+
+        Args:
+            predicate: `"ranges.min < 0.5 and header.frame_id == 'laser'"`, or a MongoDB
+                filter.
+
+        Raises:
+            WhereError: it cannot be understood, does not fit the fields, or is not allowed.
+        """
+        if isinstance(predicate, str):
+            checked = self._session.predicate(predicate, self.topics, self.recordings)
+        else:
+            checked = from_mongo(predicate)
+        if self.question.predicate is not None:
+            checked = self.question.predicate & checked
+        return self._with(predicate=checked or None)
+
+    def limit(self, count: int) -> Query:
+        """At most this many messages.
+
+        Raises:
+            UsageError: a negative number.
+        """
+        if count < 0:
+            raise UsageError("A limit cannot be negative.")
+        return self._with(limit=count)
+
+    def every(self, step: int) -> Query:
+        """Only every n-th message of each topic, beginning with the first.
+
+        Raises:
+            UsageError: less than one.
+        """
+        if step < 1:
+            raise UsageError("every(n) needs n of at least 1.")
+        return self._with(every=step)
+
+    def reverse(self) -> Query:
+        """Latest message first."""
+        return self._with(reverse=not self.question.reverse)
+
+    def fields(self, *paths: str) -> Query:
+        """Only these fields in tables (`header.stamp`, `pose.position`).
+
+        Raises:
+            TopicError: no topic of the query has such a field.
+        """
+        known = self.field_types()
+        for path in paths:
+            if known and not _is_field(path, known):
+                raise TopicError(_no_field(path, known, self.topics))
+        return self._with(fields=tuple(paths))
+
+    def in_recording(self, *names: str) -> Query:
+        """Only these recordings, by label, name or id.
+
+        Raises:
+            TopicError: there is no such recording, or it lacks the topic.
+        """
+        chosen = [entry.id for entry in self._session.select(names)]
+        return self._on(self.topics, chosen)
+
+    def with_topic(self, topic: str) -> Query:
+        """The same question about one of its topics."""
+        return self._on([topic], self.recordings)
+
+    def during(self, intervals: Intervals) -> Query:
+        """Only messages whose log time is in one of some intervals of their recording.
+
+        A message in several of them is given once. Given twice, both must hold.
+
+        Args:
+            intervals: From `intervals`, `changes` or `windows` of any query of this store, or
+                made by hand; recordings go by id or by label.
+
+        Raises:
+            TopicError: an interval is of a recording that is not in the store.
+        """
+        known = self._session.recordings()
+        ids = {entry.label: entry.id for entry in known} | {entry.id: entry.id for entry in known}
+        intervals = intervals.by_id(ids)
+        if self.question.during is not None:
+            intervals = self.question.during.common(intervals)
+        return self._with(during=intervals.merged())
+
+    def before(self, events: Query, length: DurationLike) -> Query:
+        """Only messages that came at most `length` before an event, in its recording.
+
+        The event's own log time is not part of it: `t - length <= time < t`.
+
+        Args:
+            events: Its messages are the events.
+            length: A duration: `"5min"`, seconds, a `timedelta`.
+
+        Raises:
+            TimeError: `length` is no duration.
+        """
+        return self.during(events.windows(before=length))
+
+    def around(self, events: Query, before: DurationLike = 0, after: DurationLike = 0) -> Query:
+        """Only messages near an event, in its recording: `t - before <= time < t + after`.
+
+        Args:
+            events: Its messages are the events.
+            before: How long before an event it begins, a duration.
+            after: How long after an event it ends, a duration.
+
+        Raises:
+            TimeError: one of both is no duration.
+            UsageError: both are zero.
+        """
+        return self.during(events.windows(before, after))
+
+    def at_time(self, moment: TimeLike) -> Query:
+        """Only the message that was current at a time: the last one not after it.
+
+        Raises:
+            TopicError: there is none.
+            UsageError: the question has a time range, or another clock than log time.
+        """
+        found = self.at(moment)
+        time = found.log_time_ns
+        return Query(self._session, just_before(self.question, found.recording, time, time))
+
+    # Answers.
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages, ordered by log time, recording and arrival."""
+        planner = self._planner()
+        plan = planner.scan_plan()
+        for run in planner.runs(plan):
+            yield from messages_in(plan.channels, run)
+
+    def first(self) -> Message | None:
+        """The first message, None when there is none."""
+        return next(iter(self.limit(1)), None)
+
+    def at(self, moment: TimeLike) -> Message:
+        """The message that `at_time` asks for. Its arrays are read-only: copy to change them.
+
+        Raises:
+            TopicError: there is none.
+            UsageError: the question has a time range, or another clock than log time.
+        """
+        if not self.question.is_unbounded or self.question.clock != "log":
+            raise UsageError(
+                "A message at a time is the last one by log time; `between`, `during` and "
+                "`clock` do not fit."
+            )
+        with self.counters.timed():
+            found = message_at(self._session, self.question, self.counters, moment)
+        if found is None:
+            raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+        return found
+
+    def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """The messages in order, many at once; `batch.channel` indexes the channels.
+
+        Messages that gave up their payload are left out; `counters.reduced` counts them.
+        """
+        planner = self._planner()
+        plan = planner.scan_plan()
+        whole = np.array([not channel.is_reduced for channel in plan.channels], np.bool_)
+        for run in planner.runs(plan):
+            batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
+            self.counters.reduced += len(run.batch) - len(batch)
+            if len(batch):
+                yield batch, plan.channels
+
+    def latched(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """Latched messages from before the time range that are in force when it begins."""
+        return in_force(self._session, self.question, self.counters)
+
+    def count(self) -> int:
+        """Number of messages."""
+        with self.counters.timed():
+            try:
+                found = Planner(self._session, self.question, self.counters).count()
+            except IndexChangedError:
+                # Another process has changed the index: ask once more about what is there now.
+                there = {entry.id for entry in self._session.recordings()}
+                if not there.issuperset(self.recordings):
+                    raise
+                found = Planner(self._session, self.question, self.counters).count()
+            self.counters.messages = found
+        return found
+
+    def intervals(
+        self,
+        at_least: DurationLike | None = None,
+        length: DurationLike | None = None,
+        max_gap: DurationLike | None = None,
+    ) -> Intervals:
+        """When the predicate of `where` holds: the longest intervals in which it does.
+
+        At any time the state is what the last message of the topic by then says (by log
+        time, then arrival); before the first one it is unknown, and no interval. It goes
+        on until the next message, or the end of the recording. The range of `between`
+        cuts intervals off, and what held when it began is known from before. Without
+        `where`, any message holds: with `max_gap`, that is when the topic was alive.
+
+        Args:
+            at_least: Only intervals of at least this length.
+            length: Each interval cut into as many of exactly this length as fit into it,
+                one after the other from its beginning.
+            max_gap: A message is believed for this long; without, until the next one.
+
+        Returns:
+            Their `messages` are those that satisfy the predicate.
+
+        Raises:
+            UsageError: several topics, `limit`, `every`, `reverse`, or another clock than
+                the log's.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        with self.counters.timed():
+            found = self._intervals().states(max_gap)
+        if at_least is not None:
+            found = found.at_least(at_least)
+        return found if length is None else found.cut(length)
+
+    def changes(
+        self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
+    ) -> Intervals:
+        """When fields changed: runs of messages that differ from the one before them.
+
+        A step is a message of which any of the fields differs from that of the message
+        before it, of those that satisfy `where`, in the same recording. Steps with no more
+        than `pause` between them are one change, whatever lies between. A change begins
+        at the log time of its first step, and ends 1 ns after that of its last one.
+
+        Args:
+            fields: Paths (`position`, `position.x`); arrays are compared element by element.
+            pause: Longest time between steps of one change.
+            tolerance: Numbers that differ by at most so much are the same.
+
+        Returns:
+            Their `messages` are the steps.
+
+        Raises:
+            TopicError: there is no such field.
+            UsageError: no field, several topics, `limit`, `every`, `reverse`, or another
+                clock than the log's.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        if not fields:
+            raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
+        self.fields(*fields)  # refuses what there is not
+        with self.counters.timed():
+            return self._intervals().changes(fields, pause, tolerance)
+
+    def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
+        """Time around each message: `t - before <= time < t + after`, within its recording.
+
+        There is one a message, so they may overlap; `during` and `merged` join them.
+
+        Args:
+            before: How long before it the window begins, a duration.
+            after: How long after it the window ends, a duration.
+
+        Raises:
+            TimeError: one of both is no duration.
+            UsageError: both are zero, or `limit` or `every` of several topics.
+        """
+        with self.counters.timed():
+            return self._intervals().windows(before, after)
+
+    def _intervals(self) -> IntervalQueries:
+        from hybridlog.query.answers.interval_queries import IntervalQueries
+
+        return IntervalQueries(self._session, self.question, self.counters)
+
+    def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """In which spans of log time of a recording any message lies.
+
+        Args:
+            recording: Id of the recording.
+            spans: int64[n, 2], begin and end, ns; they may overlap.
+
+        Returns:
+            bool[n].
+
+        Raises:
+            UsageError: the question has `limit` or `every`.
+        """
+        with self.counters.timed():
+            return self._intervals().any_within(recording, spans)
+
+    def documents(self) -> Iterator[dict[str, Any]]:
+        """The index documents in MongoDB, in the order of the messages.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+        """
+        from hybridlog.query.answers.index_documents import index_documents
+
+        self.counters.reset()
+        return index_documents(self._session, self.question, self.counters)
+
+    def to_arrow(self) -> pa.Table:
+        """A table: scalars and strings as columns, arrays as lists, first column log time."""
+        from hybridlog.frames.answer import to_arrow
+
+        return to_arrow(self._planner())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A frame of the same columns, indexed by log time (UTC, ns)."""
+        from hybridlog.frames.answer import to_pandas
+
+        frame = to_pandas(self._planner())
+        frame.attrs["hybridlog"] = asdict(self.counters)
+        return frame
+
+    def to_tables(self) -> Iterator[pa.Table]:
+        """The answer in order, in Arrow tables of bounded size; at least one, perhaps empty."""
+        from hybridlog.frames.answer import stream
+
+        return stream(self._planner())
+
+    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
+        """Every message as an array (`Message.to_numpy`): stacked when all are alike."""
+        arrays: list[NDArray[Any]] = [message.to_numpy() for message in self]
+        alike = {(a.shape, a.dtype) for a in arrays}
+        return np.stack(arrays) if len(alike) == 1 else arrays
+
+    # What is known without asking.
+
+    def channels(self) -> list[RecordedChannel]:
+        """Every channel that the question is about."""
+        return Planner(self._session, self.question, self.counters).channels()
+
+    def field_types(self) -> dict[str, str] | None:
+        """Paths that can be queried and their types; None when a topic has no fixed fields."""
+        return self._session.field_types(self.topics, self.recordings)
+
+    def check_range(self) -> None:
+        """Make sure that the time range meets a recording.
+
+        Raises:
+            TimeError: it is empty, or outside of all recordings.
+        """
+        RangeResolver(self._session, self.question).resolve()
+
+    def size_hint(self) -> int:
+        """Bytes of payload, about: the total of a progress bar."""
+        parts = Planner(self._session, replace(self.question, clock="log"), Counters()).parts()
+        return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
+
+    # How.
+
+    def _with(self, **changes: Any) -> Query:
+        return Query(self._session, replace(self.question, **changes))
+
+    def _on(self, topics: Sequence[str], recordings: Sequence[str]) -> Query:
+        """The same conditions on other topics and recordings."""
+        topics, chosen = self._session.having(topics, recordings)
+        return self._with(topics=topics, recordings=chosen)
+
+    def _planner(self) -> Planner:
+        self.counters.reset()
+        return Planner(self._session, self.question, self.counters)
+
+
+def _is_field(path: str, known: Mapping[str, str]) -> bool:
+    if summary_type(path, known) is not None:
+        return True
+    return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
+
+
+def summary_type(path: str, known: Mapping[str, str]) -> str | None:
+    """Type of a summary of an array of numbers (`ranges.min`), None if a path is none."""
+    array, _, what = path.rpartition(".")
+    element, bracket, _ = known.get(array, "").partition("[")
+    if not bracket or what not in {"n", "min", "max", "mean"} or element not in _NUMBERS:
+        return None
+    if what == "n" or (what != "mean" and not element.startswith("float")):
+        return "int64"
+    return "float64"
+
+
+def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
+    near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
+    return (
+        f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
+        "`hybridlog schema TOPIC` lists them all."
+    )

@@ -1,0 +1,178 @@
+"""The values that describe a question: `Question`, and the `Part`s it is split into."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from hybridlog.query.times import TIME_LIMIT, TimeLike
+from hybridlog.schema.codec import codec_for
+from hybridlog_storage.messages import REDUCED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.intervals import Intervals
+    from hybridlog.query.predicate import Predicate
+    from hybridlog.schema.codec import Codec
+    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+    from hybridlog_storage.messages import Channel
+
+Clock = Literal["log", "publish", "header"]
+Span = tuple[int, int]
+"""`[begin, end)`, nanoseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked. Immutable, hashable and picklable.
+
+    Attributes:
+        topics: Full names of topics.
+        recordings: Ids of recordings.
+        bounds: Time range `[begin, end)` as it was given; None for all times.
+        clock: The clock that `bounds` refers to.
+        predicate: Condition on the fields of a message; None for no condition.
+        limit: Most messages of the answer; None for no limit.
+        every: Keep every n-th message of each topic.
+        reverse: Latest message first.
+        fields: Field paths for tables; None for all.
+        during: Intervals of log time that messages must lie in; None for all times.
+    """
+
+    topics: tuple[str, ...]
+    recordings: tuple[str, ...]
+    bounds: tuple[TimeLike | None, TimeLike | None] | None = None
+    clock: Clock = "log"
+    predicate: Predicate | None = None
+    limit: int | None = None
+    every: int = 1
+    reverse: bool = False
+    fields: tuple[str, ...] | None = None
+    during: Intervals | None = None
+
+    @property
+    def returns_all(self) -> bool:
+        """Whether every matching message is in the answer: neither `limit` nor `every`."""
+        return self.limit is None and self.every == 1
+
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether all times are asked about: neither `between` nor `during`."""
+        return self.bounds is None and self.during is None
+
+    @property
+    def is_by_log_time(self) -> bool:
+        """Whether the time range, if any, refers to log time."""
+        return self.bounds is None or self.clock == "log"
+
+
+@dataclass(frozen=True)
+class RecordedChannel:
+    """One channel of one recording.
+
+    Attributes:
+        recording: The recording.
+        channel_id: Its id in the recording.
+        channel: Topic, type and metadata.
+    """
+
+    recording: RecordingEntry
+    channel_id: int
+    channel: Channel
+
+    @cached_property
+    def codec(self) -> Codec:
+        """Decodes its payloads; made when first used."""
+        return codec_for(self.channel)
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether its messages kept their fields but gave up their payloads."""
+        return self.channel.message_encoding == REDUCED
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The share of a question that concerns one topic of one recording.
+
+    Attributes:
+        recording: The recording.
+        topic: Full name of the topic.
+        channels: The topic's channels.
+        bounds: `[begin, end)` of `clock`, ns; None for all times.
+        clock: The clock of `bounds`.
+        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all times.
+        predicate: Condition on the fields; None for no condition.
+    """
+
+    recording: RecordingEntry
+    topic: str
+    channels: tuple[RecordedChannel, ...]
+    bounds: Span | None
+    clock: Clock
+    windows: NDArray[np.int64] | None
+    predicate: Predicate | None
+
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether it covers all times of the recording."""
+        return self.bounds is None and self.windows is None
+
+    @property
+    def is_by_log_time(self) -> bool:
+        """Whether its bounds, if any, refer to log time."""
+        return self.bounds is None or self.clock == "log"
+
+    @property
+    def stats(self) -> list[ChannelStats]:
+        """Statistics of its channels, without those that have no messages."""
+        wanted = {channel.channel_id for channel in self.channels}
+        return [c.stats for c in self.recording.channels if c.id in wanted]
+
+    @property
+    def messages(self) -> int:
+        """Messages of the topic in the recording, at any time."""
+        return sum(stats.messages for stats in self.stats)
+
+    @cached_property
+    def field_types(self) -> Mapping[str, str] | None:
+        """Types of the fields by path; None where a definition does not fix them."""
+        return field_types(self.channels)
+
+    @cached_property
+    def log_windows(self) -> NDArray[np.int64]:
+        """int64[n, 2]: the log time it covers; bounds of another clock do not narrow it."""
+        low, high = self.bounds if self.bounds and self.clock == "log" else (0, TIME_LIMIT - 1)
+        if self.windows is None:
+            return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
+        cut = np.clip(self.windows, low, high)
+        return cut[cut[:, 1] > cut[:, 0]]
+
+    @property
+    def share(self) -> float:
+        """Fraction of the topic's time that it covers, 0 to 1."""
+        firsts = [s.first for s in self.stats if s.first is not None]
+        lasts = [s.last for s in self.stats if s.last is not None]
+        if not firsts:
+            return 0.0
+        first, end = min(firsts), max(lasts) + 1
+        cut = np.clip(self.log_windows, first, end)
+        return float((cut[:, 1] - cut[:, 0]).sum()) / (end - first)
+
+
+def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
+    """Types of the fields of some channels, by path; None where no definition fixes them."""
+    types: dict[str, str] = {}
+    for channel in channels:
+        if channel.is_reduced:
+            continue  # its fields are those of whole messages
+        paths = channel.codec.paths()
+        if not paths:
+            return None
+        types.update({path.path: path.type for path in paths})
+    return types or None

@@ -1,0 +1,88 @@
+"""Which rows of Arrow columns differ: numbers by value, strings by their bytes, lists by both."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.schema.column import ranges
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Rows = NDArray[np.intp]
+
+
+def rows_differ(
+    column: pa.Array[Any], one: Rows, other: Rows, tolerance: float = 0.0
+) -> NDArray[np.bool_]:
+    """Compare rows of a column with other rows of it.
+
+    NaN equals NaN, -0 equals 0, and null equals null only. Lists of different lengths differ.
+
+    Args:
+        column: The column, nested as it may be.
+        one: intp[n], rows.
+        other: intp[n], the rows that they are compared with.
+        tolerance: Numbers that differ by at most this are the same.
+
+    Returns:
+        bool[n], whether they differ.
+    """
+    kind = column.type
+    if pa.types.is_null(kind):
+        return np.zeros(len(one), np.bool_)
+    valid = np.asarray(column.is_valid())
+    differs: NDArray[np.bool_] = valid[one] != valid[other]
+    there = valid[one] & valid[other]
+    if pa.types.is_struct(kind):
+        for inner in column.flatten():
+            differs |= there & rows_differ(inner, one, other, tolerance)
+        return differs
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        rows = np.flatnonzero(there)
+        differs[rows] = _lists(column, one[rows], other[rows], tolerance)
+        return differs
+    return differs | (there & _values(column, one, other, tolerance))
+
+
+def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> NDArray[np.bool_]:
+    kind = column.type
+    if not (pa.types.is_primitive(kind) and not pa.types.is_decimal(kind)):
+        codes = pc.fill_null(column.dictionary_encode().indices, -1)
+        values = codes.to_numpy(zero_copy_only=False)
+    else:
+        if pa.types.is_temporal(kind):
+            column = column.view(pa.int64())
+        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(  # noqa: FBT003
+            zero_copy_only=False
+        )
+    left, right = values[one], values[other]
+    same = left == right
+    if left.dtype.kind == "f":
+        same |= np.isnan(left) & np.isnan(right)
+    if tolerance and left.dtype.kind in "iuf" and pa.types.is_primitive(kind):
+        with np.errstate(invalid="ignore"):  # inf less inf is no number, and not near
+            same |= np.abs(left.astype(np.float64) - right.astype(np.float64)) <= tolerance
+    differs: NDArray[np.bool_] = ~same
+    return differs
+
+
+def _lists(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> NDArray[np.bool_]:
+    length = pc.fill_null(pc.list_value_length(column), 0).to_numpy(zero_copy_only=False)
+    length = length.astype(np.int64)
+    start = np.cumsum(length) - length  # of the elements that `flatten` keeps
+    elements = column.flatten()
+    count = length[one]
+    found: NDArray[np.bool_] = count != length[other]
+    alike = np.flatnonzero(~found & (count > 0))
+    if len(alike):
+        count = count[alike]
+        differs = rows_differ(
+            elements, ranges(start[one[alike]], count), ranges(start[other[alike]], count), tolerance
+        )
+        found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
+    return found

@@ -1,0 +1,444 @@
+"""What an open store holds: the catalog's snapshot, open files, the index, caches."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.connection import Connection
+from hybridlog.entries import channels_of, take_inventory
+from hybridlog.guarded import Belief, GuardedIndex
+from hybridlog.losses import topics_of
+from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
+from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.query.chunk_lists import ChunkLists, latest_first
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.types import check_types
+from hybridlog.query.question import RecordedChannel, field_types
+from hybridlog.query.recent_chunks import RecentChunks
+from hybridlog.query.topics import resolve
+from hybridlog_storage.errors import (
+    CatalogError,
+    DatabaseError,
+    DiskFullError,
+    HybridlogError,
+    TopicError,
+)
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from hybridlog.query.predicate.tree import Predicate
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+
+_MAX_OPEN_SEGMENTS = 256
+_MAX_MEANINGS = 128  # topic patterns and predicates that are cached
+
+
+class Session:
+    """The state of one open store. Thread safe for reading.
+
+    Args:
+        directory: Where the store lies.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one that
+            the store names.
+        progress: Called while an index is brought up to date.
+
+    Attributes:
+        directory: Where the store lies.
+        catalog: Recordings, channels, chunks and schemas.
+        connection: The connection to MongoDB.
+        repairs: What was repaired when the store was opened.
+        recent_chunks: Chunks that single messages were read from.
+    """
+
+    def __init__(
+        self, directory: StoreDirectory, mongo: str | None, progress: Progress | None
+    ) -> None:
+        self.directory = directory
+        self.connection = Connection(directory, mongo)
+        self.repairs = RepairReport()
+        self.recent_chunks = RecentChunks()
+        self._unavailable: HybridlogError | None = None
+        self._progress = progress
+        self._connecting = threading.RLock()
+        self._is_indexed = False  # the index has all recordings of the snapshot
+        self._recordings: list[RecordingEntry] | None = None
+        self._by_id: dict[str, RecordingEntry] = {}
+        self._belief: Belief | None = None
+        self._schemas: dict[str, Schema] = {}
+        self._channels: dict[str, list[RecordedChannel]] = {}
+        self._segments: dict[tuple[str, int], SegmentReader] = {}
+        self._chunk_lists = ChunkLists()
+        self._lock = threading.Lock()
+        self.catalog = open_catalog(directory)
+        self._remember_meanings()
+        try:
+            self.recordings()
+        except BaseException:
+            self.catalog.close()
+            raise
+
+    # The index.
+
+    @property
+    def connected(self) -> Database | None:
+        """The index, if there is a connection already."""
+        return self.connection.database
+
+    @property
+    def unavailable(self) -> HybridlogError | None:
+        """Why MongoDB cannot be reached; None while that is not known."""
+        return self._unavailable
+
+    @property
+    def database(self) -> Database | None:
+        """The index; connected to when first asked for, None if MongoDB is unavailable."""
+        if self._unavailable is None and not (self.connected is not None and self._is_indexed):
+            with suppress(HybridlogError):
+                self.connect()
+        return self.connected
+
+    def connect(self) -> Database:
+        """Connect to the index and bring it up to date.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+            StoreError: it holds the index of another store, or this store is a copy.
+        """
+        from hybridlog.maintenance import index
+
+        with self._connecting:
+            if self.connected is not None and self._is_indexed:
+                return self.connected
+            try:
+                database = self.connection.open()
+                repairs = RepairReport()
+                has_changed = index.bring_up_to_date(
+                    self.directory,
+                    self.catalog,
+                    database,
+                    self.recordings(),
+                    report=repairs,
+                    progress=self._progress,
+                )
+            except BaseException as error:
+                self.disconnect()
+                if isinstance(error, HybridlogError):
+                    self._unavailable = error
+                raise
+            self._unavailable = None
+            self.repairs.indexed.update(repairs.indexed)
+            self.repairs.unreadable.update(repairs.unreadable)
+            self.repairs.removed += repairs.removed
+            if has_changed:
+                self.invalidate()
+            self._is_indexed = True
+            return database
+
+    def disconnect(self) -> None:
+        """Leave MongoDB; questions are answered from the files then."""
+        self.connection.close()
+        self._belief = None
+
+    def take_over(self) -> None:
+        """Record in the index that the store lies here now."""
+        self._belief = None
+        self.connection.take_over()
+        self._unavailable = None
+
+    def database_for(self, purpose: str) -> Database:
+        """The index.
+
+        Raises:
+            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+        """
+        if self.database is None:
+            raise DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
+        return self.database
+
+    def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
+        """The index, to ask about some recordings.
+
+        Raises:
+            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+            IndexChangedError: another process removes documents of these recordings.
+        """
+        return GuardedIndex(
+            self.database_for(purpose), recordings, self.belief, self.invalidate
+        )
+
+    def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
+        """The state of the index of some recordings, as of the catalog's snapshot.
+
+        Args:
+            database: The index.
+            keys: Keys of the recordings.
+            anew: Ask it now.
+        """
+        found = self._belief = Belief.of(database, keys, None if anew else self._belief)
+        return found
+
+    # The catalog.
+
+    def recordings(self) -> list[RecordingEntry]:
+        """All recordings, oldest first."""
+        if self._recordings is None:
+            try:
+                found = repair_on_open(self.directory, self.catalog, self.repairs)
+            except DiskFullError as error:
+                # The store stays readable, and recordings can be removed.
+                self.repairs.disk_full = error
+                self.catalog.close()
+                self.catalog = open_catalog(self.directory, in_memory=True)
+                found = repair_on_open(self.directory, self.catalog, self.repairs)
+            self._by_id = {entry.id: entry for entry in found}
+            self._recordings = found
+        return self._recordings
+
+    def entry(self, recording: str) -> RecordingEntry:
+        """The entry of a recording, by its id or its label.
+
+        Raises:
+            TopicError: there is none.
+        """
+        everything = self.recordings()
+        found = self._by_id.get(recording)
+        if found is None:
+            found = next((entry for entry in everything if entry.label == recording), None)
+        if found is None:
+            raise TopicError(f"Recording {recording!r} is not in the store any more.")
+        return found
+
+    def chosen(self, ids: Collection[str]) -> list[RecordingEntry]:
+        """The recordings with these ids, oldest first; those that are gone are left out."""
+        wanted = set(ids)
+        return [entry for entry in self.recordings() if entry.id in wanted]
+
+    def select(self, names: Sequence[str]) -> list[RecordingEntry]:
+        """Recordings by label, by name, by id, or by the beginning of one of these.
+
+        Raises:
+            TopicError: there is no such recording, or there are several.
+        """
+        everything = self.recordings()
+        chosen: list[RecordingEntry] = []
+        for given in names:
+            name = self.repairs.copies.get(given, given)
+            found = (
+                [r for r in everything if name in {r.label, r.id}]
+                or [r for r in everything if r.name == name]
+                or [r for r in everything if r.label.startswith(name)]
+                or [r for r in everything if len(name) >= 4 and r.id.startswith(name)]
+            )
+            if len(found) != 1:
+                candidates = ", ".join(r.label for r in (found or everything)[:10]) or "none"
+                problem = "is ambiguous" if found else "is not in the store"
+                raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
+            if found[0] not in chosen:
+                chosen.append(found[0])
+        return chosen
+
+    def topics(self) -> list[str]:
+        """Names of all topics, sorted; also of those whose messages are all lost."""
+        return sorted({topic for r in self.recordings() for topic in topics_of(r)})
+
+    def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
+        """The channels of a recording, with their codecs."""
+        found = self._channels.get(recording.id)
+        if found is None:
+            by_id = self._read_channels(recording)
+            found = [RecordedChannel(recording, i, c) for i, c in sorted(by_id.items())]
+            self._channels[recording.id] = found
+        return found
+
+    def field_types(
+        self, topics: Collection[str], recordings: Collection[str]
+    ) -> dict[str, str] | None:
+        """Types of the fields of some topics, by path; None where no definition fixes them."""
+        return field_types(
+            tuple(
+                channel
+                for entry in self.chosen(recordings)
+                for channel in self.channels(entry)
+                if channel.channel.topic in topics
+            )
+        )
+
+    def having(
+        self, topics: Sequence[str], recordings: Collection[str] | None = None
+    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Topics, and the ids of the recordings that have any of them.
+
+        Args:
+            topics: Full names.
+            recordings: Ids, labels or names; None for all.
+
+        Raises:
+            TopicError: no recording has any of the topics.
+        """
+        wanted = set(topics)
+        named = None if recordings is None else {r.id for r in self.select([*recordings])}
+        chosen = tuple(
+            r.id
+            for r in self.recordings()
+            if (named is None or r.id in named) and not wanted.isdisjoint(topics_of(r))
+        )
+        if wanted and not chosen:
+            raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
+        return tuple(topics), chosen
+
+    def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The topics that patterns name, and the recordings that have them.
+
+        Raises:
+            TopicError: a pattern fits nothing, or several topics; lists the candidates.
+        """
+        return self._resolved(names)
+
+    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        known = self.topics()
+        if not names:
+            listed = "There are: " + ", ".join(known[:20]) if known else "The store is empty."
+            raise TopicError("Which topic? " + listed)
+        return self.having(resolve(names, known))
+
+    def predicate(
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
+    ) -> Predicate:
+        """A predicate on some topics of some recordings.
+
+        Raises:
+            WhereError: it cannot be understood, or does not fit the fields.
+        """
+        return self._parsed(text, topics, recordings)
+
+    def _parse(
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
+    ) -> Predicate:
+        found = parse(text)
+        check_types(found, self.field_types(topics, recordings))
+        return found
+
+    def _remember_meanings(self) -> None:
+        """Cache what patterns and predicates mean; finding out takes half of a small count."""
+        self._resolved = lru_cache(_MAX_MEANINGS)(self._resolve)
+        self._parsed = lru_cache(_MAX_MEANINGS)(self._parse)
+
+    def _read_channels(self, recording: RecordingEntry) -> Mapping[int, Channel]:
+        wanted = {c.schema for c in recording.channels if c.schema is not None}
+        if not wanted <= self._schemas.keys():
+            # Recordings share most of their schemas.
+            entries = (*self.recordings(), recording)
+            used = {c.schema for r in entries for c in r.channels if c.schema is not None}
+            with suppress(CatalogError):
+                self._schemas = self.catalog.schemas(used)
+        if not wanted <= self._schemas.keys():
+            # The catalog has lost one.
+            return channels_of(take_inventory(self.directory, recording.label).summaries.values())
+        return {
+            c.id: Channel(
+                c.topic,
+                c.message_encoding,
+                self._schemas[c.schema] if c.schema is not None else None,
+                c.metadata,
+                has_publish_time=c.has_publish_time,
+            )
+            for c in recording.channels
+        }
+
+    def chunks(
+        self,
+        recording: RecordingEntry,
+        channels: Sequence[int],
+        bounds: tuple[int, int] | None,
+        clock: str,
+    ) -> list[ChunkEntry]:
+        """Chunks that may hold messages of some channels in a time range."""
+        if bounds is None or clock != "log" or recording.status == "open":
+            return self._fetch_chunks(recording, channels, bounds, clock)
+        fetch = partial(self._fetch_chunks, recording, channels)
+        return self._chunk_lists.find(recording.id, channels, bounds, fetch)
+
+    def chunks_before(
+        self, recording: RecordingEntry, channels: Sequence[int], span: tuple[int, int]
+    ) -> Iterator[tuple[ChunkEntry, int]]:
+        """Chunks that may hold the last message of some channels by a time.
+
+        Args:
+            recording: Of which.
+            channels: Channel ids.
+            span: Log time of the recording's first message, and the time, ns.
+
+        Yields:
+            See `ChunkLists.before`.
+        """
+        fetch = partial(self._fetch_chunks, recording, channels)
+        if recording.status == "open":
+            return latest_first(frozenset(channels), span, fetch)
+        return self._chunk_lists.before(recording.id, channels, span, fetch)
+
+    def _fetch_chunks(
+        self,
+        recording: RecordingEntry,
+        channels: Sequence[int],
+        bounds: tuple[int, int] | None,
+        clock: str = "log",
+    ) -> list[ChunkEntry]:
+        try:
+            return self.catalog.chunks(recording, channels, bounds, clock)
+        except CatalogError:
+            put_again(self.directory, self.catalog, recording)
+            return self.catalog.chunks(recording, channels, bounds, clock)
+
+    def segment(self, recording: str, number: int) -> SegmentReader:
+        """The reader of a sealed segment of a recording, by id or label. Thread safe."""
+        key = (recording, number)
+        with self._lock:
+            reader = self._segments.get(key)
+            if reader is None:
+                _make_room(self._segments)
+                path = self.directory.recording(self.entry(recording).label)
+                reader = SegmentReader(path / f"{number:06d}.mcap", number)
+                self._segments[key] = reader
+            return reader
+
+    # The end.
+
+    def invalidate(self) -> None:
+        """Drop everything that was read, so that the next question sees the store anew."""
+        self._recordings = None
+        self._by_id = {}
+        self._is_indexed = False
+        self._belief = None
+        self._schemas = {}
+        self._channels.clear()
+        with self._lock:
+            self._segments.clear()  # each is closed by the last thread that reads from it
+        self._chunk_lists.clear()
+        self.recent_chunks.clear()
+        self._remember_meanings()
+
+    def close(self) -> None:
+        """Close files and connections. May be called more than once."""
+        with self._lock:
+            for reader in self._segments.values():
+                reader.close()
+            self._segments.clear()
+        self.recent_chunks.clear()
+        self.disconnect()
+        self.catalog.close()
+
+
+def _make_room(opened: dict[Any, Any]) -> None:
+    """Drop the file that was opened first, if many are open.
+
+    It is closed when the last thread that reads from it drops it, too.
+    """
+    if len(opened) >= _MAX_OPEN_SEGMENTS:
+        del opened[next(iter(opened))]
