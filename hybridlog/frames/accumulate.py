@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 import numpy as np
 
 from hybridlog.frames.ragged import Growing, Ragged, RaggedBuilder
-from hybridlog.frames.text import repaired
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.utf8 import repaired
 
 if TYPE_CHECKING:
     import pyarrow as pa

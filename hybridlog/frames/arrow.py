@@ -14,8 +14,8 @@ import pyarrow.compute as pc
 
 from hybridlog.frames.accumulate import Lists, Nested, Text, Values, json_text
 from hybridlog.frames.ragged import Ragged, row_blocks
-from hybridlog.frames.text import repaired
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.utf8 import repaired
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
