@@ -66,9 +66,8 @@ class Belief:
 class Believe(Protocol):
     """Reads the state of the index of some recordings."""
 
-    def __call__(
-        self, database: Database, keys: Collection[str], *, anew: bool = False
-    ) -> Belief: ...
+    def __call__(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
+        """Read it."""
 
 
 class GuardedIndex:

@@ -13,7 +13,8 @@ from hybridlog.query.times import format_time
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.plan import Lane, Piece
+    from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
 
 
@@ -47,7 +48,7 @@ class Message:
 
     def __init__(
         self,
-        lane: Lane,
+        channel: RecordedChannel,
         *,
         log_time: int,
         publish_time: int,
@@ -57,17 +58,17 @@ class Message:
         documents: Documents,
         row: int,
     ) -> None:
-        channel = lane.channel
-        self.topic = channel.topic
-        self.type = channel.schema.name if channel.schema is not None else ""
+        described = channel.channel
+        self.topic = described.topic
+        self.type = described.schema.name if described.schema is not None else ""
         self.log_time_ns = log_time
-        self.publish_time_ns = publish_time if channel.has_publish_time else None
+        self.publish_time_ns = publish_time if described.has_publish_time else None
         self.sequence = sequence
         self.seq = seq
-        self.recording = lane.recording.id
+        self.recording = channel.recording.id
         self._view = view
-        self._codec = lane.codec
-        self._is_reduced = lane.is_reduced
+        self._codec = channel.codec
+        self._is_reduced = channel.is_reduced
         self._documents = documents
         self._row = row
 
@@ -131,12 +132,16 @@ class Documents:
     """The index documents of some messages, made for all its messages when one is asked for.
 
     Args:
-        lanes: By what `batch.channel` holds.
+        channels: By what `batch.channel` holds.
         batch: The messages.
     """
 
-    def __init__(self, lanes: Sequence[Lane] | Mapping[int, Lane], batch: Batch) -> None:
-        self._lanes = lanes
+    def __init__(
+        self,
+        channels: Sequence[RecordedChannel] | Mapping[int, RecordedChannel],
+        batch: Batch,
+    ) -> None:
+        self._channels = channels
         self._batch = batch
         self._bodies: dict[int, bytes] = {}
 
@@ -150,18 +155,18 @@ class Documents:
         document = struct.pack("<i", len(body) + 5) + body + b"\x00"
         return bson.decode(document)
 
-    def _make(self, lane: int) -> None:
-        rows = np.flatnonzero(self._batch.channel == lane)
+    def _make(self, index: int) -> None:
+        rows = np.flatnonzero(self._batch.channel == index)
         part = self._batch.take(rows)
-        for group in self._lanes[lane].codec.bodies(part.buffer, part.offset, part.length):
+        for group in self._channels[index].codec.bodies(part.buffer, part.offset, part.length):
             for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
                 self._bodies[row] = body.tobytes()
 
 
-def messages_in(lanes: Sequence[Lane], piece: Piece) -> Iterator[Message]:
-    """The messages of a piece, in its order; `piece.batch.channel` indexes the lanes."""
-    batch = piece.batch
-    documents = Documents(lanes, batch)
+def messages_in(channels: Sequence[RecordedChannel], run: MessageRun) -> Iterator[Message]:
+    """The messages of a run, in its order; `run.batch.channel` indexes the channels."""
+    batch = run.batch
+    documents = Documents(channels, batch)
     view = memoryview(batch.buffer)
     # Columns become lists at once: one number at a time is the slow way out of an array.
     columns = (
@@ -169,14 +174,14 @@ def messages_in(lanes: Sequence[Lane], piece: Piece) -> Iterator[Message]:
         batch.log_time,
         batch.publish_time,
         batch.sequence,
-        piece.seq,
+        run.seq,
         batch.offset,
         batch.length,
     )
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    for row, (lane, log_time, publish_time, sequence, seq, start, size) in enumerate(rows):
+    for row, (index, log_time, publish_time, sequence, seq, start, size) in enumerate(rows):
         yield Message(
-            lanes[lane],
+            channels[index],
             log_time=log_time,
             publish_time=publish_time,
             sequence=sequence,

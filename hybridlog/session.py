@@ -16,7 +16,7 @@ from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_ope
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.types import check_types
+from hybridlog.query.predicate.types import check
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
@@ -169,9 +169,7 @@ class Session:
             DatabaseError: it is unavailable; says what it was needed for, and why it is.
             IndexChangedError: another process removes documents of these recordings.
         """
-        return GuardedIndex(
-            self.database_for(purpose), recordings, self.belief, self.invalidate
-        )
+        return GuardedIndex(self.database_for(purpose), recordings, self.belief, self.invalidate)
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
         """The state of the index of some recordings, as of the catalog's snapshot.
@@ -318,11 +316,9 @@ class Session:
         """
         return self._parsed(text, topics, recordings)
 
-    def _parse(
-        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> Predicate:
+    def _parse(self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]) -> Predicate:
         found = parse(text)
-        check_types(found, self.field_types(topics, recordings))
+        check(found, self.field_types(topics, recordings))
         return found
 
     def _remember_meanings(self) -> None:

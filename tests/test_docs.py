@@ -516,7 +516,7 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.intervals import Interval, Intervals
-    from hybridlog.query.plan import Counters
+    from hybridlog.query.counters import Counters
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segment_writer import SegmentSettings
@@ -701,7 +701,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
         told = sorted(message for _, message in recording.messages())
         schemas = {
             (lane.channel.topic, lane.channel.schema.name): lane.channel
-            for lane in recorded.lanes(entry)
+            for lane in recorded.session.channels(entry)
             if lane.channel.schema is not None
         }
         ours = sorted(

@@ -689,7 +689,7 @@ def test_an_answer_needs_nothing_that_the_catalog_has_lost(made: Made, harm: str
         assert [m.decode().data for m in store.topic("/b")] == [f"{n:04d}" for n in range(1, 80, 3)]
         (entry,) = store.recordings()
         check(entry)
-        assert store.connected is None
+        assert store.session.connected is None
     if "schemas" not in harm:
         with closing(sqlite3.connect(path)) as db:
             assert db.execute("select count(*) from segments").fetchone() == (4,)
@@ -707,4 +707,4 @@ def test_the_catalog_may_go_while_the_store_is_open(made: Made) -> None:
                 opened_store.refresh()
                 check(*opened_store.recordings())
                 assert [m.raw for m in opened_store.all_topics()] == wanted
-        assert store.connected is None
+        assert store.session.connected is None

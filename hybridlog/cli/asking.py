@@ -10,7 +10,7 @@ from hybridlog.losses import topics_of
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.reader import Query
+    from hybridlog.query.query import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
 

@@ -18,7 +18,7 @@ from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.reader import Query
+    from hybridlog.query.query import Query
 
 _WHOLE = {"mcap", "bag"}
 
@@ -53,7 +53,7 @@ def run(target: Path, form: str | None, choices: Choices) -> None:
         else:
             _tables(query, form, target, force=force, quiet=quiet)
         if not quiet:
-            chosen = [r for r in view.recordings() if r.id in query.recording_ids]
+            chosen = [r for r in view.recordings() if r.id in query.recordings]
             for line in gaps(chosen, query.topics, choices.between):
                 output.note(line)
 
@@ -80,7 +80,7 @@ def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -
 
 def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     """One file a topic; a topic that is no table, or lies beside the range, is left out."""
-    query.plan()  # refuses a range that holds nothing of any topic
+    query.check_range()  # refuses a range that holds nothing of any topic
     new = not directory.exists()
     try:
         _make(directory)
@@ -98,7 +98,7 @@ def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quie
     left_out: list[HybridlogError] = []
     try:
         for topic, path in paths.items():
-            one = query.only(topic)
+            one = query.with_topic(topic)
             try:
                 missing = write(one, form, path, quiet=quiet)
             except (DefinitionError, TimeError) as error:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.export.base import Target
-    from hybridlog.query.plan import Counters
-    from hybridlog.reader import Query
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.query import Query
     from hybridlog.store import Store
 
 _SUFFIXES = {
@@ -131,14 +131,13 @@ def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> in
 
 def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:
     from hybridlog.export import open_batch_writer
-    from hybridlog.latched import in_force
 
     with open_batch_writer(form, target, profile=_profile(query)) as exact:
         if form != "raw":
-            for batch, lanes in in_force(query):
-                exact.write(batch, [lane.channel for lane in lanes])
-        for batch, lanes in query.batches():
-            exact.write(batch, [lane.channel for lane in lanes])
+            for batch, channels in query.latched():
+                exact.write(batch, [c.channel for c in channels])
+        for batch, channels in query.batches():
+            exact.write(batch, [c.channel for c in channels])
             progress()
 
 
@@ -146,18 +145,17 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     """Write the rows; returns how many."""
     from hybridlog.export import open_table_writer
     from hybridlog.export.jsonl import JsonlWriter
-    from hybridlog.frames.answer import stream
 
     written = 0
     if form == "jsonl":
         with JsonlWriter(target) as rows:
-            for table in stream(query):
+            for table in query.to_tables():
                 rows.write_table(_for_json(table, query))
                 written += table.num_rows
                 progress()
     else:
         with open_table_writer(form, target) as tables:
-            for table in stream(query):
+            for table in query.to_tables():
                 tables.write(table)
                 written += table.num_rows
                 progress()
@@ -178,7 +176,7 @@ def _query(store: Store, choices: Choices) -> Query:
     if choices.fields is not None:
         query = query.fields(*names_of(choices.fields))
     if choices.at is not None:
-        return query.just_at(choices.at)
+        return query.at_time(choices.at)
     if choices.every > 1:
         query = query.every(choices.every)
     if choices.reverse:
@@ -260,7 +258,7 @@ def _path(choices: Choices, form: str) -> Path | None:
 
 
 def _profile(query: Query) -> str:
-    encodings = {lane.channel.message_encoding for lane in query.lanes()}
+    encodings = {c.channel.message_encoding for c in query.channels()}
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
 
 
@@ -297,7 +295,7 @@ def closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
 
 
 def _tell_gaps(store: Store, query: Query, choices: Choices) -> None:
-    recordings = [r for r in store.recordings() if r.id in query.recording_ids]
+    recordings = [r for r in store.recordings() if r.id in query.recordings]
     between = choices.between if choices.clock == "log" else None
     for line in gaps(recordings, query.topics, between):
         output.note(line)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from hybridlog.query.intervals import Interval, Intervals
-    from hybridlog.reader import Query
+    from hybridlog.query.query import Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def _show(
         if not len(found) and not count:
             output.note("No interval.")
         closing_line(query.counters, time.monotonic() - started, count=True)
-        recordings = [r for r in store.recordings() if r.id in query.recording_ids]
+        recordings = [r for r in store.recordings() if r.id in query.recordings]
         for line in gaps(recordings, query.topics, asked.between):
             output.note(line)
 

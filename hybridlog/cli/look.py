@@ -11,13 +11,13 @@ from hybridlog.cli.asking import question
 from hybridlog.cli.observed import observed_fields
 from hybridlog.cli.opening import opened
 from hybridlog.cli.segment import show_segment
-from hybridlog.latched import depth_of
+from hybridlog.latching import depth_of
 from hybridlog.losses import Cause
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import REDUCED, Channel
 
 if TYPE_CHECKING:
-    from hybridlog.query.plan import Lane
+    from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
@@ -118,13 +118,14 @@ def show_schema(
     """Print a topic's definition and the paths that can be asked about."""
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
     with opened(store, mongo, quiet=as_json) as view:
-        for lane in question(view, [topic], recordings).lanes():
-            schema = lane.channel.schema
-            key = (lane.channel.topic, lane.recording.id if schema is None else repr(schema))
+        for recorded in question(view, [topic], recordings).channels():
+            schema = recorded.channel.schema
+            told = recorded.recording.id if schema is None else repr(schema)
+            key = (recorded.channel.topic, told)
             if key in seen:
-                seen[key]["recordings"].append(lane.recording.label)
+                seen[key]["recordings"].append(recorded.recording.label)
             else:
-                seen[key] = _of_channel(view, lane)
+                seen[key] = _of_channel(view, recorded)
     if not seen:
         raise TopicError(f"No recording chosen has {topic}.")
     if as_json:
@@ -152,8 +153,8 @@ def show_schema(
         output.say()
 
 
-def _of_channel(store: Store, lane: Lane) -> dict[str, Any]:
-    channel, codec = lane.channel, lane.codec
+def _of_channel(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
+    channel, codec = recorded.channel, recorded.codec
     schema = channel.schema
     text = None
     if schema is not None and schema.encoding in _READABLE:
@@ -163,14 +164,14 @@ def _of_channel(store: Store, lane: Lane) -> dict[str, Any]:
     ]
     observed = codec.indexed and not fields
     if observed:
-        fields = observed_fields(store.query([channel.topic], [lane.recording.id]))
+        fields = observed_fields(store.query([channel.topic], [recorded.recording.id]))
     return {
         "topic": channel.topic,
         "type": schema.name if schema is not None else None,
         "message_encoding": channel.message_encoding,
         "schema_encoding": schema.encoding if schema is not None else None,
         "definition": text,
-        "recordings": [lane.recording.label],
+        "recordings": [recorded.recording.label],
         "not_indexed": codec.reason,
         "observed": observed,
         "fields": fields,

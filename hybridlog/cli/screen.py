@@ -12,7 +12,7 @@ from hybridlog.cli.coverage import tell_reduced, tell_unreadable
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hybridlog.reader import Query
+    from hybridlog.query.query import Query
 
 SCREEN_ROWS = 20
 """Messages shown without --limit."""
@@ -35,13 +35,11 @@ def print_answer(query: Query) -> Query:
     Returns:
         The question that was answered, with its counters.
     """
-    from hybridlog.frames.answer import stream
-
-    limit = query.most
+    limit = query.question.limit
     # One more than is shown tells whether there is more.
     asked = query if limit is not None else query.limit(SCREEN_ROWS + 1)
     shown = 0
-    for table in stream(asked):
+    for table in asked.to_tables():
         wanted = table if limit is not None else table.slice(0, SCREEN_ROWS - shown)
         _print_block(_cells(wanted), asked.topics)
         shown += wanted.num_rows

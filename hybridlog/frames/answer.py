@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.columns.answers import judged
-from hybridlog.columns.judged import Judged
 from hybridlog.frames import TableBuilder
-from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
 from hybridlog.indexing import rows_by_channel
-from hybridlog.query.plan import Lane, Piece, Plan, Sweep
-from hybridlog.schema.column import Column, Records, Scalars, Strings, take
-from hybridlog_storage.errors import DefinitionError, UsageError
-from hybridlog_storage.messages import Batch
+from hybridlog.schema.column import Records, Strings
+from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.reader import Query
+    from hybridlog.query.chunk_scan import MessageRun, ScanPlan
+    from hybridlog.query.planner import Planner
+    from hybridlog.query.question import Question, RecordedChannel
 
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
@@ -47,62 +45,70 @@ class Block(NamedTuple):
     size: int
 
 
-def collect(query: Query) -> TableBuilder:
+def collect(planner: Planner) -> TableBuilder:
     """All columns of a query's answer.
 
     Raises:
         DefinitionError: a topic has no definition to make columns from.
     """
-    several = len(query.topics) > 1
-    types = scalar_types(query)
-    if types is not None:
-        builder = TableBuilder()
-        for block in chain.from_iterable(_single_values(query, types)):
-            builder.append(block.log_time, block.seq, block.records)
-        return builder
-    plan = query.plan()
-    _check(plan.lanes)
-    builder = TableBuilder(expected_rows=_expected(query, plan))
-    for block in _empty(plan, query):
+    several = len(planner.question.topics) > 1
+    plan = planner.scan_plan()
+    _check(plan.channels)
+    builder = TableBuilder(expected_rows=_expected(planner, plan))
+    for block in _empty(planner):
         _append(builder, block, several=several)
-    sweep = Sweep(plan, query.store.segment)
-    for piece in sweep.unordered() if query.is_unthinned else query.pieces(plan):
-        for block in _decoded(plan.lanes, piece, query):
+    all_of_them = planner.question.returns_all
+    for run in planner.unordered(plan) if all_of_them else planner.runs(plan):
+        for block in _decoded(plan.channels, run, planner):
             _append(builder, block, several=several)
     return builder
 
 
-def stream(query: Query) -> Iterator[pa.Table]:
+def to_arrow(planner: Planner) -> pa.Table:
+    """The whole answer as an Arrow table, in order."""
+    question = planner.question
+    table = collect(planner).to_arrow()
+    table = table.select(arranged(table.column_names, question.fields))
+    return table.take(np.arange(table.num_rows - 1, -1, -1)) if question.reverse else table
+
+
+def to_pandas(planner: Planner) -> pd.DataFrame:
+    """The whole answer as a frame, in order."""
+    question = planner.question
+    frame = collect(planner).to_pandas()
+    names = list(frame.columns)
+    wanted = arranged(names, question.fields)
+    if wanted != names:  # choosing columns takes as long as making the frame
+        frame = frame[wanted]
+    return frame.iloc[::-1] if question.reverse else frame
+
+
+def stream(planner: Planner) -> Iterator[pa.Table]:
     """The answer in order, in tables of bounded size; at least one, perhaps empty."""
-    several = len(query.topics) > 1
-    types = scalar_types(query)
-    groups: Iterator[Iterable[Block]]
-    if types is not None:
-        groups = _single_values(query, types)
-    else:
-        plan = query.plan()
-        _check(plan.lanes)
-        decoded = (_decoded(plan.lanes, piece, query) for piece in query.pieces(plan))
-        groups = chain([_empty(query.empty_plan(), query)], decoded)
-    yield from _tables(query, groups, several=several)
+    several = len(planner.question.topics) > 1
+    plan = planner.scan_plan()
+    _check(planner.channels())
+    decoded = (_decoded(plan.channels, run, planner) for run in planner.runs(plan))
+    groups: Iterator[Iterable[Block]] = chain([_empty(planner)], decoded)
+    yield from _tables(planner.question, groups, several=several)
 
 
 def _tables(
-    query: Query, groups: Iterator[Iterable[Block]], *, several: bool
+    question: Question, groups: Iterator[Iterable[Block]], *, several: bool
 ) -> Iterator[pa.Table]:
     builder, size = TableBuilder(), 0
     given = False
     for group in groups:
         # Blocks of one group overlap in time, so no table ends between them.
         if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
-            yield _finished(builder, query)
+            yield _finished(builder, question)
             given = True
             builder, size = TableBuilder(), 0
         for block in group:
             _append(builder, block, several=several)
             size += block.size
     if len(builder) or not given:
-        yield _finished(builder, query)
+        yield _finished(builder, question)
 
 
 def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
@@ -120,10 +126,10 @@ def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
     return sorted(names, key=place)
 
 
-def _finished(builder: TableBuilder, query: Query) -> pa.Table:
+def _finished(builder: TableBuilder, question: Question) -> pa.Table:
     table = builder.to_arrow()
-    table = table.select(arranged(table.column_names, query.selected_fields))
-    if query.is_reversed:
+    table = table.select(arranged(table.column_names, question.fields))
+    if question.reverse:
         table = table.take(np.arange(table.num_rows - 1, -1, -1))
     return table
 
@@ -141,16 +147,18 @@ def with_topic(records: Records, topic: str) -> Records:
     return Records({"topic": column, **records.fields}, rows)
 
 
-def _decoded(lanes: Sequence[Lane], piece: Piece, query: Query) -> Iterator[Block]:
+def _decoded(
+    lanes: Sequence[RecordedChannel], piece: MessageRun, planner: Planner
+) -> Iterator[Block]:
     ranks = _ranks(lanes)
     for number, rows in rows_by_channel(piece.batch.channel):
         lane = lanes[number]
         if lane.is_reduced:
-            query.counters.reduced += len(rows)
+            planner.counters.reduced += len(rows)
             continue
         batch, seq = piece.batch.take(rows), piece.seq[rows]
         decoded = lane.codec.columns(
-            batch.buffer, batch.offset, batch.length, query.selected_fields
+            batch.buffer, batch.offset, batch.length, planner.question.fields
         )
         good = decoded.rows
         yield Block(
@@ -162,149 +170,34 @@ def _decoded(lanes: Sequence[Lane], piece: Piece, query: Query) -> Iterator[Bloc
         )
 
 
-def _ranks(lanes: Sequence[Lane]) -> list[int]:
+def _ranks(lanes: Sequence[RecordedChannel]) -> list[int]:
     """What makes arrival numbers of each lane's recording follow those of the one before."""
     order = {key: rank for rank, key in enumerate(sorted({lane.recording.key for lane in lanes}))}
     return [order[lane.recording.key] << _SEQ_BITS for lane in lanes]
 
 
-def _empty(plan: Plan, query: Query) -> Iterator[Block]:
+def _empty(planner: Planner) -> Iterator[Block]:
     """A block without rows for each channel: columns exist even when no message does."""
     none = np.empty(0, np.int64)
-    for number, _ in enumerate(plan.lanes):
-        channel = np.empty(0, np.int32)
-        batch = Batch(b"", none, none, channel, none, none, none.astype(np.uint32))
-        lane = plan.lanes[number]
-        decoded = lane.codec.columns(
-            batch.buffer, batch.offset, batch.length, query.selected_fields
-        )
-        yield Block(lane.channel.topic, none, none, decoded.records, 0)
+    for channel in planner.channels():
+        if channel.is_reduced:
+            continue
+        decoded = channel.codec.columns(b"", none, none, planner.question.fields)
+        yield Block(channel.channel.topic, none, none, decoded.records, 0)
 
 
-def _expected(query: Query, plan: Plan) -> int | None:
+def _expected(planner: Planner, plan: ScanPlan) -> int | None:
     """How many rows will come, when that is known before."""
-    if query.is_unthinned and query.is_unbounded and plan.chooser is None:
+    question = planner.question
+    if question.returns_all and question.is_unbounded and question.predicate is None:
         return sum(task.messages for task in plan.tasks())
     return None
 
 
-def _check(lanes: Sequence[Lane]) -> None:
+def _check(lanes: Sequence[RecordedChannel]) -> None:
     for lane in lanes:
         if lane.codec.reason is not None:
             raise DefinitionError(
                 f"{lane.channel.topic} cannot be made a table: {lane.codec.reason}. "
                 "Its payloads can be fetched as they are (--format raw or mcap)."
             )
-
-
-def scalar_types(query: Query) -> Mapping[str, str] | None:
-    """Types of the fields asked for, if the index alone can answer; None if it cannot.
-
-    Raises:
-        UsageError: a summary of an array is asked for where the index cannot answer.
-    """
-    from hybridlog.reader import summary_type
-
-    fields = query.selected_fields
-    if fields is None:
-        return None
-    types: dict[str, str] = {}
-    summaries: list[str] = []
-    indexed = query.store.database is not None and len(query.topics) == 1
-    for lane in query.lanes():
-        if lane.is_reduced:
-            continue  # the index has of it what it has of whole messages
-        paths = {p.path: p for p in lane.codec.paths()}
-        known = {name: path.type for name, path in paths.items()}
-        for name in fields:
-            found = summary_type(name, known)
-            if found is not None:
-                summaries.append(name)
-            elif name in paths and not paths[name].array and known[name] in INDEX_TYPES:
-                found = known[name]
-            if found is None or types.setdefault(name, found) != found:
-                indexed = False
-    if summaries and not indexed:
-        raise UsageError(
-            f"{summaries[0]} stands in the index: ask for it on one topic, together with "
-            "single values only, while MongoDB is there."
-        )
-    return types if indexed else None
-
-
-def _single_values(query: Query, types: Mapping[str, str]) -> Iterator[Iterable[Block]]:
-    """Blocks of single values of one topic, out of kept columns or the index.
-
-    The first group has no rows, so that there are columns even when no message is found.
-    """
-    topic = query.topics[0]
-    none = np.empty(0, np.int64)
-    yield [Block(topic, none, none, Records(_no_values(types), 0), 0)]
-    found = None
-    if query.is_unthinned:
-        with query.costing():
-            found = judged(query, topic, types, as_rows=True)
-    yield from _from_index(query, types) if found is None else _from_columns(query, types, found)
-
-
-def _no_values(types: Mapping[str, str]) -> dict[str, Column]:
-    """Columns without rows."""
-    columns: dict[str, Column] = {}
-    for path, kind in types.items():
-        dtype = INDEX_TYPES[kind]
-        if kind == "string":
-            columns[path] = Strings(np.empty(0, np.uint8), np.zeros(1, np.int64))
-        elif dtype is None:
-            columns[path] = Scalars(np.empty(0, np.int64), INSTANTS[kind])
-        else:
-            columns[path] = Scalars(np.empty(0, dtype))
-    return columns
-
-
-def _from_columns(
-    query: Query, types: Mapping[str, str], found: Sequence[Judged]
-) -> Iterator[list[Block]]:
-    """Blocks of fields out of kept columns, in groups that are in order."""
-    if not found:
-        return
-    ordered = sorted(found, key=lambda part: part.recording.key)
-    parts = [(part, part.rows()) for part in ordered]
-    times = [part.columns.log_time[rows] for part, rows in parts]
-    owner = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
-    order = np.lexsort((owner, np.concatenate(times)))  # stable: within one, by arrival
-    if query.is_reversed:
-        order = order[::-1]
-    row = np.concatenate([rows for _, rows in parts])
-    for begin in range(0, len(order), _BLOCK_ROWS):
-        here = order[begin : begin + _BLOCK_ROWS]
-        group = []
-        for rank, (part, _) in enumerate(parts):
-            rows = np.sort(row[here[owner[here] == rank]])
-            columns: dict[str, Column] = {
-                path: take(part.columns.fields[path], rows) for path in types
-            }
-            seq = part.columns.seq[rows] + (rank << _SEQ_BITS)
-            log_time = part.columns.log_time[rows]
-            group.append(Block(query.topics[0], log_time, seq, Records(columns, len(rows)), 0))
-        query.counters.messages += len(here)
-        yield group
-
-
-def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:
-    """Blocks of the fields asked for, in groups that are in the order of the index."""
-    topic = query.topics[0]
-    projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
-    for raw, rows, before in query.thinned_documents(topic, projection):
-        group = []
-        # Documents that lack a field (an array too short for a summary) form parts.
-        for part in records_from_bson(raw, types):
-            chosen = np.flatnonzero(np.isin(part.rows, rows, assume_unique=True))
-            query.counters.messages += len(chosen)
-            reference, records = part.reference, part.records
-            if len(chosen) < len(reference):
-                reference, records = reference.take(chosen), take(records, chosen)
-            # Their places keep rows of one log time in the order of the index.
-            places = before + part.rows[chosen]
-            place = -places if query.is_reversed else places
-            group.append(Block(topic, reference.t, place, records, 0))
-        yield group

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from hybridlog.latched import depth_of
+from hybridlog.latching import depth_of
 from hybridlog_storage.messages import Channel
 
 _MOST_LATCHED = 32 << 20  # payload bytes of one channel; its last message stays in any case

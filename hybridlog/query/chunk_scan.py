@@ -317,7 +317,7 @@ class ChunkScan:
             if index in filters:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
-                found = filters[index].matches(channel, run.take(rows))
+                found = filters[index].matches(channel, run.batch.take(rows), run.seq[rows])
                 holds[rows] = found.holds
                 unreadable += found.unreadable
         return (run if holds.all() else run.take(holds)), unreadable

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from hybridlog.reader import Query
     from hybridlog_storage.catalog import RecordingEntry
 
 Span = tuple[int, int]
@@ -37,6 +36,13 @@ Span = tuple[int, int]
 MOST_PIECES = 10_000_000
 """Most intervals that `Intervals.cut` makes."""
 _LAST = np.iinfo(np.int64).max
+
+
+class Events(Protocol):
+    """Messages at some times; a query is one."""
+
+    def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """In which spans of log time of a recording any message lies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +140,19 @@ class Intervals:
     def __repr__(self) -> str:
         return f"<Intervals {len(self)}, {format_duration(self.duration_ns)} in all>"
 
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same intervals of the same recordings."""
+        return isinstance(other, Intervals) and self._value() == other._value()
+
+    def __hash__(self) -> int:
+        """Hash of the intervals."""
+        return hash(self._value())
+
+    def _value(self) -> tuple[object, ...]:
+        names = np.array(self._recordings, object)[self._recording] if len(self) else ()
+        columns = (self._begin, self._end, self._messages)
+        return tuple(names), *(column.tobytes() for column in columns)
+
     @property
     def duration_ns(self) -> int:
         """Sum of their lengths, nanoseconds; where they overlap, time counts twice."""
@@ -207,26 +226,23 @@ class Intervals:
             parts.append((name, np.stack([begin, end, np.zeros_like(begin)], axis=1)))
         return Intervals.of(parts)
 
-    def containing(self, query: Query) -> Intervals:
+    def containing(self, events: Events) -> Intervals:
         """Only those in which the log time of at least one message of a question lies.
 
-        The message must be of the interval's own recording. Intervals that overlap are
-        each looked at, and nothing but the index is read.
+        The message must be of the interval's own recording. Intervals that overlap
+        are each looked at.
 
         Args:
-            query: The messages, of the same store.
+            events: A query; its messages, of the same store.
 
         Raises:
             UsageError: it has `limit` or `every`.
-            DatabaseError: MongoDB is away and there is a predicate.
         """
-        from hybridlog.counting import any_in_each
-
         found = np.zeros(len(self), np.bool_)
         for code, name in enumerate(self._recordings):
             rows = np.flatnonzero(self._recording == code)
             spans = np.stack([self._begin[rows], self._end[rows]], axis=1)
-            found[rows] = any_in_each(query, name, spans)
+            found[rows] = events.any_within(name, spans)
         return self._take(found)
 
     def within(self, spans: Mapping[str, Span]) -> Intervals:

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.tree import And, Not, Opaque, Or, Predicate
+from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.tree import And, Opaque, Predicate, nodes
 from hybridlog_storage.errors import DefinitionError, PayloadError, WhereError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
 
@@ -29,7 +28,7 @@ def can_decide(predicate: Predicate) -> bool:
     """Whether the messages alone decide a predicate, without MongoDB."""
     if any(path.startswith(_ONLY_INDEXED) for path in predicate.fields()):
         return False
-    return not _has_opaque(predicate.root)
+    return not predicate.is_opaque
 
 
 def residual(predicate: Predicate) -> Predicate | None:
@@ -41,7 +40,7 @@ def residual(predicate: Predicate) -> Predicate | None:
     """
     items = predicate.root.items if isinstance(predicate.root, And) else (predicate.root,)
     left = [item for item in items if not isinstance(item, Opaque)]
-    if any(map(_has_opaque, left)):
+    if any(isinstance(node, Opaque) for item in left for node in nodes(item)):
         raise WhereError(
             "This filter mixes operators that only MongoDB understands with conditions that it "
             "does not answer exactly, such as regular expressions: join them with $and."
@@ -49,14 +48,6 @@ def residual(predicate: Predicate) -> Predicate | None:
     if not left:
         return None
     return Predicate(left[0] if len(left) == 1 else And(tuple(left)), predicate.text)
-
-
-def _has_opaque(node: Node) -> bool:
-    if isinstance(node, Opaque):
-        return True
-    if isinstance(node, Not):
-        return _has_opaque(node.item)
-    return isinstance(node, And | Or) and any(map(_has_opaque, node.items))
 
 
 class Matches(NamedTuple):
@@ -85,43 +76,50 @@ class MessageFilter:
         self._test = to_bool(predicate.root, types)
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
 
-    def matches(self, channel: RecordedChannel, run: MessageRun) -> Matches:
-        """Decide on messages of one channel."""
-        if channel.is_reduced or not channel.codec.indexed:
-            return self._one_by_one(channel, run, np.arange(len(run.batch)))
-        from hybridlog.query.predicate.to_mask import to_mask
+    def matches(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
+        """Decide on messages of one channel.
 
-        batch = run.batch
+        Args:
+            channel: Their channel.
+            batch: The messages.
+            seq: int64[n], their arrival numbers.
+        """
+        if channel.is_reduced or not channel.codec.indexed:
+            return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         decoded = channel.codec.arrow(
             batch.buffer, batch.offset, batch.length, self._fields - {"_meta"}
         )
         records = decoded.records
         if "_meta" in self._fields:
-            records = _with_meta(records, channel, run.take(decoded.rows))
+            records = _with_meta(records, channel, batch.take(decoded.rows), seq[decoded.rows])
         mask = to_mask(self._predicate.root, self._types, records)
         if mask is None:
-            return self._one_by_one(channel, run, np.arange(len(batch)))
+            return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         holds = np.zeros(len(batch), np.bool_)
         holds[decoded.rows] = mask
         unreadable = np.setdiff1d(np.arange(len(batch)), decoded.rows, assume_unique=True)
         if len(unreadable):
-            rest = self._one_by_one(channel, run, unreadable)
+            rest = self._one_by_one(channel, batch, seq, unreadable)
             holds[unreadable] = rest.holds[unreadable]
         return Matches(holds, len(unreadable))
 
     def _one_by_one(
-        self, channel: RecordedChannel, run: MessageRun, rows: NDArray[np.intp]
+        self,
+        channel: RecordedChannel,
+        batch: Batch,
+        seq: NDArray[np.int64],
+        rows: NDArray[np.intp],
     ) -> Matches:
-        holds = np.zeros(len(run.batch), np.bool_)
+        holds = np.zeros(len(batch), np.bool_)
         unreadable = 0
         for row in rows.tolist():
             try:
-                fields = dict(channel.codec.plain(run.batch.payload(row)))
+                fields = dict(channel.codec.plain(batch.payload(row)))
             except (PayloadError, DefinitionError):
                 fields = {}
                 unreadable += 1
             if "_meta" in self._fields:
-                fields["_meta"] = _meta_of(channel, run.batch, run.seq, row)
+                fields["_meta"] = _meta_of(channel, batch, seq, row)
             holds[row] = self._test(fields)
         return Matches(holds, unreadable)
 
@@ -141,20 +139,23 @@ def _meta_of(
 
 
 def _with_meta(
-    records: pa.StructArray, channel: RecordedChannel, run: MessageRun
+    records: pa.StructArray,
+    channel: RecordedChannel,
+    batch: Batch,
+    seq: NDArray[np.int64],
 ) -> pa.StructArray:
     """The same records with the fields of `_meta` that a message itself tells."""
     import pyarrow as pa
 
-    rows = len(run.batch)
+    rows = len(batch)
     columns: dict[str, Any] = {
-        "t": pa.array(run.batch.log_time),
+        "t": pa.array(batch.log_time),
         "rec": pa.array([channel.recording.key] * rows, pa.string()),
         "topic": pa.array([channel.channel.topic] * rows, pa.string()),
-        "seq": pa.array(run.seq),
+        "seq": pa.array(seq),
     }
     if channel.channel.has_publish_time:
-        columns["pub"] = pa.array(run.batch.publish_time)
+        columns["pub"] = pa.array(batch.publish_time)
     meta = pa.StructArray.from_arrays(list(columns.values()), names=list(columns))
     names = [field.name for field in records.type]
     return pa.StructArray.from_arrays([*records.flatten(), meta], names=[*names, "_meta"])

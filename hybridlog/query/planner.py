@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from hybridlog.indexing import STAMP
-from hybridlog.query.chunk_scan import ChunkScan, ChunkKey, MessageRun, RowSelection
+from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
 from hybridlog.query.engines.base import Need
 from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.statistics import Statistics
-from hybridlog.query.message_filter import MessageFilter, can_decide, residual
+from hybridlog.query.message_filter import MessageFilter, residual
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import (
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine, Outcomes, Values
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
 
@@ -76,7 +77,7 @@ class Planner:
             TopicError: a topic does not have the clock that was asked for.
         """
         wanted = set(self.question.topics)
-        found = []
+        found: list[Part] = []
         for recording, bounds, windows in self._ranges.resolve():
             by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
             for channel in self.session.channels(recording):
@@ -189,10 +190,10 @@ class Planner:
         plan.selector = select if selecting else None
         return plan
 
-    def _undecided(self, part: Part) -> object:
-        """The share of a part's predicate that MongoDB does not decide exactly."""
+    def _undecided(self, part: Part) -> Predicate | None:
+        """The share of a part's predicate that is left when MongoDB has answered."""
         assert part.predicate is not None
-        return None if self._mongo.filter_of(part).is_exact else residual(part.predicate)
+        return residual(part.predicate) if self._mongo.undecided(part) else None
 
     # Choosing.
 
@@ -235,8 +236,8 @@ class Planner:
         """Whether MongoDB finds candidates, and the messages decide."""
         if part.predicate is None or self.session.database is None:
             return False
-        best = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
-        return best in ([], [self._scan]) and not self._mongo.filter_of(part).is_exact
+        able = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
+        return able in ([], [self._scan]) and self._mongo.cost(part, Need.SELECTION) is not None
 
     def _count_otherwise(self, part: Part, failed: int) -> int:
         """The count of an engine that failed, by the next ones."""

@@ -24,8 +24,6 @@ from hybridlog.query.answers.last_message import just_before, message_at
 from hybridlog.query.answers.latched import in_force
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.query.predicate.from_mongo import from_mongo
-from hybridlog.query.predicate.parser import parse
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
@@ -36,8 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
+    from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
@@ -74,6 +72,16 @@ class Query:
         if self.question.predicate is not None:
             parts.append(f"where {self.question.predicate}")
         return f"<Query {'; '.join(parts)}>"
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both ask the same of the same open store."""
+        if not isinstance(other, Query):
+            return NotImplemented
+        return self._session is other._session and self.question == other.question
+
+    def __hash__(self) -> int:
+        """Hash of the question."""
+        return hash((id(self._session), self.question))
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -124,6 +132,8 @@ class Query:
         if isinstance(predicate, str):
             checked = self._session.predicate(predicate, self.topics, self.recordings)
         else:
+            from hybridlog.query.predicate.from_mongo import from_mongo
+
             checked = from_mongo(predicate)
         if self.question.predicate is not None:
             checked = self.question.predicate & checked
@@ -359,7 +369,7 @@ class Query:
         """
         if not fields:
             raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
-        self.fields(*fields)  # refuses what there is not
+        self.fields(*fields)  # refuses unknown fields
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate import Predicate
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.schema.codec import Codec
     from hybridlog_storage.catalog import ChannelStats, RecordingEntry
     from hybridlog_storage.messages import Channel

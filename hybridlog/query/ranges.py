@@ -10,6 +10,7 @@ from hybridlog.query.times import TIME_LIMIT, format_time, parse_range, parse_ti
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from hybridlog.query.question import Clock, Question, Span
@@ -29,7 +30,7 @@ class RangeResolver:
         self._session = session
         self._question = question
 
-    def resolve(self) -> list[tuple[RecordingEntry, Span | None, NDArray | None]]:
+    def resolve(self) -> list[tuple[RecordingEntry, Span | None, NDArray[np.int64] | None]]:
         """Each recording with its bounds on the question's clock and its windows of log time.
 
         Raises:

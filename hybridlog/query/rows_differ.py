@@ -35,7 +35,7 @@ def rows_differ(
     kind = column.type
     if pa.types.is_null(kind):
         return np.zeros(len(one), np.bool_)
-    valid = np.asarray(column.is_valid())
+    valid: NDArray[np.bool_] = np.asarray(column.is_valid(), np.bool_)
     differs: NDArray[np.bool_] = valid[one] != valid[other]
     there = valid[one] & valid[other]
     if pa.types.is_struct(kind):
@@ -46,7 +46,8 @@ def rows_differ(
         rows = np.flatnonzero(there)
         differs[rows] = _lists(column, one[rows], other[rows], tolerance)
         return differs
-    return differs | (there & _values(column, one, other, tolerance))
+    differs |= there & _values(column, one, other, tolerance)
+    return differs
 
 
 def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> NDArray[np.bool_]:
@@ -57,7 +58,7 @@ def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> 
     else:
         if pa.types.is_temporal(kind):
             column = column.view(pa.int64())
-        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(  # noqa: FBT003
+        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(
             zero_copy_only=False
         )
     left, right = values[one], values[other]
@@ -82,7 +83,10 @@ def _lists(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> N
     if len(alike):
         count = count[alike]
         differs = rows_differ(
-            elements, ranges(start[one[alike]], count), ranges(start[other[alike]], count), tolerance
+            elements,
+            ranges(start[one[alike]], count),
+            ranges(start[other[alike]], count),
+            tolerance,
         )
         found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
     return found

@@ -11,6 +11,8 @@ What `parse_time` takes:
 | `2015-03-03T18:28:33`, `2015-03-03` | the same in UTC |
 | `1425407313`, `1425407313.123456789` | seconds since the epoch, below 10**14 |
 | `1425407313123456789` | nanoseconds since the epoch, from 10**14 |
+| the int `1425407313123456789` | nanoseconds since the epoch, whatever the size |
+| the float `1425407313.5` | seconds since the epoch |
 | `5000000000ns` | nanoseconds since the epoch, whatever the size (simulated clocks start at 0) |
 | `+5s`, `+1m30s`, `+500ms`, `+5`, `1m30s` | from the start of the recording (`+5` is seconds) |
 | `-10s`, `-10` | before the end of the recording |
@@ -103,9 +105,9 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     """One time, in nanoseconds since the epoch.
 
     Args:
-        text: A time in one of the forms of this module's table, a number by the same
-            rule (a float is taken by its shortest decimal form), a `datetime` or
-            `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
+        text: A time in one of the forms of this module's table, an int (nanoseconds since
+            the epoch), a float (seconds since the epoch, by its shortest decimal form), a
+            `datetime` or `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
         start: Where `+5s` counts from, nanoseconds; None when there is no recording.
         end: Where `-10s` counts from, nanoseconds: one past the last message, so that
             `[start, end)` is everything. A time before the epoch becomes 0.
@@ -118,7 +120,7 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     if isinstance(text, bool):
         raise TimeError(f"{text} is not a time: {ACCEPTED}")
     if isinstance(text, Integral):
-        return _checked(_scaled(int(text), ""), text)
+        return _checked(int(text), text)
     if isinstance(text, Real):
         return _checked(_from_float(float(text)), text)
     if isinstance(text, date):

@@ -90,6 +90,16 @@ class Codec(Protocol):
     def fields(self, payload: Buffer) -> dict[str, object]:
         """What the index document holds of this message; empty when it holds nothing."""
 
+    def plain(self, payload: Buffer) -> dict[str, object]:
+        """The whole message as plain values: dict, list, str, bytes, bool, int, float, None.
+
+        Times and durations are integer nanoseconds.
+
+        Raises:
+            PayloadError: The payload does not fit its definition.
+            DefinitionError: There is no definition to read it by.
+        """
+
     def decode(self, payload: Buffer) -> object:
         """The whole message as an object.
 
@@ -166,6 +176,10 @@ class OpaqueCodec:
             yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
 
     def fields(self, payload: Buffer) -> dict[str, object]:
+        """Nothing."""
+        return {}
+
+    def plain(self, payload: Buffer) -> dict[str, object]:
         """Nothing."""
         return {}
 

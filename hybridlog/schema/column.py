@@ -159,6 +159,20 @@ def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return result
 
 
+def row_of(column: Column, row: int) -> object:
+    """One row as plain values; times and durations are integer nanoseconds."""
+    if isinstance(column, Scalars):
+        return column.values[row].item()
+    if isinstance(column, Records):
+        return {name: row_of(inner, row) for name, inner in column.fields.items()}
+    begin, end = int(column.offset[row]), int(column.offset[row + 1])
+    if isinstance(column, Strings):
+        return column.data[begin:end].tobytes().decode("utf-8", "replace")
+    if isinstance(column.values, Scalars):
+        return column.values.values[begin:end].tolist()
+    return [row_of(column.values, place) for place in range(begin, end)]
+
+
 def header_stamps(records: Records) -> NDArray[np.int64] | None:
     """The header stamps of decoded messages, ns; None when they have no header."""
     header = records.fields.get("header")

@@ -61,6 +61,10 @@ class JsonCodec:
             return {}
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
 
+    def plain(self, payload: Buffer) -> dict[str, object]:
+        """The message as plain values; see `Codec.plain`."""
+        return cast("dict[str, object]", top(_parsed(memoryview(payload))))
+
     def decode(self, payload: Buffer) -> object:
         """What the JSON text says, as Python objects.
 

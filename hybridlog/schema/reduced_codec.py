@@ -113,6 +113,10 @@ class ReducedCodec:
         body = _body(memoryview(payload))
         return {} if isinstance(body, PayloadError) else _document(body)
 
+    def plain(self, payload: Buffer) -> dict[str, object]:
+        """The fields that were kept; long arrays are summaries."""
+        return self.fields(payload)
+
     def decode(self, payload: Buffer) -> object:
         """Refuses.
 

@@ -12,7 +12,7 @@ import bson
 import numpy as np
 
 from hybridlog.schema.codec import BodyGroup, DecodedArrow, error_group
-from hybridlog.schema.column import header_stamps
+from hybridlog.schema.column import header_stamps, row_of
 from hybridlog.schema.definition import (
     ArrayOf,
     FieldPath,
@@ -99,6 +99,15 @@ class RosCodec:
         (group,) = self.bodies(payload, start, size)
         body = group.body.tobytes()
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
+
+    def plain(self, payload: Buffer) -> dict[str, object]:
+        """The message as plain values; see `Codec.plain`."""
+        start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
+        decoded = self.columns(payload, start, size, None)
+        if decoded.unreadable:
+            reason = decoded.unreadable[0].reason
+            raise PayloadError(f"the payload does not fit {self._name}: {reason}")
+        return {name: row_of(column, 0) for name, column in decoded.records.fields.items()}
 
     def decode(self, payload: Buffer) -> object:
         """The message as rosbags makes it: attributes, arrays as numpy views.

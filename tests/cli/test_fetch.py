@@ -17,7 +17,7 @@ import pyarrow.parquet
 import pytest
 
 from hybridlog.cli.fetch import closing_line
-from hybridlog.query.plan import Counters
+from hybridlog.query.counters import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
 from . import odd_log

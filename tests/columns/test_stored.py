@@ -473,9 +473,9 @@ def test_chunks_that_come_twice_make_no_columns(recorded: hl.Store, tmp_path: Pa
     place = tmp_path / "again"
     place.mkdir()
     gatherer = FieldGatherer(place)
-    channels = {lane.channel_id: lane.channel for lane in recorded.lanes(entry)}
+    channels = {lane.channel_id: lane.channel for lane in recorded.session.channels(entry)}
     for chunk in recorded.catalog.chunks(entry):
-        read = recorded.segment("log", chunk.segment).read_chunk(chunk.place)
+        read = recorded.session.segment("log", chunk.segment).read_chunk(chunk.place)
         gatherer.add(read, channels)
         gatherer.add(read, channels)
     gatherer.close(entry)
@@ -497,7 +497,7 @@ def test_chunks_may_come_in_any_order(
     """Chunks that were let go come last; their rows have their place all the same."""
     name = live(store, 200, settings=SegmentSettings(chunk_size=1024, segment_size=8192))
     (entry,) = store.recordings()
-    channels = {lane.channel_id: lane.channel for lane in store.lanes(entry)}
+    channels = {lane.channel_id: lane.channel for lane in store.session.channels(entry)}
     chunks = store.catalog.chunks(entry)
     assert len({chunk.segment for chunk in chunks}) > 2
     shuffled = chunks[seed // 2 :: 2] + chunks[: seed // 2] + chunks[seed // 2 + 1 :: 2]
@@ -516,7 +516,7 @@ def test_chunks_may_come_in_any_order(
             if place < (chunk.segment, chunk.offset) and place not in told:
                 gatherer.expect(*place)
                 told.add(place)
-        gatherer.add(store.segment(name, chunk.segment).read_chunk(chunk.place), channels)
+        gatherer.add(store.session.segment(name, chunk.segment).read_chunk(chunk.place), channels)
     gatherer.close(entry)
     assert told
     found, file = FieldColumns(tmp_path / "again"), column_file.ColumnFile(file_of(store, name))

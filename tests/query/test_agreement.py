@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
+from hybridlog.query.evaluate import holds
+from hybridlog.query.filters import check_filter
+from hybridlog.query.where import compile_filter, parse
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pymongo.collection import Collection
 
 from hybridlog.query.column_filter import column_filter
-from hybridlog.query.evaluate import holds
-from hybridlog.query.filters import check_filter
-from hybridlog.query.where import compile_filter, parse
 from hybridlog.schema.codec import Codec, codec_for
 from hybridlog.schema.column import Scalars
 from hybridlog_storage.messages import Channel, Schema

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog import reader
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
@@ -29,7 +28,6 @@ rows = st.lists(
     max_size=80,
 )
 times = st.integers(-2, 63)
-WAYS = {"by chunks": -1, "as usual": reader._FEW, "by documents": 10**9}
 
 
 @pytest.fixture(scope="module")
@@ -69,31 +67,25 @@ def test_a_count_by_time_is_what_a_loop_counts(
     )
     begin, end = (BASE + edges[0] * SECOND, BASE + (edges[0] + edges[1]) * SECOND)
     both = intervals((ids["a"], begin, end), (ids["b"], begin, end))
-    with (
-        hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked,
-        pytest.MonkeyPatch.context() as patch,
-    ):
+    with hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked:
         for topics in ({"/state"}, set(store.topics())):
             if not topics <= set(store.topics()):
                 continue
             query = asked.topic(*topics)
-            for way in WAYS.values():
-                patch.setattr(reader, "_FEW", way)
-                assert query.during(windows).count() == looped(model, topics, windows)
-                between = query.between(f"{begin}ns", f"{end}ns")
-                # A range beside all recordings that have the topics is refused.
-                having = [ms for ms in model.logs.values() if topics & {m.topic for m in ms}]
-                if any(begin <= m.time < end for ms in having for m in ms):
-                    assert between.count() == looped(model, topics, both)
-                    common = windows.common(both)
-                    assert between.during(windows).count() == looped(model, topics, common)
+            assert query.during(windows).count() == looped(model, topics, windows)
+            between = query.between(f"{begin}ns", f"{end}ns")
+            # A range beside all recordings that have the topics is refused.
+            having = [ms for ms in model.logs.values() if topics & {m.topic for m in ms}]
+            if any(begin <= m.time < end for ms in having for m in ms):
+                assert between.count() == looped(model, topics, both)
+                common = windows.common(both)
+                assert between.during(windows).count() == looped(model, topics, common)
 
 
 @pytest.fixture
-def many(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+def many(store: hl.Store) -> hl.Store:
     """200 messages, a second apart, in about twenty chunks; counted by chunks."""
     recorded(store, {"a": [(n, "/state", {"s": 0, "name": PADDING}) for n in range(200)]})
-    monkeypatch.setattr(reader, "_FEW", -1)
     return store
 
 
@@ -111,7 +103,9 @@ def test_a_count_by_time_reads_indexes_at_its_ends_only(many: hl.Store) -> None:
 def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
     path = segment_of(many)
     whole = path.read_bytes()
-    chunk = many.chunks(many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log")[0]
+    chunk = many.session.chunks(
+        many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log"
+    )[0]
     length = chunk.length + chunk.trailer
     with (
         hl.open(many.directory.path, require_database=True) as opened,
@@ -132,7 +126,9 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
     """Whether or not what it says could be: the catalog has the checksum of its bytes."""
     path = segment_of(many)
     whole = path.read_bytes()
-    chunk = many.chunks(many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log")[0]
+    chunk = many.session.chunks(
+        many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log"
+    )[0]
     index = chunk.offset + chunk.length
     entry = 9 + 6 + 16  # the second one: record head, channel, length, the first one
     at = {

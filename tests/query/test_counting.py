@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import bson
@@ -13,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog import counting
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import UsageError
@@ -26,7 +24,6 @@ from tests.query.test_intervals import (
     log,
     recorded,
     several,
-    write_log,
 )
 
 
@@ -35,28 +32,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     place = tmp_path_factory.mktemp("counting") / "store"
     with hl.open(place, create=True, require_database=True) as opened:
         yield opened
-
-
-@pytest.fixture
-def many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let few messages count as many."""
-    monkeypatch.setattr(counting, "_MANY", 1)
-    monkeypatch.setattr(counting, "_PART", 1)
-    monkeypatch.setattr(counting, "processors", lambda: 3)
-
-
-def asked(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Writes down the filters of counts."""
-    found: list[Any] = []
-    count = Database.count
-
-    def noted(self: Database, collection: str, query: Any = None, **options: Any) -> int:
-        if query:
-            found.append(query)
-        return count(self, collection, query, **options)
-
-    monkeypatch.setattr(Database, "count", noted)
-    return found
 
 
 # --- counts in all times --------------------------------------------------------------
@@ -68,14 +43,12 @@ GONE = "f" * 16
 @several
 @given(
     logs=st.fixed_dictionaries({"a": log, "b": log}),
-    is_many=st.booleans(),
     index=st.sampled_from([None, "s", "_meta.rec"]),
     chosen=st.sampled_from([("a",), ("b",), ("a", "b")]),
 )
 def test_a_count_is_what_a_loop_counts(
     store: hl.Store,
     logs: dict[str, Any],
-    is_many: bool,
     index: str | None,
     chosen: tuple[str, ...],
 ) -> None:
@@ -86,54 +59,16 @@ def test_a_count_is_what_a_loop_counts(
     database = store.database_for("the test")
     if index is not None:
         database.create_index("state", [(index, 1)])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counting, "_MANY", 1 if is_many else 10**6)
-        patch.setattr(counting, "_PART", 2)
-        patch.setattr(counting, "processors", lambda: 3)
-        query = store.topic("/state").in_recording(*has).where("s >= 1")
-        assert query.count() == sum(m.value["s"] >= 1 for name in has for m in model.of(name))
-        query = query.where("x > 1")
-        assert query.count() == sum(
-            m.value["s"] >= 1 and m.value.get("x", 0) > 1 for name in has for m in model.of(name)
-        )
+    query = store.topic("/state").in_recording(*has).where("s >= 1")
+    assert query.count() == sum(m.value["s"] >= 1 for name in has for m in model.of(name))
+    query = query.where("x > 1")
+    assert query.count() == sum(
+        m.value["s"] >= 1 and m.value.get("x", 0) > 1 for name in has for m in model.of(name)
+    )
     if index is not None:
         database.drop_index("state", [(index, 1)])
 
 
-@pytest.mark.usefixtures("many")
-def test_the_recording_is_left_out_when_there_is_no_other(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    rows = [(second, "/state", {"s": second % 2}) for second in range(12)]
-    recorded(store, {"a": rows})
-    query = store.topic("/state").where("s == 1")
-    database = store.database_for("the test")
-    told = asked(store, monkeypatch)
-    assert query.count() == 6
-    assert len(told) == 3
-    assert "_meta.rec" not in str(told)
-    database.create_index("state", [("s", 1)])
-    told.clear()
-    assert query.count() == 6
-    assert told == [{"s": {"$eq": 1}}]
-    database.drop_index("state", [("s", 1)])
-
-    # Another one has recorded meanwhile: this store does not know of it, nor counts it.
-    with hl.open(store.directory.path, require_database=True) as other:
-        path = tmp_path / "b.mcap"
-        write_log(path, [(3, "/state", {"s": 1})], -1)
-        other.record(path, name="b")
-        told.clear()
-        assert query.count() == 6
-        assert all("_meta.rec" in str(one) for one in told)
-        store.refresh()
-        assert query.count() == 6
-        assert store.topic("/state").where("s == 1").count() == 7
-        other.remove("b")
-    store.refresh()
-
-
-@pytest.mark.usefixtures("many")
 @pytest.mark.parametrize("trace", ["documents", "entry", "directory"])
 def test_what_no_recording_has_is_not_counted(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, trace: str
@@ -158,28 +93,6 @@ def test_what_no_recording_has_is_not_counted(
     database.delete("state", {"_meta.rec": GONE})
     if trace == "directory":
         (store.directory.path / "recordings" / "gone").rmdir()
-
-
-@pytest.mark.usefixtures("many")
-def test_a_recording_that_begins_during_a_count(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorded(store, {"a": [(second, "/state", {"s": 1}) for second in range(6)]})
-    query = store.topic("/state").where("s == 1")
-    database = store.database_for("the test")
-    counted = counting._counted
-
-    def slowly(*args: Any) -> int:
-        if not database.find_one("hybridlog.recordings", {"_id": GONE}):
-            database.replace("hybridlog.recordings", {"_id": GONE}, {"_id": GONE})
-            stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": GONE}})
-            database.insert_raw("state", stray, 1)
-        return counted(*args)
-
-    monkeypatch.setattr(counting, "_counted", slowly)
-    assert query.count() == 6
-    database.delete("hybridlog.recordings", {"_id": GONE})
-    database.delete("state", {"_meta.rec": GONE})
 
 
 def test_a_short_range_is_read_by_its_keys_whatever_indexes_there_are(store: hl.Store) -> None:
@@ -232,26 +145,23 @@ def contained(model: Model, rows: Intervals, topics: set[str], least: int) -> li
 @given(
     logs=st.fixed_dictionaries({"a": log, "b": log}),
     spans=st.lists(st.tuples(st.sampled_from("ab"), st.integers(-1, 12), st.integers(0, 4))),
-    several_reads=st.sampled_from([0.01, 32, 10**9]),
 )
 def test_intervals_that_contain_a_message_are_what_a_loop_finds(
-    store: hl.Store, logs: dict[str, Any], spans: list[tuple[str, int, int]], several_reads: float
+    store: hl.Store, logs: dict[str, Any], spans: list[tuple[str, int, int]]
 ) -> None:
     model = recorded(store, logs)
     rows = intervals(
         *((model.ids[name], BASE + b * SECOND, BASE + (b + n) * SECOND) for name, b, n in spans)
     )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counting, "_SEVERAL", several_reads)
-        for topics in (store.topics(), ["/state"]):
-            if not set(topics) <= set(store.topics()):
-                continue
-            for least in (0, 2):
-                query = store.topic(*topics)
-                query = query.where(f"s >= {least}") if least else query
-                found = list(rows.containing(query))
-                want = contained(model, rows, set(topics), least)
-                assert found == [row for row, is_in in zip(rows, want, strict=True) if is_in]
+    for topics in (store.topics(), ["/state"]):
+        if not set(topics) <= set(store.topics()):
+            continue
+        for least in (0, 2):
+            query = store.topic(*topics)
+            query = query.where(f"s >= {least}") if least else query
+            found = list(rows.containing(query))
+            want = contained(model, rows, set(topics), least)
+            assert found == [row for row, is_in in zip(rows, want, strict=True) if is_in]
 
 
 @pytest.fixture

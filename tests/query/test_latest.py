@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.query.query import Query
 from hybridlog.query.recent_chunks import RecentChunks
-from hybridlog.reader import Query
 from hybridlog.recorder import RecordOptions
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.errors import SegmentError, TopicError
@@ -94,7 +94,7 @@ def test_the_message_at_a_time_is_what_a_loop_finds(
                         continue
                     found = query.at(f"{now}ns")
                     assert (found.recording, found.fields["n"]) == want
-                    (same,) = query.just_at(f"{now}ns")
+                    (same,) = query.at_time(f"{now}ns")
                     assert (same.recording, same.fields["n"]) == want
 
 
@@ -137,7 +137,7 @@ def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
     entry = many.recordings()[0]
     path = many.directory.recording(entry.label) / "000000.mcap"
     whole = path.read_bytes()
-    last = many.chunks(entry, [entry.channels[0].id], None, "log")[-1]
+    last = many.session.chunks(entry, [entry.channels[0].id], None, "log")[-1]
     place = last.offset + last.length - 1
     path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
     try:

@@ -6,13 +6,13 @@ import re
 import numpy as np
 import pytest
 from bson import Code, Int64, ObjectId, Regex
+from hybridlog.query.filters import check_filter
+from hybridlog.query.where import compile_filter, parse
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pymongo.collection import Collection
 
 from hybridlog.query import evaluate
-from hybridlog.query.filters import check_filter
-from hybridlog.query.where import compile_filter, parse
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 Document = dict[str, Any]
 
 
-def index_documents(
-    session: Session, question: Question, counters: Counters
-) -> Iterator[Document]:
+def index_documents(session: Session, question: Question, counters: Counters) -> Iterator[Document]:
     """The index documents of the answer to a question.
 
     Raises:
@@ -32,9 +30,7 @@ def index_documents(
     session.database_for("Reading index documents")
     planner = Planner(session, question, counters)
     mongo = Mongo(session, counters)
-    streams = [
-        _of_part(planner, mongo, part, reverse=question.reverse) for part in planner.parts()
-    ]
+    streams = [_of_part(planner, mongo, part, reverse=question.reverse) for part in planner.parts()]
     # Keys are in the order of log time, recording and arrival, over all topics.
     merged = heapq.merge(*streams, key=lambda pair: pair[1]["_id"], reverse=question.reverse)
     seen: Counter[str] = Counter()

@@ -50,9 +50,7 @@ class IntervalQueries:
             for rows in self._states_in(part, span, gap)
         )
 
-    def changes(
-        self, fields: Sequence[str], pause: DurationLike, tolerance: float
-    ) -> Intervals:
+    def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
         """When fields change; see `Query.changes`."""
         self._check("A change")
         if not tolerance >= 0 or tolerance == np.inf:
@@ -130,8 +128,9 @@ class IntervalQueries:
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, unbounded, with each span that is asked about."""
         whole = replace(self._question, bounds=None, during=None)
-        parts = {p.recording.id: p for p in Planner(
-            self._session, whole, self._planner.counters).parts()}
+        parts = {
+            p.recording.id: p for p in Planner(self._session, whole, self._planner.counters).parts()
+        }
         for recording, span in RangeResolver(self._session, self._question).spans():
             if recording.id in parts:
                 yield parts[recording.id], span
@@ -142,9 +141,7 @@ class IntervalQueries:
         if before is not None:
             # The last message before the range still speaks for its beginning.
             time, holds = before
-            yield clipped(
-                holding.add(np.array([time]), np.array([holds]), counted=False), span
-            )
+            yield clipped(holding.add(np.array([time]), np.array([holds]), counted=False), span)
         for found in self._planner.outcomes(_bounded(part, span)):
             yield clipped(holding.add(found.log_time, found.holds), span)
         yield clipped(holding.finish(span_of(part.recording)[1]), span)
@@ -171,9 +168,7 @@ class IntervalQueries:
             yield changing.add(found.log_time[differs])
         yield changing.finish()
 
-    def _row_before(
-        self, part: Part, span: Span, paths: Collection[str]
-    ) -> pa.StructArray | None:
+    def _row_before(self, part: Part, span: Span, paths: Collection[str]) -> pa.StructArray | None:
         """The fields of the last matching message before a span."""
         for begin in _earlier(part, span):
             last = None

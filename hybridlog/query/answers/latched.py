@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.latching import depth_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 
@@ -16,24 +16,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
-    from hybridlog_storage.messages import Batch, Channel
-
-_TRANSIENT_LOCAL = re.compile(r"durability:\s*(?:1|transient_local)\b")
-_MAX_DEPTH = 1000
-
-
-def depth_of(channel: Channel) -> int:
-    """How many of a channel's last messages a late subscriber gets; 0 without latching.
-
-    A ROS 1 connection latches one message. A ROS 2 channel mixes the publishers of its
-    topic, and the depth of each does not tell how many there are: all are kept, up to a bound.
-    """
-    metadata = channel.metadata
-    if metadata.get("latching") in {"1", "true"}:
-        return 1
-    if _TRANSIENT_LOCAL.search(metadata.get("offered_qos_profiles", "")):
-        return _MAX_DEPTH
-    return 0
+    from hybridlog_storage.messages import Batch
 
 
 def in_force(

@@ -46,7 +46,7 @@ class ChunkIndex:
         self._session = session
         self._counters = counters
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:  # noqa: ARG002
+    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
         """For counts and times by log time; it grows with the number of chunks in the range."""
         if part.predicate is not None or not part.is_by_log_time:
             return None

@@ -13,8 +13,10 @@ from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, Values
 from hybridlog.query.predicate.to_mongo import to_mongo
+from hybridlog.query.predicate.tree import And
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
@@ -50,12 +52,16 @@ class Mongo:
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session
         self._counters = counters
+        self._undecided: dict[Part, int] = {}
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:  # noqa: ARG002
-        """By the number of documents looked at; None without MongoDB, or if it may be wrong."""
+    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+        """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
         if need is Need.VALUES or self._session.database is None:
             return None
-        if need is not Need.SELECTION and not self.filter_of(part).is_exact:
+        try:
+            if need is not Need.SELECTION and self.undecided(part):
+                return None
+        except (DatabaseError, IndexChangedError):
             return None
         windows = 1 if part.windows is None else len(part.windows)
         each = _LOOK_S if need is Need.COUNT else _LOOK_S + _DOCUMENT_S
@@ -65,11 +71,27 @@ class Mongo:
 
     def filter_of(self, part: Part) -> MongoFilter:
         """The predicate of a part as MongoDB understands it."""
-        from hybridlog.query.predicate.to_mongo import MongoFilter
+        predicate = And(()) if part.predicate is None else part.predicate.root
+        return to_mongo(predicate, part.field_types)
 
-        if part.predicate is None:
-            return MongoFilter({}, is_exact=True)
-        return to_mongo(part.predicate.root, part.field_types)
+    def undecided(self, part: Part) -> int:
+        """Number of documents that do not tell whether their message matches.
+
+        Long arrays are summaries there, some integers are rounded, and MongoDB does not
+        search with patterns: what it finds may be more than what matches.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+            IndexChangedError: another process changes the index.
+        """
+        found = self.filter_of(part)
+        if found.is_exact:
+            return 0
+        if part not in self._undecided:
+            unsure = {"$and": [found.filter, {"$nor": [found.certain]}]}
+            asked = [(collection_of(part.topic), joined(c, unsure)) for c in conditions(part)]
+            self._undecided[part] = sum(self._index([part]).count_each(asked))
+        return self._undecided[part]
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of documents that match.

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 _START_S = 1e-3  # seconds to begin
 _BYTE_S = 2e-9  # seconds to read and decompress a byte
-_MESSAGE_S = 1.5e-6  # seconds to decode a message by columns
+_ROW_S = 1.5e-6  # seconds to decode a message by columns
+_OBJECT_S = 20e-6  # seconds to make a Python object of a message
+_BY_COLUMNS = {"ros1", "cdr"}
 
 
 class PayloadScan:
@@ -35,12 +37,14 @@ class PayloadScan:
         self._session = session
         self._counters = counters
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:  # noqa: ARG002
+    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
         """By bytes and messages; None if only MongoDB understands the predicate."""
         if part.predicate is not None and not can_decide(part.predicate):
             return None
         size = sum(stats.payload_bytes for stats in part.stats)
-        each = _BYTE_S * size + _MESSAGE_S * part.messages
+        encodings = {channel.channel.message_encoding for channel in part.channels}
+        message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S
+        each = _BYTE_S * size + message_s * part.messages
         return _START_S + part.share * each
 
     def count(self, parts: Sequence[Part]) -> int:
@@ -56,7 +60,9 @@ class PayloadScan:
             holds = np.ones(len(run.batch), np.bool_)
             if decide is not None:
                 for index, rows in rows_by_channel(run.batch.channel):
-                    found = decide.matches(plan.channels[index], run.take(rows))
+                    found = decide.matches(
+                        plan.channels[index], run.batch.take(rows), run.seq[rows]
+                    )
                     holds[rows] = found.holds
                     self._counters.unreadable += found.unreadable
             yield Outcomes(run.batch.log_time, run.seq, holds)
@@ -77,7 +83,7 @@ class PayloadScan:
                 good = decoded.rows
                 yield Values(own.batch.log_time[good], own.seq[good], decoded.records)
 
-    def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:  # noqa: ARG002
+    def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """Nothing is known before the messages are read."""
         return RowSelection({})
 
@@ -113,9 +119,7 @@ class PayloadScan:
                 bounds = int(windows[0, 0]), int(windows[-1, 1])
         is_empty = bounds is not None and bounds[0] >= bounds[1]
         chunks = (
-            []
-            if is_empty
-            else self._session.chunks(part.recording, list(indexes), bounds, clock)
+            [] if is_empty else self._session.chunks(part.recording, list(indexes), bounds, clock)
         )
         return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
 

@@ -1,0 +1,394 @@
+"""Every engine gives the same answer: each against a plain evaluation of decoded messages.
+
+Two recordings overlap in time and have ties; their topics are JSON and ROS 2 messages with
+NaN, -0.0, missing and null values, nested and long arrays and integers beyond 2^53 and 2^63.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import hybridlog as hl
+from hybridlog.query.engines.base import Engine
+from hybridlog.query.engines.chunk_index import ChunkIndex
+from hybridlog.query.engines.mongo import Mongo
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.statistics import Statistics
+from hybridlog.query.intervals import Intervals
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.query import Query
+from hybridlog_storage.errors import TimeError
+from hybridlog_storage.segment_writer import SegmentSettings
+
+SECOND = 10**9
+BASE = 1_700_000_000 * SECOND
+DEFINITION = """\
+std_msgs/Header header
+float64 x
+int32 i
+uint64 u
+bool b
+string s
+float64[] a
+uint64[] k
+demo/Part[] m
+================================================================================
+MSG: demo/Part
+int32 v
+float32[] q
+"""
+FULL_DEFINITION = (
+    DEFINITION
+    + "=" * 80
+    + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    + "=" * 80
+    + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+ENGINES: dict[str, type[Engine]] = {
+    "statistics": Statistics,
+    "chunk index": ChunkIndex,
+    "mongo": Mongo,
+    "payload scan": PayloadScan,
+}
+WAYS = {
+    "planner": tuple(ENGINES),
+    "mongo": ("mongo",),
+    "payload scan": ("payload scan",),
+    "without mongo": ("statistics", "chunk index", "payload scan"),
+}
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A message as it was written.
+
+    `fields` is what an independent decoder makes of it.
+    """
+
+    recording: str
+    topic: str
+    log_time: int
+    publish_time: int
+    stamp: int | None
+    seq: int
+    fields: dict[str, Any]
+    raw: bytes
+
+
+def _ros_message(types: Any, rng: random.Random, stamp: int) -> Any:
+    numbers = [0.0, -0.0, 1.0, 1.5, -2.25, math.nan, math.inf, 2.0**53 + 2]
+    unsigned = [0, 1, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1]
+    make = types.types
+    length = rng.choice([0, 1, 2, 40])
+    part = make["demo/msg/Part"]
+    return make["demo/msg/Thing"](
+        header=make["std_msgs/msg/Header"](
+            stamp=make["builtin_interfaces/msg/Time"](sec=stamp // SECOND, nanosec=stamp % SECOND),
+            frame_id=rng.choice(["", "laser", "base"]),
+        ),
+        x=rng.choice(numbers),
+        i=rng.choice([-3, 0, 1, 2, 2**31 - 1]),
+        u=rng.choice(unsigned),
+        b=rng.random() < 0.5,
+        s=rng.choice(["", "a", "slip 1", "SLIP", "é\n"]),
+        a=np.array([rng.choice(numbers) for _ in range(length)], np.float64),
+        k=np.array([rng.choice(unsigned) for _ in range(length)], np.uint64),
+        m=[
+            part(v=rng.randrange(3), q=np.array([rng.choice(numbers[:5])], np.float32))
+            for _ in range(rng.choice([0, 1, 3]))
+        ],
+    )
+
+
+def _as_dict(value: Any) -> Any:
+    """A message of rosbags as plain values; times as nanoseconds."""
+    if hasattr(value, "sec") and hasattr(value, "nanosec"):
+        return value.sec * SECOND + value.nanosec
+    if hasattr(value, "__dataclass_fields__"):
+        names = [n for n in value.__dataclass_fields__ if not n.startswith("__")]
+        return {name: _as_dict(getattr(value, name)) for name in names}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_as_dict(each) for each in value] if isinstance(value, list) else value
+
+
+def _json_message(rng: random.Random) -> dict[str, Any]:
+    numbers = [0, -0.0, 1, 1.5, 2**53 + 1, -(2**53) - 1, 2**63, 2**64 - 1, 2**64, 2**70, True]
+    found: dict[str, Any] = {}
+    for name, make in (
+        ("x", lambda: rng.choice([*numbers, None, "1"])),
+        ("n", lambda: rng.choice([0, 1, 2])),
+        ("s", lambda: rng.choice(["", "a", "slip 1", None, "SLIP"])),
+        ("a", lambda: [rng.choice(numbers) for _ in range(rng.choice([0, 1, 3, 40]))]),
+        ("o", lambda: {"v": rng.choice([1, None])}),
+        ("l", lambda: [[rng.choice(numbers)] for _ in range(rng.choice([0, 2]))]),
+    ):
+        if rng.random() < 0.8:
+            found[name] = make()
+    return found
+
+
+def _write(path: Path, seed: int, count: int) -> list[Sent]:
+    rng = random.Random(seed)
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    types.register(get_types_from_msg(DEFINITION, "demo/msg/Thing"))
+    sent: list[Sent] = []
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        ros = writer.register_schema("demo/msg/Thing", "ros2msg", FULL_DEFINITION.encode())
+        plain = writer.register_schema("State", "jsonschema", b"{}")
+        things = [writer.register_channel(t, "cdr", ros) for t in ("/thing", "/other")]
+        state = writer.register_channel("/state", "json", plain, {"mark": str(seed)})
+        for seq in range(count):
+            # Ties in log time, and times that go back.
+            log_time = BASE + rng.randrange(40) * SECOND // 4 + (seed % 2)
+            publish, stamp = log_time - rng.randrange(SECOND), log_time - rng.randrange(9) * SECOND
+            kind = rng.randrange(3)
+            if kind < 2:
+                message = _ros_message(types, rng, stamp)
+                raw = bytes(types.serialize_cdr(message, "demo/msg/Thing"))
+                topic, channel, fields = ("/thing", "/other")[kind], things[kind], _as_dict(message)
+            else:
+                fields = _json_message(rng)
+                raw = json.dumps(fields).encode()
+                topic, channel = "/state", state
+            writer.add_message(channel, log_time, raw, publish)
+            own = stamp if kind < 2 else None
+            sent.append(Sent("", topic, log_time, publish, own, seq, fields, raw))
+        writer.finish()  # type: ignore[no-untyped-call]
+    return sent
+
+
+@dataclass(frozen=True, repr=False)
+class World:
+    """A store and what was written to it, in the order of an answer."""
+
+    store: hl.Store
+    sent: list[Sent]
+    ids: dict[str, str]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    place = tmp_path_factory.mktemp("engines")
+    with hl.open(place / "store", create=True, require_database=True) as store:
+        everything: list[Sent] = []
+        ids = {}
+        for seed, name in enumerate(("one", "two")):
+            written = _write(place / f"{name}.mcap", seed, 400)
+            settings_ = SegmentSettings(chunk_size=4096, segment_size=200_000)
+            report = store.record(place / f"{name}.mcap", name=name, settings=settings_)
+            ids[name] = report.entry.id
+            by_place = {(m.log_time, m.raw): m for m in written}
+            for message in store.all_topics().in_recording(name):
+                one = by_place[message.log_time_ns, message.raw]
+                everything.append(
+                    Sent(
+                        report.entry.id, one.topic, one.log_time, one.publish_time, one.stamp,
+                        message.seq, one.fields, one.raw,
+                    )
+                )  # fmt: skip
+            assert len(everything) == 400 * (seed + 1)
+        everything.sort(key=lambda m: (m.log_time, m.recording[:16], m.seq))
+        yield World(store, everything, ids)
+
+
+@contextmanager
+def only(way: str) -> Iterator[None]:
+    """Let some engines answer only."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, engine in ENGINES.items():
+            if name not in WAYS[way]:
+                patch.setattr(engine, "cost", lambda *_: None)
+        yield
+
+
+number = st.sampled_from(
+    [
+        *("0", "1", "1.5", "-0.0", "-2", "nan", "inf", "9007199254740993", "9223372036854775807"),
+        *("9223372036854775808", "9223372036854775809", "18446744073709551615", "2.5e18"),
+    ]
+)
+order = st.sampled_from(["==", "!=", "<", "<=", ">", ">="])
+ros_numbers = st.sampled_from(["x", "i", "u", "a", "k", "m[].v", "m[0].q", "a.min", "a.n", "k.max"])
+json_numbers = st.sampled_from(["x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]"])
+pattern = st.sampled_from(["'^slip'", "'(?i)slip'", "'[0-9]$'", "'^$'", "'l.p 1'"])
+
+
+def _conditions(numbers: st.SearchStrategy[str], extra: list[str]) -> st.SearchStrategy[str]:
+    one = st.one_of(
+        st.builds("{} {} {}".format, numbers, order, number),
+        st.builds("{} in [{}, {}]".format, numbers, number, number),
+        st.builds("s ~ {}".format, pattern),
+        st.builds("s !~ {}".format, pattern),
+        st.sampled_from(["s == 'a'", "s != ''", "_meta.seq < 200", *extra]),
+    )
+    return st.one_of(
+        one,
+        st.builds("not ({})".format, one),
+        st.builds("({}) and ({})".format, one, one),
+        st.builds("({}) or not ({})".format, one, one),
+    )
+
+
+ros_condition = _conditions(ros_numbers, ["b == true", "header.frame_id == 'laser'", "b != false"])
+json_condition = _conditions(
+    json_numbers,
+    ["x exists", "x missing", "x == null", "s == null", "o.v == null", "x == true", "x == '1'"],
+)
+
+
+lengths = st.integers(1, 8)
+
+
+@st.composite
+def questions(draw: st.DrawFn) -> dict[str, Any]:
+    """A question as keyword arguments of `ask` and `expected`."""
+    is_json = draw(st.booleans())
+    topics = ("/state",) if is_json else draw(st.sampled_from([("/thing",), ("/thing", "/other")]))
+    condition = draw(st.none() | (json_condition if is_json else ros_condition))
+    if condition is None and draw(st.booleans()):
+        topics = ("/thing", "/other", "/state")
+    clocks = ["log", "publish"] if "/state" in topics else ["log", "publish", "header"]
+    begin = draw(st.none() | st.integers(-8, 44))
+    span = None
+    if begin is not None:
+        span = BASE + begin * SECOND // 4, BASE + (begin + draw(st.integers(1, 30))) * SECOND // 4
+    windows = draw(
+        st.none()
+        | st.lists(
+            st.tuples(st.sampled_from(["one", "two"]), st.integers(0, 40), st.integers(1, 8))
+        )
+    )
+    return {
+        "topics": topics,
+        "recordings": draw(st.sampled_from([("one",), ("two",), ("one", "two")])),
+        "condition": condition,
+        "span": span,
+        "clock": draw(st.sampled_from(clocks)),
+        "windows": windows,
+        "limit": draw(st.none() | st.integers(0, 30)),
+        "every": draw(st.sampled_from([1, 1, 2, 7])),
+        "reverse": draw(st.booleans()),
+    }
+
+
+def _windows(world: World, windows: list[tuple[str, int, int]]) -> Intervals:
+    rows: dict[str, list[list[int]]] = {}
+    for name, begin, length in windows:
+        first = BASE + begin * SECOND // 4
+        rows.setdefault(world.ids[name], []).append([first, first + length * SECOND // 4, 1])
+    return Intervals.of((name, np.array(spans, np.int64)) for name, spans in rows.items())
+
+
+def asked(world: World, question: dict[str, Any]) -> Query:
+    query = world.store.topic(*question["topics"]).in_recording(*question["recordings"])
+    if question["span"] is not None:
+        query = query.between(*question["span"])
+    query = query.clock(question["clock"])
+    if question["condition"] is not None:
+        query = query.where(question["condition"])
+    if question["windows"] is not None:
+        query = query.during(_windows(world, question["windows"]))
+    if question["every"] > 1:
+        query = query.every(question["every"])
+    if question["limit"] is not None:
+        query = query.limit(question["limit"])
+    return query.reverse() if question["reverse"] else query
+
+
+def expected(world: World, question: dict[str, Any]) -> list[Sent]:
+    """The plain evaluation: a loop over all that was written."""
+    test = None
+    if question["condition"] is not None:
+        types = None if question["topics"] == ("/state",) else _types(world, question)
+        test = to_bool(parse(question["condition"]).root, types)
+    named = {world.ids[name] for name in question["recordings"]}
+    found = []
+    for sent in world.sent:
+        time = {"log": sent.log_time, "publish": sent.publish_time, "header": sent.stamp}
+        now = time[question["clock"]]
+        span = question["span"]
+        if sent.topic not in question["topics"] or sent.recording not in named:
+            continue
+        if span is not None and (now is None or not span[0] <= now < span[1]):
+            continue
+        if question["windows"] is not None and not any(
+            world.ids[name] == sent.recording
+            and BASE + begin * SECOND // 4 <= sent.log_time < BASE + (begin + n) * SECOND // 4
+            for name, begin, n in question["windows"]
+        ):
+            continue
+        if test is not None and not test({**sent.fields, "_meta": {"seq": sent.seq}}):
+            continue
+        found.append(sent)
+    if question["reverse"]:
+        found.reverse()
+    seen: dict[str, int] = {}
+    thinned = []
+    for sent in found:
+        seen[sent.topic] = seen.get(sent.topic, -1) + 1
+        if seen[sent.topic] % question["every"] == 0:
+            thinned.append(sent)
+    return thinned if question["limit"] is None else thinned[: question["limit"]]
+
+
+def _types(world: World, question: dict[str, Any]) -> dict[str, str] | None:
+    return world.store.topic(*question["topics"]).field_types()
+
+
+def check(world: World, question: dict[str, Any]) -> None:
+    want = expected(world, question)
+    for way in WAYS:
+        with only(way):
+            query = asked(world, question)
+            try:
+                count = query.count()
+            except TimeError:
+                assert not want, (way, question)
+                continue
+            assert count == len(want), (way, question)
+            got = [(m.recording, m.topic, m.log_time_ns, m.seq, m.raw) for m in query]
+            assert got == [(s.recording, s.topic, s.log_time, s.seq, s.raw) for s in want], (
+                way,
+                question,
+            )
+            # With patterns or rounded integers, MongoDB alone does not know when it is wrong.
+            if way != "mongo" and query.question.returns_all and question["clock"] == "log":
+                spans = np.array([[s.log_time, s.log_time + 1] for s in world.sent], np.int64)
+                for recording in query.recordings:
+                    inside = query.any_within(recording, spans)
+                    times = {s.log_time for s in want if s.recording == recording}
+                    assert inside.tolist() == [s.log_time in times for s in world.sent], way
+
+
+relaxed = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
+
+
+@settings(max_examples=60, suppress_health_check=relaxed)
+@given(question=questions())
+def test_every_engine_answers_as_a_loop_does(world: World, question: dict[str, Any]) -> None:
+    check(world, question)
+
+
+@pytest.mark.slow
+@settings(max_examples=3000, suppress_health_check=relaxed)
+@given(question=questions())
+def test_three_thousand_questions(world: World, question: dict[str, Any]) -> None:
+    check(world, question)
