@@ -981,7 +981,13 @@ def expected(model: dict[str, Recording], asked: Asked) -> list[Said] | type[Exc
     if asked.number is not None:
         everything = [m for m in everything if _number(m) >= asked.number]
     everything.sort(key=lambda m: m.order, reverse=asked.reverse)
-    everything = everything[:: asked.every]
+    seen: Counter[str] = Counter()
+    thinned = []
+    for m in everything:
+        if seen[m.topic] % asked.every == 0:
+            thinned.append(m)
+        seen[m.topic] += 1
+    everything = thinned
     return everything if asked.limit is None else everything[: asked.limit]
 
 

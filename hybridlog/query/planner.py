@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -225,8 +226,8 @@ class Planner:
         for number, group in groups.items():
             try:
                 total += self._engines[number].count(group)
-            except _RETRIED:
-                total += sum(self._count_otherwise(part, number) for part in group)
+            except _RETRIED as error:
+                total += sum(self._count_otherwise(part, number, error) for part in group)
         if narrowed:
             scan = ChunkScan(self._plan_of(narrowed), self.session.segment)
             total += sum(len(run.batch) for run in scan.unordered())
@@ -239,18 +240,13 @@ class Planner:
         able = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
         return able in ([], [self._scan]) and self._mongo.cost(part, Need.SELECTION) is not None
 
-    def _count_otherwise(self, part: Part, failed: int) -> int:
+    def _count_otherwise(self, part: Part, failed: int, failure: Exception) -> int:
         """The count of an engine that failed, by the next ones."""
-        others = [e for e in self._choose(part, Need.COUNT) if e is not self._engines[failed]]
-        failure: Exception | None = None
-        for engine in others:
-            try:
-                return engine.count([part])
-            except _RETRIED as error:
-                failure = failure or error
-        if failure is not None:
-            raise failure
-        return self._engines[failed].count([part])
+        for engine in self._choose(part, Need.COUNT):
+            if engine is not self._engines[failed]:
+                with suppress(*_RETRIED):
+                    return engine.count([part])
+        raise failure
 
     def _first(
         self,

@@ -48,9 +48,7 @@ _MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
 _PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
-_SPARSE = 4  # times the usual span, for a chunk that holds little
-_FEW = 4  # messages: a chunk of fewer holds little, too,
-_LITTLE = 8  # with less than so many times the bytes of others: each costs more than a message
+_SMALL_SPANS = 64  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
 _WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
@@ -63,9 +61,8 @@ class SegmentSettings:
         chunk_size: Bytes of uncompressed content at which a chunk closes, if its writer is not
             told otherwise, as it is where very much comes.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
-        span_size: Bytes of content below which it may span four times as much, or below eight
-            times these with fewer than four messages: what is read too much for a short slice
-            is little then, and what a chunk costs is not.
+        span_size: Bytes of content below which such a chunk may span 64 times as much: small
+            chunks compress badly, and reading one whole costs little.
         large_payload: Mean payload bytes from which a channel gets chunks of its own.
         compression: Codec of chunks that can be compressed.
         level: zstd level.
@@ -78,10 +75,10 @@ class SegmentSettings:
 
     chunk_size: int = 2 << 20
     chunk_span_ns: int = 250_000_000
-    span_size: int = 32 << 10
+    span_size: int = 512 << 10
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
-    level: int = 1
+    level: int = 3
     segment_size: int = 4 << 30
     segment_span_s: float | None = None
     sync: Literal["chunk", "seal", "never"] = "seal"
@@ -242,7 +239,7 @@ class RecordingWriter:
         if len(builder):
             size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
             away = abs(log_time - builder.first_log_time)
-            is_far = away >= self._span_of(len(builder), builder.messages)
+            is_far = away >= self._span_of(len(builder))
             if (key != _SHARED and is_far) or size > builder.capacity:
                 self._close_chunk(key)
                 builder = self._builder(key)
@@ -392,11 +389,10 @@ class RecordingWriter:
             if start < total or len(builder) >= builder.capacity:
                 self._close_chunk(key)
 
-    def _span_of(self, held: _Count, messages: _Count) -> _Count:
-        """Most log time, ns, of a chunk of its own with so many bytes and messages."""
-        # Of one number as of many: what is true counts as 1.
-        little = self.settings.span_size * (1 + (_LITTLE - 1) * (messages < _FEW))
-        return self.settings.chunk_span_ns * (1 + (_SPARSE - 1) * (held < little))
+    def _span_of(self, held: _Count) -> _Count:
+        """Longest log time, ns, of a chunk of one channel that holds so many bytes."""
+        is_small = held < self.settings.span_size
+        return self.settings.chunk_span_ns * (1 + (_SMALL_SPANS - 1) * is_small)
 
     def _span_end(self, builder: ChunkBuilder, batch: Batch | LooseBatch, start: int) -> int:
         """First row from `start` on that lies too far in log time from the chunk's first."""
@@ -407,8 +403,7 @@ class RecordingWriter:
             return len(batch)
         sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
         held = np.cumsum(sizes) - sizes + len(builder)
-        messages = np.arange(len(sizes)) + builder.messages
-        far = away >= self._span_of(held, messages)
+        far = away >= self._span_of(held)
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:

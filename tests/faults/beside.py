@@ -44,7 +44,6 @@ def watch(bench: Bench, scenario: Scenario, *, anew: bool) -> Watched:
         pauses = Pauses(bench.path / "pauses")
         with pauses, case.open() as held:
             held.connect()
-            held.kept.most_bytes = 0
             command = [name, str(pauses.path), *arguments]
             bench.stepper.start(command, case.path, case.uri, Point("pause"))
             for step in pauses.steps():
@@ -54,7 +53,6 @@ def watch(bench: Bench, scenario: Scenario, *, anew: bool) -> Watched:
                     continue
                 try:
                     with case.open() as opened:
-                        opened.kept.most_bytes = 0
                         _ask(opened, scenario, step, watched)
                 except HybridlogError as error:
                     watched.refused[type(error).__name__] += 1

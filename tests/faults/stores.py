@@ -208,7 +208,6 @@ def look(case: Case) -> State:
         WrongError: An answer contradicts another one, or something was left over.
     """
     with case.open() as store:
-        store.kept.most_bytes = 0  # MongoDB answers
         without_server = {entry.label: _messages(store, entry) for entry in store.recordings()}
         database = store.connect()
         # What connecting has mended is what counts.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.frames.bson import key_columns, reference_columns
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, Values
@@ -17,18 +16,19 @@ from hybridlog.query.predicate.tree import And
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
+from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns
 from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.frames.bson import KeyColumns
     from hybridlog.guarded import GuardedIndex
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.predicate.to_mongo import MongoFilter
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
+    from hybridlog_storage.index_columns import KeyColumns
 
 _QUESTION_S = 0.4e-3  # seconds of a question to MongoDB
 _LOOK_S = 0.7e-6  # seconds to look at a document
@@ -36,8 +36,6 @@ _DOCUMENT_S = 4e-6  # seconds to send a document
 _WINDOWS_A_QUESTION = 14
 _BATCH = 50_000
 _DOCUMENTS = 10_000
-_KEY = {"_id": 1}
-_REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 _Filter = dict[str, object]
 
 
@@ -148,17 +146,17 @@ class Mongo:
             for raw in index.find_raw(
                 collection_of(part.topic),
                 joined(condition, self.filter_of(part).filter),
-                _REFERENCE,
+                REFERENCE,
                 sort=[("_id", 1)],
             ):
                 reference = reference_columns(raw)
-                self._counters.documents_read += len(reference.off)
-                places = np.stack([reference.seg, reference.chunk], axis=1)
+                self._counters.documents_read += len(reference)
+                places = np.stack([reference.segment, reference.chunk], axis=1)
                 groups, inverse = np.unique(places, axis=0, return_inverse=True)
                 for number, (segment, chunk) in enumerate(groups.tolist()):
                     key = (part.recording.id, segment, chunk)
                     if key in wanted:
-                        found[key].append(reference.off[inverse.reshape(-1) == number])
+                        found[key].append(reference.offset[inverse.reshape(-1) == number])
         return RowSelection({key: np.sort(np.concatenate(p)) for key, p in found.items()})
 
     def documents(self, part: Part, *, reverse: bool) -> Iterator[bytes]:
@@ -183,7 +181,7 @@ class Mongo:
     def _keys(self, part: Part, collection: str, asked: _Filter) -> Iterator[KeyColumns]:
         """Keys of the documents that a filter finds, in order, never an empty batch."""
         index = self._index([part])
-        for raw in index.find_raw(collection, asked, _KEY, sort=[("_id", 1)], batch_size=_BATCH):
+        for raw in index.find_raw(collection, asked, KEY, sort=[("_id", 1)], batch_size=_BATCH):
             keys = key_columns(raw)
             self._counters.documents_read += len(keys)
             if len(keys):

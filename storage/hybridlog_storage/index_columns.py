@@ -1,0 +1,153 @@
+"""Keys and references of index documents as columns, read from projected documents.
+
+A projection of index documents to their key, or to the place of the payload, has the same
+layout in every document. So a batch of thousands of them is read as one numpy array.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+KEY: Final = {"_id": 1}
+"""The projection that `key_columns` reads."""
+REFERENCE: Final = {"_id": 0, "_meta.ref": 1}
+"""The projection that `reference_columns` reads."""
+
+_KEY_VALUE = np.dtype([("time", ">u8"), ("recording", ">u8"), ("seq", ">u8")])
+_KEY_HEAD = np.void(b"\x27\0\0\0\x05_id\0\x18\0\0\0\0")
+"""What precedes the key: 39 bytes in all, a binary value named `_id` of 24 bytes."""
+_KEY_DOCUMENT = np.dtype([("head", "V14"), ("key", _KEY_VALUE), ("end", "u1")])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyColumns:
+    """The keys of index documents.
+
+    Attributes:
+        time: int64[n], log time, ns.
+        recording: uint64[n], key of the recording.
+        seq: int64[n], arrival number in the recording.
+    """
+
+    time: NDArray[np.int64]
+    recording: NDArray[np.uint64]
+    seq: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of keys."""
+        return len(self.time)
+
+    def take(self, rows: NDArray[np.intp] | slice) -> KeyColumns:
+        """The chosen keys."""
+        return KeyColumns(self.time[rows], self.recording[rows], self.seq[rows])
+
+    def place_after(self, time: int, seq: int) -> int:
+        """How many keys of one recording, in order, are not after a place."""
+        low = int(np.searchsorted(self.time, time, "left"))
+        high = int(np.searchsorted(self.time, time, "right"))
+        return low + int(np.searchsorted(self.seq[low:high], seq, "right"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceColumns:
+    """Where the payloads of messages lie.
+
+    Attributes:
+        segment: int64[n], number of the segment.
+        chunk: int64[n], number of the chunk in the segment.
+        offset: int64[n], start of the payload in the uncompressed chunk.
+    """
+
+    segment: NDArray[np.int64]
+    chunk: NDArray[np.int64]
+    offset: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of references."""
+        return len(self.offset)
+
+
+def key_columns(batch: bytes) -> KeyColumns:
+    """The keys of index documents, in document order.
+
+    Args:
+        batch: Documents one after the other, projected to `KEY`.
+
+    Raises:
+        StoreError: a document is not one of hybridlog's.
+    """
+    documents = _documents(batch, _KEY_DOCUMENT)
+    if len(documents) and (documents["head"] != _KEY_HEAD).any():
+        raise _strange("_id")
+    keys = documents["key"]
+    return KeyColumns(
+        keys["time"].astype(np.int64),
+        keys["recording"].astype(np.uint64),
+        keys["seq"].astype(np.int64),
+    )
+
+
+def reference_columns(batch: bytes) -> ReferenceColumns:
+    """Where the payloads of messages lie, in document order.
+
+    Args:
+        batch: Documents one after the other, projected to `REFERENCE`.
+
+    Raises:
+        StoreError: a document is not one of hybridlog's.
+    """
+    documents = _documents(batch, _REFERENCE_DOCUMENT)
+    for name, expected in _REFERENCE_TEXT.items():
+        if len(documents) and (documents[name] != expected).any():
+            raise _strange("_meta.ref")
+    return ReferenceColumns(
+        documents["seg"].astype(np.int64),
+        documents["chunk"].astype(np.int64),
+        documents["off"].astype(np.int64),
+    )
+
+
+def _documents(batch: bytes, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    if len(batch) % layout.itemsize:
+        raise _strange("layout")
+    return np.frombuffer(batch, layout)
+
+
+def _strange(what: str) -> StoreError:
+    return StoreError(
+        f"An index document has an unexpected {what}. `hybridlog reindex` makes the index anew."
+    )
+
+
+def _reference_layout() -> tuple[np.dtype[np.void], dict[str, np.void]]:
+    """The layout of a projected document, and the bytes between its values."""
+    integers = [("seg", 0x10, "<i4"), ("chunk", 0x12, "<i8"), ("off", 0x12, "<i8")]
+    integers.append(("len", 0x12, "<i8"))
+    sizes = {"<i4": 4, "<i8": 8}
+    inner = 4 + sum(2 + len(name) + sizes[kind] for name, _, kind in integers) + 1
+    meta = 4 + len(b"\x03ref\0") + inner + 1
+    whole = 4 + len(b"\x03_meta\0") + meta + 1
+    text = struct.pack("<i", whole) + b"\x03_meta\0" + struct.pack("<i", meta)
+    text += b"\x03ref\0" + struct.pack("<i", inner)
+    fields: list[tuple[str, str]] = []
+    expected: dict[str, np.void] = {}
+    for name, tag, kind in integers:
+        text += bytes([tag]) + name.encode() + b"\0"
+        fields += [(f"before {name}", f"V{len(text)}"), (name, kind)]
+        expected[f"before {name}"] = np.void(text)
+        text = b""
+    fields.append(("end", "V3"))
+    expected["end"] = np.void(b"\0\0\0")
+    return np.dtype(fields), expected
+
+
+_REFERENCE_DOCUMENT, _REFERENCE_TEXT = _reference_layout()
