@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from hybridlog.counting import count_in_columns, in_all_times
+from hybridlog.frames.names import is_own, is_summary
 from hybridlog.indexing import STAMP
 from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_counts import count_in_chunks
@@ -175,14 +176,17 @@ class Query:
         return self._with(_reverse=not self._reverse)
 
     def fields(self, *paths: str) -> Query:
-        """Only these fields in tables (`header.stamp`, `pose.position`).
+        """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
+
+        `publish_time`, `stamp` (of the header), `seq` (arrival number), `sequence` (the
+        sender's), `topic` and `recording` are columns, too, where no field is called so.
 
         Raises:
             TopicError: no topic of the query has such a field.
         """
         known = self.field_types()
         for path in paths:
-            if known and not _is_field(path, known):
+            if known and not (_is_field(path, known) or is_own(path)):
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(_fields=tuple(paths))
 
@@ -505,23 +509,18 @@ class Query:
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
-        from hybridlog.frames.answer import arranged, collect
+        from hybridlog.frames.answer import collect
 
         table = collect(self).to_arrow()
-        table = table.select(arranged(table.column_names, self._fields))
         if self._reverse:
             table = table.take(np.arange(table.num_rows - 1, -1, -1))
         return table
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: scalars as columns, arrays as numpy cells, indexed by log time (UTC, ns)."""
-        from hybridlog.frames.answer import arranged, collect
+        from hybridlog.frames.answer import collect
 
         frame = collect(self).to_pandas()
-        names = list(frame.columns)
-        wanted = arranged(names, self._fields)
-        if wanted != names:  # choosing columns takes as long as making the frame
-            frame = frame[wanted]
         if self._reverse:
             frame = frame.iloc[::-1]
         frame.attrs["hybridlog"] = _as_dict(self.counters)
@@ -1091,7 +1090,7 @@ def _as_dict(counters: Counters) -> dict[str, float]:
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:
-    if summary_type(path, known) is not None:
+    if is_summary(path, known):
         return True
     return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
 
