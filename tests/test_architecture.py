@@ -59,6 +59,7 @@ ALLOWED = {
         "hybridlog.schema.arrow_columns",
         "hybridlog.schema.arrow_objects",
         "hybridlog.schema.arrow_protobuf",
+        "hybridlog.schema.arrow_types",
     ),
     "pymongo": ("hybridlog_storage.database",),
     "rclpy": ("hybridlog.live_sources.ros2_middleware",),

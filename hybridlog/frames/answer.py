@@ -1,203 +1,280 @@
-"""From a query to columns: out of the index when that is enough, else out of payloads."""
+"""From a query to tables: payloads are decoded, or columns of whole topics are taken."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
-from hybridlog.frames import TableBuilder
-from hybridlog.indexing import rows_by_channel
-from hybridlog.schema.column import Records, Strings
+from hybridlog.frames.builder import Block, TableBuilder
+from hybridlog.frames.names import is_summary, own_columns, summary_of
+from hybridlog.indexing import STAMP, rows_by_channel
+from hybridlog.schema.arrow_columns import TIME, numbers, structs
+from hybridlog.schema.arrow_types import common_schema
 from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import MessageRun, ScanPlan
+    from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Question, RecordedChannel
 
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
 _SEQ_BITS = 44
+_FIXED = {"ros1", "cdr"}
+"""Encodings of which a definition fixes the fields."""
 
 
-class Block(NamedTuple):
-    """Columns of some messages.
-
-    Attributes:
-        topic: Their topic.
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        records: n rows.
-        size: Bytes of their payloads, 0 when they came out of the index.
-    """
-
-    topic: str
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-    records: Records
-    size: int
-
-
-def collect(planner: Planner) -> TableBuilder:
-    """All columns of a query's answer.
+def to_arrow(planner: Planner) -> pa.Table:
+    """The whole answer as an Arrow table, in order.
 
     Raises:
         DefinitionError: a topic has no definition to make columns from.
     """
-    several = len(planner.question.topics) > 1
-    plan = planner.scan_plan()
-    _check(plan.channels)
-    builder = TableBuilder(expected_rows=_expected(planner, plan))
-    for block in _empty(planner):
-        _append(builder, block, several=several)
-    all_of_them = planner.question.returns_all
-    for run in planner.unordered(plan) if all_of_them else planner.runs(plan):
-        for block in _decoded(plan.channels, run, planner):
-            _append(builder, block, several=several)
-    return builder
-
-
-def to_arrow(planner: Planner) -> pa.Table:
-    """The whole answer as an Arrow table, in order."""
-    question = planner.question
-    table = collect(planner).to_arrow()
-    table = table.select(arranged(table.column_names, question.fields))
-    return table.take(np.arange(table.num_rows - 1, -1, -1)) if question.reverse else table
+    return _finished(_collected(planner), planner.question)
 
 
 def to_pandas(planner: Planner) -> pd.DataFrame:
-    """The whole answer as a frame, in order."""
+    """The whole answer as a frame, in order.
+
+    Raises:
+        DefinitionError: a topic has no definition to make columns from.
+    """
+    frame = _collected(planner).to_pandas()
+    return frame.iloc[::-1] if planner.question.reverse else frame
+
+
+def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
-    frame = collect(planner).to_pandas()
-    names = list(frame.columns)
-    wanted = arranged(names, question.fields)
-    if wanted != names:  # choosing columns takes as long as making the frame
-        frame = frame[wanted]
-    return frame.iloc[::-1] if question.reverse else frame
+    builder = TableBuilder(question.fields)
+    plan = planner.scan_plan()
+    decoder = Decoder(planner, plan.channels)
+    for block in Decoder(planner, planner.channels()).empty():
+        builder.append(block)
+    for run in planner.unordered(plan) if question.returns_all else planner.runs(plan):
+        for block in decoder.blocks(run):
+            builder.append(block)
+    return builder
 
 
 def stream(planner: Planner) -> Iterator[pa.Table]:
-    """The answer in order, in tables of bounded size; at least one, perhaps empty."""
-    several = len(planner.question.topics) > 1
+    """The answer in order, in tables of bounded size; at least one, perhaps empty.
+
+    The type of a column may change from table to table where no definition fixes it.
+    """
+    question = planner.question
     plan = planner.scan_plan()
-    _check(planner.channels())
-    decoded = (_decoded(plan.channels, run, planner) for run in planner.runs(plan))
-    groups: Iterator[Iterable[Block]] = chain([_empty(planner)], decoded)
-    yield from _tables(planner.question, groups, several=several)
-
-
-def _tables(
-    question: Question, groups: Iterator[Iterable[Block]], *, several: bool
-) -> Iterator[pa.Table]:
-    builder, size = TableBuilder(), 0
+    decoder = Decoder(planner, plan.channels)
+    decoded = (decoder.blocks(run) for run in planner.runs(plan))
+    groups = chain([Decoder(planner, planner.channels()).empty()], decoded)
+    builder, size = TableBuilder(question.fields), 0
     given = False
     for group in groups:
         # Blocks of one group overlap in time, so no table ends between them.
         if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
             yield _finished(builder, question)
             given = True
-            builder, size = TableBuilder(), 0
+            builder, size = TableBuilder(question.fields), 0
         for block in group:
-            _append(builder, block, several=several)
+            builder.append(block)
             size += block.size
     if len(builder) or not given:
         yield _finished(builder, question)
 
 
-def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
-    """Column names in the order in which their fields were asked for."""
-    if fields is None:
-        return list(names)
+def schema_of(planner: Planner) -> pa.Schema | None:
+    """The columns of an answer, when they depend on what is in its messages; else None.
 
-    def place(name: str) -> int:
-        for number, path in enumerate(fields):
-            plain = path.replace("[]", "")
-            if name == plain or name.startswith(f"{plain}.") or plain.startswith(f"{name}."):
-                return number
-        return -1  # what was not asked for comes first: log time, topic
+    The messages of which no definition fixes the fields are read for it.
+    """
+    if not any(_is_open(channel) for channel in planner.channels()):
+        return None
+    return common_schema(stream(planner))
 
-    return sorted(names, key=place)
+
+def json_columns(schema: pa.Schema | None) -> list[str]:
+    """Columns that are JSON text, since they have no common exact type."""
+    return [] if schema is None else [field.name for field in schema if field.type == pa.json_()]
+
+
+def _is_open(channel: RecordedChannel) -> bool:
+    """Whether the columns of a channel depend on what is in its messages."""
+    return channel.channel.message_encoding not in _FIXED
 
 
 def _finished(builder: TableBuilder, question: Question) -> pa.Table:
     table = builder.to_arrow()
-    table = table.select(arranged(table.column_names, question.fields))
-    if question.reverse:
-        table = table.take(np.arange(table.num_rows - 1, -1, -1))
-    return table
+    return table.take(np.arange(table.num_rows - 1, -1, -1)) if question.reverse else table
 
 
-def _append(builder: TableBuilder, block: Block, *, several: bool) -> None:
-    records = with_topic(block.records, block.topic) if several else block.records
-    builder.append(block.log_time, block.seq, records)
+class Decoder:
+    """Makes blocks of the messages of a query.
 
+    Args:
+        planner: Of the question.
+        channels: The channels of the messages.
 
-def with_topic(records: Records, topic: str) -> Records:
-    """The same columns behind one that says the topic."""
-    name = np.frombuffer(topic.encode("utf-8", "replace"), np.uint8)
-    rows = len(records)
-    column = Strings(np.tile(name, rows), np.arange(rows + 1, dtype=np.int64) * len(name))
-    return Records({"topic": column, **records.fields}, rows)
+    Attributes:
+        channels: The same.
 
+    Raises:
+        DefinitionError: A channel has no definition to make columns from.
+    """
 
-def _decoded(
-    lanes: Sequence[RecordedChannel], piece: MessageRun, planner: Planner
-) -> Iterator[Block]:
-    ranks = _ranks(lanes)
-    for number, rows in rows_by_channel(piece.batch.channel):
-        lane = lanes[number]
-        if lane.is_reduced:
-            planner.counters.reduced += len(rows)
-            continue
-        batch, seq = piece.batch.take(rows), piece.seq[rows]
-        decoded = lane.codec.columns(
-            batch.buffer, batch.offset, batch.length, planner.question.fields
+    def __init__(self, planner: Planner, channels: Sequence[RecordedChannel]) -> None:
+        _check(channels)
+        self.channels = channels
+        self._counters = planner.counters
+        self._chosen = planner.question.fields
+        self._own = _own(planner)
+        self._ranks = _ranks(planner.channels(), channels)
+        self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
+
+    def empty(self) -> Iterator[Block]:
+        """A block without rows for each channel: columns exist even when no message does."""
+        none = np.empty(0, np.int64)
+        batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
+        for number, channel in enumerate(self.channels):
+            if not channel.is_reduced:
+                yield self.block(number, batch, none)[0]
+
+    def blocks(self, run: MessageRun) -> Iterator[Block]:
+        """The messages of a run, by channel."""
+        for number, rows in rows_by_channel(run.batch.channel):
+            if self.channels[number].is_reduced:
+                self._counters.reduced += len(rows)
+            else:
+                yield self.block(number, run.batch.take(rows), run.seq[rows])[0]
+
+    def block(
+        self, number: int, batch: Batch, seq: NDArray[np.int64]
+    ) -> tuple[Block, NDArray[np.intp]]:
+        """Messages of one channel, and which of the rows could be read."""
+        channel = self.channels[number]
+        decoded = channel.codec.arrow(
+            batch.buffer, batch.offset, batch.length, self._fields[number]
         )
-        good = decoded.rows
-        yield Block(
-            lane.channel.topic,
-            batch.log_time[good],
-            seq[good] + ranks[number],
-            decoded.records,
-            batch.payload_bytes,
-        )
+        records, good = decoded.records, decoded.rows
+        stamps = None
+        if "stamp" in self._own:
+            stamps = _stamps(records)
+            records = _without_stamp(records, self._chosen)
+        if len(good) < len(batch):
+            batch, seq = batch.take(good), seq[good]
+        own = self.own_columns(number, batch, seq, stamps)
+        order = seq + self._ranks[number]
+        topic = channel.channel.topic
+        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes), good
+
+    def own_columns(
+        self,
+        number: int,
+        batch: Batch,
+        seq: NDArray[np.int64],
+        stamps: pa.Array[Any] | None = None,
+    ) -> dict[str, pa.Array[Any]]:
+        """Our columns of messages of one channel, besides the log time."""
+        channel = self.channels[number]
+        return {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
 
 
-def _ranks(lanes: Sequence[RecordedChannel]) -> list[int]:
-    """What makes arrival numbers of each lane's recording follow those of the one before."""
-    order = {key: rank for rank, key in enumerate(sorted({lane.recording.key for lane in lanes}))}
-    return [order[lane.recording.key] << _SEQ_BITS for lane in lanes]
+def _own(planner: Planner) -> list[str]:
+    """Columns of ours that a table has besides the log time."""
+    question, channels = planner.question, planner.channels()
+    defined = {path.path for c in channels if not c.is_reduced for path in c.codec.paths()}
+    asked = own_columns(question.fields, defined)
+    unasked = []
+    if len(question.topics) > 1:
+        unasked.append("topic")
+    if len({channel.recording.key for channel in channels}) > 1:
+        unasked.append("recording")
+    return [name for name in dict.fromkeys([*unasked, *asked]) if name != "log_time"]
 
 
-def _empty(planner: Planner) -> Iterator[Block]:
-    """A block without rows for each channel: columns exist even when no message does."""
-    none = np.empty(0, np.int64)
-    for channel in planner.channels():
-        if channel.is_reduced:
-            continue
-        decoded = channel.codec.columns(b"", none, none, planner.question.fields)
-        yield Block(channel.channel.topic, none, none, decoded.records, 0)
+def _own_column(
+    name: str,
+    channel: RecordedChannel,
+    batch: Batch,
+    seq: NDArray[np.int64],
+    stamps: pa.Array[Any] | None,
+) -> pa.Array[Any]:
+    rows = len(batch)
+    if name == "topic":
+        return _text(channel.channel.topic, rows)
+    if name == "recording":
+        return _text(channel.recording.label, rows)
+    if name == "seq":
+        return numbers(seq)
+    if name == "sequence":
+        return numbers(batch.sequence)
+    if name == "publish_time":
+        known = channel.channel.has_publish_time
+        return numbers(batch.publish_time, "time") if known else pa.nulls(rows, TIME)
+    return pa.nulls(rows, TIME) if stamps is None else stamps
 
 
-def _expected(planner: Planner, plan: ScanPlan) -> int | None:
-    """How many rows will come, when that is known before."""
-    question = planner.question
-    if question.returns_all and question.is_unbounded and question.predicate is None:
-        return sum(task.messages for task in plan.tasks())
-    return None
+def _text(text: str, rows: int) -> pa.Array[Any]:
+    text = text.encode("utf-8", "replace").decode()
+    return pa.repeat(pa.scalar(text, pa.string()), rows)
 
 
-def _check(lanes: Sequence[RecordedChannel]) -> None:
-    for lane in lanes:
-        if lane.codec.reason is not None:
+def _to_decode(
+    fields: Sequence[str] | None, channel: RecordedChannel, own: Sequence[str]
+) -> frozenset[str] | None:
+    """Paths that are decoded: those asked for, arrays whose summaries are, the stamp."""
+    if fields is None or channel.is_reduced:
+        return None
+    known = {path.path: path.type for path in channel.codec.paths()}
+    wanted = set(fields)
+    for path in fields:
+        summary = summary_of(path)
+        if summary is not None and is_summary(path, known):
+            wanted.add(summary[0])
+    return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
+
+
+def _stamps(records: pa.StructArray) -> pa.Array[Any] | None:
+    """The header stamps of messages; None when they have none."""
+    found: pa.Array[Any] = records
+    for name in STAMP.split("."):
+        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
+            return None
+        found = found.flatten()[found.type.get_field_index(name)]
+    return found if found.type == TIME else None
+
+
+def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.StructArray:
+    """The messages without the stamp that was decoded only for the column of that name."""
+    if fields is None or any(path in {"header", STAMP} for path in fields):
+        return records
+    children = dict(zip([f.name for f in records.type], records.flatten(), strict=True))
+    header = children.get("header")
+    if header is None or not pa.types.is_struct(header.type):
+        return records
+    inner = dict(zip([f.name for f in header.type], header.flatten(), strict=True))
+    inner.pop("stamp", None)
+    children["header"] = structs(inner, len(records))
+    return structs(children, len(records))
+
+
+def _ranks(every: Sequence[RecordedChannel], channels: Sequence[RecordedChannel]) -> list[int]:
+    """Numbers that put the messages of one recording behind those of the one before."""
+    keys = sorted({channel.recording.key for channel in every})
+    order = {key: rank for rank, key in enumerate(keys)}
+    return [order[channel.recording.key] << _SEQ_BITS for channel in channels]
+
+
+def _check(channels: Sequence[RecordedChannel]) -> None:
+    for channel in channels:
+        if channel.codec.reason is not None:
             raise DefinitionError(
-                f"{lane.channel.topic} cannot be made a table: {lane.codec.reason}. "
+                f"{channel.channel.topic} cannot be made a table: {channel.codec.reason}. "
                 "Its payloads can be fetched as they are (--format raw or mcap)."
             )

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from hybridlog.frames.names import is_own, is_summary
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import just_before, message_at
 from hybridlog.query.answers.latched import in_force
@@ -40,11 +41,6 @@ if TYPE_CHECKING:
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.messages import Batch
-
-_NUMBERS = {
-    "bool", "byte", "char", "float32", "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}  # fmt: skip
 
 
 class Query:
@@ -164,14 +160,17 @@ class Query:
         return self._with(reverse=not self.question.reverse)
 
     def fields(self, *paths: str) -> Query:
-        """Only these fields in tables (`header.stamp`, `pose.position`).
+        """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
+
+        `publish_time`, `stamp` (of the header), `seq` (arrival number), `sequence` (the
+        sender's), `topic` and `recording` are columns, too, where no field is called so.
 
         Raises:
             TopicError: no topic of the query has such a field.
         """
         known = self.field_types()
         for path in paths:
-            if known and not _is_field(path, known):
+            if known and not (_is_field(path, known) or is_own(path)):
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
@@ -441,6 +440,18 @@ class Query:
 
         return stream(self._planner())
 
+    def schema(self) -> pa.Schema | None:
+        """Columns of the tables, where only the messages tell; None where definitions do."""
+        from hybridlog.frames.answer import schema_of
+
+        return schema_of(Planner(self._session, self.question, Counters()))
+
+    def to_json_lines(self) -> Iterator[list[str]]:
+        """The answer in order as lines of JSON, many at a time."""
+        from hybridlog.frames.lines import lines
+
+        return lines(self._planner())
+
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked when all are alike."""
         arrays: list[NDArray[Any]] = [message.to_numpy() for message in self]
@@ -486,20 +497,9 @@ class Query:
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:
-    if summary_type(path, known) is not None:
+    if is_summary(path, known):
         return True
     return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
-
-
-def summary_type(path: str, known: Mapping[str, str]) -> str | None:
-    """Type of a summary of an array of numbers (`ranges.min`), None if a path is none."""
-    array, _, what = path.rpartition(".")
-    element, bracket, _ = known.get(array, "").partition("[")
-    if not bracket or what not in {"n", "min", "max", "mean"} or element not in _NUMBERS:
-        return None
-    if what == "n" or (what != "mean" and not element.startswith("float")):
-        return "int64"
-    return "float64"
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:

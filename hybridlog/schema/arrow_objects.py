@@ -8,13 +8,13 @@ integers that a double would round.
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import DURATION, TIME, lists, structs
+from hybridlog.schema.plain import MAX_DEPTH, json_text
 from hybridlog.schema.utf8 import repaired_text
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 EXACT = 1 << 53
 """A double holds every integer up to this, and not the next one."""
-MAX_DEPTH = 100
-"""Values that are nested deeper are JSON text."""
 MAX_NAMES = 10_000
 """Objects within a message that have more different names are JSON text."""
 _INT64, _UINT64 = np.iinfo(np.int64), np.iinfo(np.uint64)
@@ -84,33 +82,6 @@ def json_array(values: Sequence[Any]) -> pa.Array[Any]:
     """Values as JSON text, None as null."""
     texts = [None if value is None else json_text(value) for value in values]
     return pa.ExtensionArray.from_storage(pa.json_(), pa.array(texts, pa.string()))
-
-
-def json_text(value: object) -> str:
-    """A value as compact JSON, with NaN and infinities as strings, as protobuf writes them."""
-    try:
-        text = json.dumps(
-            value, ensure_ascii=False, allow_nan=False, separators=(",", ":"), default=str
-        )
-    except ValueError:
-        return json_text(without_nan(value))
-    except RecursionError:
-        text = json.dumps(f"nested deeper than {MAX_DEPTH}")
-    return repaired_text(text)
-
-
-def without_nan(value: Any) -> Any:
-    """The value with `"NaN"`, `"Infinity"` and `"-Infinity"`, for which JSON has no number."""
-    if isinstance(value, float):
-        if value != value:  # noqa: PLR0124 - only NaN
-            return "NaN"
-        if value in {np.inf, -np.inf}:
-            return "Infinity" if value > 0 else "-Infinity"
-    elif isinstance(value, dict):
-        return {name: without_nan(item) for name, item in value.items()}
-    elif isinstance(value, list):
-        return [without_nan(item) for item in value]
-    return value
 
 
 def missing_rows(values: Sequence[object]) -> NDArray[np.bool_] | None:

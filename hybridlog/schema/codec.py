@@ -14,7 +14,7 @@ from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -59,6 +59,24 @@ class DecodedArrow:
 
     rows: NDArray[np.intp]
     records: pa.StructArray
+    unreadable: list[Unreadable]
+
+
+@dataclass(slots=True)
+class DecodedObjects:
+    """Messages as plain objects, for JSON lines.
+
+    A field that a message lacks is not there, and one that is null is None. Times are
+    nanoseconds; bytes are bytes.
+
+    Attributes:
+        rows: Rows of the input that could be read, ascending.
+        objects: One for each of them.
+        unreadable: The other rows, each in one of these.
+    """
+
+    rows: NDArray[np.intp]
+    objects: Sequence[Mapping[str, object]]
     unreadable: list[Unreadable]
 
 
@@ -148,6 +166,17 @@ class Codec(Protocol):
             DefinitionError: There is no definition to read them by.
         """
 
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """Messages as plain objects; None when every message has every field.
+
+        Args:
+            buffer: Holds the payloads.
+            offset: int64[n], where each payload starts.
+            length: int64[n], bytes of each payload.
+        """
+
 
 class OpaqueCodec:
     """Payloads that are stored and fetched as they are.
@@ -218,6 +247,12 @@ class OpaqueCodec:
             DefinitionError: Always.
         """
         raise self._refusal()
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """None: there are no fields."""
+        return None
 
     def _refusal(self) -> DefinitionError:
         return DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")

@@ -13,6 +13,7 @@ from hybridlog.schema.object_rows import (
     body_groups,
     body_of,
     columns_of,
+    objects_of,
     payloads_of,
     top,
 )
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, DecodedArrow
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.object_rows import Plain
     from hybridlog.schema.wire import Decoded
@@ -98,6 +99,14 @@ class JsonCodec:
             objects_array,
             payloads_of(buffer, offset, length),
             fields,
+        )
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """What the JSON texts say; see `Codec.objects`."""
+        return objects_of(
+            lambda payload: top(_parsed(payload)), payloads_of(buffer, offset, length)
         )
 
     def _body(self, payload: memoryview) -> bytes | PayloadError:

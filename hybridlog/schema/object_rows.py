@@ -16,7 +16,13 @@ import numpy as np
 from bson.errors import BSONError
 from bson.int64 import Int64
 
-from hybridlog.schema.codec import BodyGroup, DecodedArrow, error_group, nothing_decoded
+from hybridlog.schema.codec import (
+    BodyGroup,
+    DecodedArrow,
+    DecodedObjects,
+    error_group,
+    nothing_decoded,
+)
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 from hybridlog.schema.document import top_level_names
 from hybridlog.schema.summary import summarise
@@ -25,7 +31,7 @@ from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -33,7 +39,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 _T = TypeVar("_T")
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bool | int | float | None"
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | float | None"
 """What a payload is made of. An `Int64` is stored as int64 whatever its value."""
 
 MAX_BYTES = 8 << 20
@@ -215,6 +221,18 @@ def arrow_of(
     """
     rows, objects, unreadable = _read(read, payloads)
     return DecodedArrow(rows, build(objects, _names(fields)), unreadable)
+
+
+def objects_of(
+    read: Callable[[memoryview], Mapping[str, Any]], payloads: Iterator[memoryview]
+) -> DecodedObjects:
+    """Payloads as the objects that they become one by one.
+
+    Args:
+        read: Makes the object; raises PayloadError.
+        payloads: In the order of the rows.
+    """
+    return DecodedObjects(*_read(read, payloads))
 
 
 def _read(

@@ -18,7 +18,9 @@ from hybridlog.schema.object_rows import (
     body_groups,
     body_of,
     columns_of,
+    objects_of,
     payloads_of,
+    top,
 )
 from hybridlog.schema.protobuf_fields import (
     TIMES,
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, DecodedArrow
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.object_rows import Plain
     from hybridlog.schema.wire import Decoded
     from hybridlog_storage.messages import Buffer, Schema
@@ -151,6 +153,15 @@ class ProtobufCodec:
 
         return arrow_of(self._parsed, build, payloads_of(buffer, offset, length), fields)
 
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """The fields that are set, or that do not track whether they are; see `Codec.objects`."""
+        return objects_of(
+            lambda payload: top(_plain(self._parsed(payload), whole=True)),
+            payloads_of(buffer, offset, length),
+        )
+
     def _parsed(self, payload: memoryview) -> Message:
         from google.protobuf.message import DecodeError
 
@@ -231,32 +242,37 @@ def _fill_standard(pool: DescriptorPool, name: str, added: set[str]) -> None:
     added.add(name)
 
 
-def _plain(message: Message) -> dict[str, Plain]:
-    """A message as a plain object, its fields in the order of the definition."""
+def _plain(message: Message, *, whole: bool = False) -> dict[str, Plain]:
+    """A message as a plain object, its fields in the order of the definition.
+
+    Args:
+        message: The message.
+        whole: `bytes` as they are, not as their length.
+    """
     found: dict[str, Plain] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
             continue
         value = getattr(message, field.name)
         if not is_repeated(field):
-            found[field.name] = _value(field, value)
+            found[field.name] = _value(field, value, whole)
         elif is_map(field):
             inner = field.message_type.fields_by_name["value"]
             # Maps have no order of their own; index documents must be reproducible.
-            found[field.name] = {map_key(k): _value(inner, value[k]) for k in sorted(value)}
+            found[field.name] = {map_key(k): _value(inner, value[k], whole) for k in sorted(value)}
         else:
-            found[field.name] = [_value(field, v) for v in value]
+            found[field.name] = [_value(field, v, whole) for v in value]
     return found
 
 
-def _value(field: FieldDescriptor, value: object) -> Plain:
+def _value(field: FieldDescriptor, value: object, whole: bool) -> Plain:  # noqa: FBT001
     if is_message(field):
         kind = TIMES.get(field.message_type.full_name)
         if kind is not None:
             return _nanoseconds(cast("Message", value), kind)
-        return _plain(cast("Message", value))
+        return _plain(cast("Message", value), whole=whole)
     if isinstance(value, bytes):
-        return {"n": Int64(len(value))}
+        return value if whole else {"n": Int64(len(value))}
     if TYPES[field.type] in {"uint32", "int64", "uint64"}:
         return Int64(cast("int", value))
     return cast("Plain", value)

@@ -21,7 +21,7 @@ import numpy as np
 from bson.errors import BSONError
 
 from hybridlog.schema.codec import codec_for, nothing_decoded
-from hybridlog.schema.object_rows import arrow_of, body_groups, payloads_of
+from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import REDUCED, Channel
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, DecodedArrow
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Buffer
 
@@ -151,6 +151,12 @@ class ReducedCodec:
         from hybridlog.schema.arrow_objects import objects_array
 
         return arrow_of(_fields, objects_array, payloads_of(buffer, offset, length), fields)
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """What the index documents hold."""
+        return objects_of(_fields, payloads_of(buffer, offset, length))
 
 
 def _fields(payload: memoryview) -> dict[str, object]:

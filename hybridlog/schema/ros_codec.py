@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import bson
 import numpy as np
 
-from hybridlog.schema.codec import BodyGroup, DecodedArrow, error_group
+from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects, error_group
 from hybridlog.schema.column import header_stamps, row_of
 from hybridlog.schema.definition import (
     ArrayOf,
@@ -144,6 +144,12 @@ class RosCodec:
 
         decoded = self.columns(buffer, offset, length, fields)
         return DecodedArrow(decoded.rows, records_array(decoded.records), decoded.unreadable)
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """None: every message has every field."""
+        return None
 
     def _reader_of(self, fields: frozenset[str]) -> WireReader:
         return WireReader(self._type, self._wire, fields)
