@@ -515,8 +515,8 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
-    from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.counters import Counters
+    from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segment_writer import SegmentSettings

@@ -46,8 +46,8 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
-from hybridlog.query.topics import matcher
 from hybridlog.query.query import Query
+from hybridlog.query.topics import matcher
 from hybridlog.recorder import RecordOptions
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TimeError, TopicError

@@ -89,7 +89,7 @@ def store(base: Path) -> Iterator[hl.Store]:
     """`robot` (four seconds of the simulated robot) and, where they are, real logs."""
     write_bag(base / "robot.bag", duration_s=4.0)
     with hl.open(base / "store", create=True, require_database=True) as opened:
-        opened.record(base / "robot.bag")
+        opened.record(base / "robot.bag", settings=SegmentSettings(span_size=0))
         for name in LOGS if DATA.is_dir() else []:
             opened.record(DATA / "real" / name, name=name.split(".")[0])
         yield opened
