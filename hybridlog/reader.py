@@ -30,6 +30,7 @@ from hybridlog.indexing import STAMP
 from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_counts import count_in_chunks
 from hybridlog.query.chunk_lists import earlier_and_earlier
+from hybridlog.query.index_filter import IndexFilter
 from hybridlog.query.intervals import span_of
 from hybridlog.query.latest import last_message
 from hybridlog.query.plan import (
@@ -44,7 +45,6 @@ from hybridlog.query.plan import (
     Task,
     count_given,
 )
-from hybridlog.query.predicate import Predicate
 from hybridlog.query.times import (
     TIME_LIMIT,
     DurationLike,
@@ -97,7 +97,7 @@ class Query:
     recording_ids: tuple[str, ...]
     _bounds: tuple[TimeLike | None, TimeLike | None] | None = None
     _clock: Clock = "log"
-    _predicates: tuple[Predicate, ...] = ()
+    _predicates: tuple[IndexFilter, ...] = ()
     _limit: int | None = None
     _every: int = 1
     _reverse: bool = False
@@ -145,9 +145,9 @@ class Query:
         if isinstance(predicate, str):
             checked = self.store.predicate(predicate, self.topics, self.recording_ids)
         else:
-            from hybridlog.query.filters import check_filter
+            from hybridlog.query.predicate.from_mongo import from_mongo
 
-            checked = Predicate(check_filter(predicate))
+            checked = IndexFilter(from_mongo(predicate), self.field_types() or None)
         return self._with(_predicates=(*self._predicates, checked))
 
     def limit(self, count: int) -> Query:
@@ -576,7 +576,7 @@ class Query:
         return _all_of([predicate.to_filter() for predicate in self._predicates if predicate])
 
     @property
-    def predicates(self) -> tuple[Predicate, ...]:
+    def predicates(self) -> tuple[IndexFilter, ...]:
         """What was given to `where`; all must hold."""
         return self._predicates
 

@@ -20,9 +20,9 @@ from hybridlog.losses import topics_of
 from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
 from hybridlog.maintenance.report import Progress, RepairReport, being_written
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
+from hybridlog.query.index_filter import IndexFilter
 from hybridlog.query.intervals import span_of
 from hybridlog.query.plan import Lane
-from hybridlog.query.predicate import Predicate
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.times import parse_time
 from hybridlog.query.topics import resolve
@@ -469,7 +469,7 @@ class Store:
 
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> Predicate:
+    ) -> IndexFilter:
         """A predicate on some topics of some recordings.
 
         Raises:
@@ -479,11 +479,14 @@ class Store:
 
     def _compile(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
-    ) -> Predicate:
-        from hybridlog.query.where import compile_filter
+    ) -> IndexFilter:
+        from hybridlog.query.predicate.parser import parse
+        from hybridlog.query.predicate.types import check
 
         types = Query(self, topics, recordings).field_types()
-        return Predicate(compile_filter(text, field_types=types))
+        predicate = parse(text)
+        check(predicate, types)
+        return IndexFilter(predicate, types)
 
     def chunks(
         self,

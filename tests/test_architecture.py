@@ -52,8 +52,15 @@ ALLOWED = {
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "pandas": ("hybridlog.frames",),
-    "pyarrow": ("hybridlog.cli", "hybridlog.export", "hybridlog.frames", "hybridlog.tables"),
+    "pyarrow": (
+        "hybridlog.cli",
+        "hybridlog.export",
+        "hybridlog.frames",
+        "hybridlog.query.predicate.to_mask",
+        "hybridlog.tables",
+    ),
     "pymongo": ("hybridlog_storage.database",),
+    "re2": ("hybridlog.query.predicate.regex",),
     "rclpy": ("hybridlog.live_sources.ros2_middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
@@ -77,6 +84,7 @@ DISTRIBUTIONS = {
     "bson": "pymongo",
     "google": "mcap-protobuf-support",
     "mcap_protobuf": "mcap-protobuf-support",
+    "re2": "google-re2",
     "ruamel": "ruamel.yaml",
 }
 

@@ -40,6 +40,8 @@ def judged(
     """
     store = query.store
     has_index = store.database if query.predicates or fields else store.connected
+    if not all(predicate.is_exact for predicate in query.predicates):
+        return None
     if has_index is None or not store.kept.most_bytes or not query.is_by_log_time:
         return None
     spans = None if query.is_unbounded else _spans(query)

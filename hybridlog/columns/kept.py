@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from hybridlog.columns.judged import Judged
     from hybridlog.columns.stored import FieldColumns
     from hybridlog.query.column_filter import Single
+    from hybridlog.query.index_filter import IndexFilter
     from hybridlog.query.plan import Counters, Lane
-    from hybridlog.query.predicate import Predicate
     from hybridlog.reader import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelStats, RecordingEntry
@@ -81,7 +81,7 @@ class Asked(NamedTuple):
 
     topic: str
     recording_ids: tuple[str, ...]
-    predicates: tuple[Predicate, ...]
+    predicates: tuple[IndexFilter, ...]
     fields: frozenset[str]
     ordered: bool
 

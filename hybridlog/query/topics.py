@@ -8,9 +8,8 @@ A pattern is one of:
   are one character. With a leading slash it is compared with the whole name; without,
   with every run of whole parts at the end, so `*_scan` finds `/base/left_scan` and
   `camera/*` finds `/front/camera/image_raw`;
-* `re:` and a regular expression of Python, which must match the whole name. At most 200
-  characters and 4 unbounded repetitions, no repeated group that itself repeats or
-  branches, no back references: such expressions can run forever.
+* `re:` and a regular expression in RE2's syntax, which must match the whole name; at most
+  200 characters.
 
 A name that exists is always that topic, whatever characters it has.
 """
@@ -18,16 +17,14 @@ A name that exists is always that topic, whatever characters it has.
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 
-from hybridlog.query.regex import UnsafeRegexError, check_regex
+from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, text_of
 from hybridlog_storage.errors import TopicError
 
 _SHOWN = 10
 _LONGEST_PATTERN = 1_000
 _LONGEST_REGEX = 200
-_MOST_UNBOUNDED = 4
 
 
 def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
@@ -126,7 +123,7 @@ def _matches(pattern: str) -> Callable[[str], bool]:
     _check_length(pattern)
     if pattern.startswith("re:"):
         compiled = _regex(pattern)
-        return lambda topic: topic == pattern or compiled.fullmatch(topic) is not None
+        return lambda topic: topic == pattern or compiled.fullmatch(text_of(topic)) is not None
     if _is_plain(pattern):
         tail = pattern if pattern.startswith("/") else "/" + pattern
         if pattern.startswith("/"):
@@ -149,15 +146,14 @@ def _check_length(pattern: str) -> None:
         )
 
 
-def _regex(pattern: str) -> re.Pattern[str]:
+def _regex(pattern: str) -> Regex:
     text = pattern.removeprefix("re:")
     try:
-        check_regex(text, max_length=_LONGEST_REGEX, max_unbounded=_MOST_UNBOUNDED)
-    except UnsafeRegexError as error:
+        return compile_regex(text, _LONGEST_REGEX)
+    except RegexError as error:
         raise TopicError(
             f"the expression {_shown(text)} is refused at character {error.position + 1}: {error}"
         ) from None
-    return re.compile(text)
 
 
 # A glob is a list of tokens: a test of one character, and whether it may repeat.

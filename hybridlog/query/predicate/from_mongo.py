@@ -1,8 +1,10 @@
-"""MongoDB filters that a user wrote, checked before the database sees them.
+"""Predicates out of MongoDB filters that a user wrote.
 
 Only operators that compare values are let through. Everything that runs code on the
 server (`$where`, `$function`, `$accumulator`), reads something else, or is not known here
-is refused, and so are values that carry code and patterns that could run for very long.
+is refused, and so are values that carry code. What the language can say becomes the same
+tree as its text; the rest stays a piece of a filter that only MongoDB answers. Patterns
+have RE2's syntax, and stand where the language can say them.
 """
 
 from __future__ import annotations
@@ -11,9 +13,26 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from typing import TypeGuard
 
-from hybridlog.query.regex import UnsafeRegexError, check_regex
-from hybridlog.query.where import MAX_REGEX, MAX_UNBOUNDED
+from hybridlog.query.predicate.numbers import HIGH, LOW, is_nan
+from hybridlog.query.predicate.regex import RegexError, compile_regex
+from hybridlog.query.predicate.tree import (
+    And,
+    Compare,
+    Exists,
+    Field,
+    Match,
+    Member,
+    Node,
+    Not,
+    Opaque,
+    Or,
+    Order,
+    Predicate,
+    Value,
+    frozen,
+)
 from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 100
@@ -23,6 +42,7 @@ MAX_NODES = 20_000
 MAX_CHARACTERS = 1_000_000
 """Most characters in all keys and strings."""
 
+_ORDERS: dict[str, Order] = {"$lt": "<", "$lte": "<=", "$gt": ">", "$gte": ">="}
 _LOGICAL = {"$and", "$or", "$nor"}
 _LITERAL = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte"}
 _LISTS = {"$in", "$nin", "$all"}
@@ -64,11 +84,10 @@ _OPTIONS = set("ims")
 _BSON_VALUES = {"ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
 
 
-def check_filter(query: Mapping[str, object]) -> dict[str, object]:
-    """A copy of the filter in plain Python values, if everything in it is allowed.
+def from_mongo(query: Mapping[str, object]) -> Predicate:
+    """The predicate that a filter means.
 
-    Numpy scalars become Python numbers, tuples become lists, compiled patterns become
-    `$regex` conditions.
+    Numpy scalars are taken as Python numbers, tuples as lists, compiled patterns as `$regex`.
 
     Args:
         query: A filter as `pymongo` takes it.
@@ -78,68 +97,77 @@ def check_filter(query: Mapping[str, object]) -> dict[str, object]:
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
-    return _Checker().query(query, (), 0)
+    root = _Reader().query(query, (), 0)
+    return Predicate(root, str(query))
 
 
 _Path = tuple[str, ...]
 
 
-class _Checker:
+class _Reader:
     def __init__(self) -> None:
         self._nodes = 0
         self._characters = 0
 
-    def query(self, query: Mapping[str, object], path: _Path, depth: int) -> dict[str, object]:
-        checked: dict[str, object] = {}
+    def query(self, query: Mapping[str, object], path: _Path, depth: int) -> Node:
+        found: list[Node] = []
         for key, value in self._items(query, path, depth):
             inner = (*path, key)
             if key in _LOGICAL:
-                checked[key] = self._clauses(value, inner, depth)
+                found.append(self._joined(key, value, inner, depth))
             elif key == "$expr":
-                checked[key] = self._expression(value, inner, depth + 1)
+                found.append(_opaque({key: self._expression(value, inner, depth + 1)}, inner))
             elif key == "$comment":
-                checked[key] = self._literal(value, inner, depth + 1)
+                self._literal(value, inner, depth + 1)
             elif key.startswith("$"):
                 raise _refused(inner, "the operator is not allowed here")
             else:
-                checked[key] = self._condition(value, inner, depth + 1)
-        return checked
+                found.append(self._condition(key, value, inner, depth + 1))
+        return found[0] if len(found) == 1 else And(tuple(found))
 
-    def _clauses(self, value: object, path: _Path, depth: int) -> list[object]:
+    def _joined(self, operator: str, value: object, path: _Path, depth: int) -> Node:
         if not isinstance(value, list | tuple) or not value:
             raise _refused(path, "needs a list of filters")
-        return [self.query(_mapping(item, path), path, depth + 1) for item in value]
+        items = tuple(self.query(_mapping(item, path), path, depth + 1) for item in value)
+        if operator == "$and":
+            return items[0] if len(items) == 1 else And(items)
+        either = items[0] if len(items) == 1 else Or(items)
+        return Not(either) if operator == "$nor" else either
 
-    def _condition(self, value: object, path: _Path, depth: int) -> object:
-        if isinstance(value, Mapping):
-            marked = [isinstance(key, str) and key.startswith("$") for key in value]
-            if any(marked):
-                if not all(marked):
-                    raise _refused(path, "mixes operators and names")
-                return self._operators(value, path, depth)
+    def _condition(self, name: str, value: object, path: _Path, depth: int) -> Node:
+        if isinstance(value, Mapping) and _has_operators(value, path):
+            return self._operators(name, value, path, depth)
         if _is_pattern(value):
-            return self._pattern(value, path)
-        return self._literal(value, path, depth)
+            return self._pattern(name, value, path)
+        plain = self._literal(value, path, depth)
+        return _comparison(name, "$eq", plain) or _opaque({name: plain}, path)
 
     def _operators(
-        self, operators: Mapping[str, object], path: _Path, depth: int
-    ) -> dict[str, object]:
-        checked: dict[str, object] = {}
+        self, name: str, operators: Mapping[str, object], path: _Path, depth: int
+    ) -> Node:
+        found: list[Node] = []
         for key, value in self._items(operators, path, depth):
             inner = (*path, key)
-            if key in _LITERAL or key in _PLAIN:
-                checked[key] = self._literal(value, inner, depth + 1)
-            elif key in _LISTS:
-                checked[key] = self._members(value, inner, depth)
-            elif key == "$not":
-                checked[key] = self._not(value, inner, depth)
-            elif key == "$elemMatch":
-                checked[key] = self._element(value, inner, depth)
+            if key == "$not":
+                found.append(Not(self._not(name, value, inner, depth)))
             elif key == "$regex":
-                checked.update(self._regex(value, operators.get("$options", ""), inner))
+                options = operators.get("$options", "")
+                found.append(self._regex(name, value, options, inner))
             elif key != "$options" or "$regex" not in operators:
-                raise _refused(inner, "the operator is not allowed here")
-        return checked
+                operand = self._operand(key, value, inner, depth)
+                node = _comparison(name, key, operand)
+                found.append(_opaque({name: {key: operand}}, inner) if node is None else node)
+        return found[0] if len(found) == 1 else And(tuple(found))
+
+    def _operand(self, operator: str, value: object, path: _Path, depth: int) -> object:
+        """What stands behind an operator, in plain Python values."""
+        if operator in _LITERAL or operator in _PLAIN:
+            return self._literal(value, path, depth + 1)
+        if operator in _LISTS:
+            return self._members(value, path, depth)
+        if operator == "$elemMatch":
+            return self._element(value, path, depth)
+        raise _refused(path, "the operator is not allowed here")
 
     def _members(self, value: object, path: _Path, depth: int) -> list[object]:
         if not isinstance(value, list | tuple):
@@ -153,24 +181,62 @@ class _Checker:
                 members.append(self._literal(item, path, depth + 1))
         return members
 
-    def _not(self, value: object, path: _Path, depth: int) -> object:
+    def _not(self, name: str, value: object, path: _Path, depth: int) -> Node:
         if _is_pattern(value):
-            return self._pattern(value, path)
+            return self._pattern(name, value, path)
         inner = _mapping(value, path)
         if not inner or not all(isinstance(key, str) and key[:1] == "$" for key in inner):
             raise _refused(path, "needs operators")
-        return self._operators(inner, path, depth + 1)
+        return self._operators(name, inner, path, depth + 1)
 
-    def _element(self, value: object, path: _Path, depth: int) -> object:
+    def _element(self, value: object, path: _Path, depth: int) -> dict[str, object]:
+        """What an element must satisfy, as a filter: only MongoDB can answer it."""
         inner = _mapping(value, path)
         keys = [key for key in inner if isinstance(key, str) and key.startswith("$")]
         if keys and not set(keys) & _LOGICAL:
-            return self._condition(inner, path, depth + 1)
+            return self._plain_operators(inner, path, depth + 1)
         if "$expr" in inner:
             raise _refused((*path, "$expr"), "the operator is not allowed here")
-        return self.query(inner, path, depth + 1)
+        return self._plain_query(inner, path, depth + 1)
 
-    def _pattern(self, value: object, path: _Path) -> dict[str, object]:
+    def _plain_query(
+        self, query: Mapping[str, object], path: _Path, depth: int
+    ) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for key, value in self._items(query, path, depth):
+            inner = (*path, key)
+            if key in _LOGICAL:
+                if not isinstance(value, list | tuple) or not value:
+                    raise _refused(inner, "needs a list of filters")
+                found[key] = [
+                    self._plain_query(_mapping(item, inner), inner, depth + 1) for item in value
+                ]
+            elif key.startswith("$"):
+                raise _refused(inner, "the operator is not allowed here")
+            elif isinstance(value, Mapping) and _has_operators(value, inner):
+                found[key] = self._plain_operators(value, inner, depth + 1)
+            else:
+                found[key] = self._literal(value, inner, depth + 1)
+        return found
+
+    def _plain_operators(
+        self, operators: Mapping[str, object], path: _Path, depth: int
+    ) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for key, value in self._items(operators, path, depth):
+            inner = (*path, key)
+            if key == "$not":
+                nested = _mapping(value, inner)
+                if not nested:
+                    raise _refused(inner, "needs operators")
+                found[key] = self._plain_operators(nested, inner, depth + 1)
+            elif key in {"$regex", "$options"}:
+                raise _refused(inner, "patterns are not allowed within $elemMatch")
+            else:
+                found[key] = self._operand(key, value, inner, depth)
+        return found
+
+    def _pattern(self, name: str, value: object, path: _Path) -> Node:
         pattern, flags = getattr(value, "pattern", None), getattr(value, "flags", 0)
         if not isinstance(flags, int):
             raise _refused(path, "has flags that are not understood")
@@ -178,23 +244,28 @@ class _Checker:
         options = "".join(letter for flag, letter in table.items() if flags & flag)
         if flags & ~(re.IGNORECASE | re.MULTILINE | re.DOTALL | re.UNICODE):
             raise _refused(path, "may have the flags i, m and s only")
-        return self._regex(pattern, options, path)
+        return self._regex(name, pattern, options, path)
 
-    def _regex(self, value: object, options: object, path: _Path) -> dict[str, object]:
+    def _regex(self, name: str, value: object, options: object, path: _Path) -> Node:
         if _is_pattern(value):
             if options:
                 raise _refused(path, "has options twice")
-            return self._pattern(value, path)
+            return self._pattern(name, value, path)
         if not isinstance(value, str):
             raise _refused(path, "needs a string")
         if not isinstance(options, str) or not set(options) <= _OPTIONS:
             raise _refused(path, "may have the options i, m and s only")
-        try:
-            check_regex(value, max_length=MAX_REGEX, max_unbounded=MAX_UNBOUNDED)
-        except UnsafeRegexError as error:
-            raise _refused(path, f"the pattern is refused: {error}") from None
         self._count(path, len(value))
-        return {"$regex": str(value), **({"$options": options} if options else {})}
+        flags = "".join(sorted(set(options)))
+        pattern = f"(?{flags}){value}" if flags else str(value)
+        try:
+            compile_regex(pattern)
+        except RegexError as error:
+            raise _refused(path, f"the pattern is refused: {error}") from None
+        asked = _field(name)
+        if asked is None:
+            raise _refused(path, "a pattern needs a field of a message")
+        return Match(asked, pattern, negated=False)
 
     def _expression(self, value: object, path: _Path, depth: int) -> object:
         """An aggregation expression."""
@@ -279,8 +350,6 @@ def _plain_number(value: object) -> object:
     if getattr(value, "shape", ()) != ():
         raise TypeError(f"a value of type {type(value).__name__} is not allowed")
     number = value.item() if hasattr(value, "item") else value
-    if isinstance(number, int) and not isinstance(number, bool) and not -(2**63) <= number < 2**63:
-        raise OverflowError(f"{number} does not fit into 64 bits; write it as a float")
     if not isinstance(number, bool | int | float | None):
         raise TypeError(f"a value of type {type(value).__name__} is not allowed")
     return float(number) if isinstance(number, float) else number
@@ -323,6 +392,76 @@ _SCALARS: tuple[tuple[Callable[[object], bool], Callable[[object], object]], ...
         _plain_number,
     ),
 )
+
+
+def _comparison(name: str, operator: str, operand: object) -> Node | None:
+    """A condition as a node of the language; None when it says something else.
+
+    MongoDB's equality with null also finds missing fields, and its orders know values
+    that the language does not put in order.
+    """
+    asked = _field(name)
+    if asked is None:
+        return None
+    if isinstance(operand, int) and not isinstance(operand, bool):
+        operand = int(operand)  # an Int64 of BSON is one
+    if operator in {"$in", "$nin"} and isinstance(operand, list):
+        values = tuple(value for value in operand if _is_value(value))
+        member = Member(asked, values, negated=False) if len(values) == len(operand) else None
+        return member if operator == "$in" or member is None else Not(member)
+    if operator == "$exists" and isinstance(operand, bool):
+        return Exists(asked, present=operand)
+    if not _is_value(operand):
+        return None
+    if operator in {"$eq", "$ne"}:
+        same = Compare(asked, "==", operand)
+        return same if operator == "$eq" else Not(same)
+    order = _ORDERS.get(operator)
+    is_ordered = not isinstance(operand, bool) and not is_nan(operand)
+    return Compare(asked, order, operand) if order is not None and is_ordered else None
+
+
+def _is_value(operand: object) -> TypeGuard[Value]:
+    """Whether an operand means for MongoDB what it means in the language."""
+    return type(operand) in {bool, int, float, str}
+
+
+def _field(name: str) -> Field | None:
+    """The field of a path; None when only MongoDB understands it."""
+    parts = name.split(".")
+    if not all(parts) or parts[0] == "_id" or name == "_meta.inserted_at":
+        return None
+    return Field((parts[0], *map(_place_or_name, parts[1:])))
+
+
+def _place_or_name(part: str) -> str | int:
+    is_place = part.isascii() and part.isdecimal() and str(int(part[:9])) == part
+    return int(part) if is_place else part
+
+
+def _opaque(query: dict[str, object], path: _Path) -> Opaque:
+    _check_width(query, path)
+    return Opaque(frozen(query))
+
+
+def _check_width(value: object, path: _Path) -> None:
+    """Refuse integers that MongoDB cannot hold."""
+    if isinstance(value, Mapping):
+        for inner in value.values():
+            _check_width(inner, path)
+    elif isinstance(value, list):
+        for inner in value:
+            _check_width(inner, path)
+    elif isinstance(value, int) and not LOW <= value <= HIGH:
+        raise _refused(path, f"{value} does not fit into 64 bits; write it as a float")
+
+
+def _has_operators(value: Mapping[str, object], path: _Path) -> bool:
+    """Whether a mapping consists of operators, not of names."""
+    marked = [isinstance(key, str) and key.startswith("$") for key in value]
+    if any(marked) and not all(marked):
+        raise _refused(path, "mixes operators and names")
+    return any(marked)
 
 
 def _is_pattern(value: object) -> bool:

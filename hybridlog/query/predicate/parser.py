@@ -27,32 +27,39 @@ different kinds (a number and a string) is false. NaN equals NaN and is neither 
 greater than anything. `== null` finds a stored null, not a missing field.
 
 The pattern of `~` is found anywhere in the string unless anchored; its backslashes stand
-for themselves. Patterns that could run for very long are refused.
+for themselves. It has RE2's syntax, so that it takes linear time.
 
-`x.min`, `x.max`, `x.mean` and `x.n` of an array ask for its summary; short arrays, which
-are stored element by element, answer too. Where the types of the fields are not known, a
-field of that name in an element comes before the summary.
+`x.min`, `x.max`, `x.mean` and `x.n` of an array are its least and greatest finite element,
+their mean, and the number of elements. Where the types of the fields are not known, a
+field of that name in an element comes before them. An order asks for any finite element
+of an array.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, TypeAlias
 
-from hybridlog.query.regex import UnsafeRegexError, check_regex
-from hybridlog.query.tokens import Token, error_at, regex_text, tokenize, unescape
+from hybridlog.query.predicate.regex import RegexError, compile_regex
+from hybridlog.query.predicate.tokens import Token, error_at, regex_text, tokenize, unescape
+from hybridlog.query.predicate.tree import (
+    And,
+    Compare,
+    Exists,
+    Field,
+    Match,
+    Member,
+    Node,
+    Not,
+    Or,
+    Order,
+    Predicate,
+    Value,
+)
 from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 50
 """Deepest nesting of brackets and negations."""
-MAX_REGEX = 1_000
-MAX_UNBOUNDED = 6
-
-Value: TypeAlias = bool | int | float | str | None
-Order = Literal["==", "!=", "<", "<=", ">", ">="]
 
 _ORDERS: dict[str, Order] = {
     "==": "==",
@@ -75,115 +82,7 @@ _VALUE_WORDS: dict[str, Value] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
-    """A field path.
-
-    Attributes:
-        parts: Names, and ints for elements of arrays.
-        position: Where it stands in the text.
-    """
-
-    parts: tuple[str | int, ...]
-    position: int = 0
-
-    @property
-    def path(self) -> str:
-        """The path as MongoDB writes it: `position.0`."""
-        return ".".join(map(str, self.parts))
-
-
-@dataclass(frozen=True, slots=True)
-class Compare:
-    """`field order value`; times and durations are ints."""
-
-    field: Field
-    order: Order
-    value: Value
-    position: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Member:
-    """`field in [...]`, or `not in` when negated."""
-
-    field: Field
-    values: tuple[Value, ...]
-    negated: bool
-    position: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Exists:
-    """`field exists`, or `missing` when not present."""
-
-    field: Field
-    present: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Match:
-    """`field ~ pattern`, or `!~` when negated."""
-
-    field: Field
-    pattern: str
-    negated: bool
-    position: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class And:
-    """All of the items hold."""
-
-    items: tuple[Node, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Or:
-    """One of the items holds."""
-
-    items: tuple[Node, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Not:
-    """The item does not hold."""
-
-    item: Node
-
-
-Condition: TypeAlias = Compare | Member | Exists | Match
-Node: TypeAlias = Condition | And | Or | Not
-
-
-@dataclass(frozen=True, slots=True)
-class Expression:
-    """A parsed predicate.
-
-    Attributes:
-        text: As it was written; messages show it.
-        root: The tree.
-    """
-
-    text: str
-    root: Node
-
-    def conditions(self) -> Iterator[Condition]:
-        """Every single condition, from left to right."""
-        return _conditions(self.root)
-
-    def fields(self) -> list[str]:
-        """The paths asked for, as MongoDB writes them, each once."""
-        return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
-
-    def to_filter(self, field_types: Mapping[str, str] | None = None) -> dict[str, object]:
-        """The MongoDB filter; see `compile_filter`."""
-        from hybridlog.query.mongo_filter import to_filter
-
-        return to_filter(self, field_types)
-
-
-def parse(text: str) -> Expression:
+def parse(text: str) -> Predicate:
     """Read a predicate.
 
     Raises:
@@ -195,36 +94,8 @@ def parse(text: str) -> Expression:
 
 
 @lru_cache(maxsize=128)  # of a small topic, reading the predicate takes as long as the answer
-def _parsed(text: str) -> Expression:
+def _parsed(text: str) -> Predicate:
     return _Parser(text).parse()
-
-
-def compile_filter(text: str, *, field_types: Mapping[str, str] | None = None) -> dict[str, object]:
-    """Read a predicate and make a MongoDB filter of it.
-
-    Args:
-        text: The predicate.
-        field_types: Types of the fields that can be asked for, if known: path (dotted,
-            with or without `[]` after arrays) to type as definitions write it
-            (`float64`, `string`, `time`, `float32[]`, `uint8[9]`, `pkg/Type[]`). Then
-            fields that do not exist and values of the wrong kind are errors, and the
-            summaries of short arrays can be asked for. `_meta.*` is always known.
-
-    Raises:
-        WhereError: The predicate cannot be read, or does not fit the types.
-    """
-    return parse(text).to_filter(field_types)
-
-
-def _conditions(node: Node) -> Iterator[Condition]:
-    match node:
-        case And(items) | Or(items):
-            for item in items:
-                yield from _conditions(item)
-        case Not(item):
-            yield from _conditions(item)
-        case _:
-            yield node
 
 
 class _Parser:
@@ -234,13 +105,13 @@ class _Parser:
         self._at = 0
         self._depth = 0
 
-    def parse(self) -> Expression:
+    def parse(self) -> Predicate:
         if self._peek().kind == "end":
             raise WhereError("the predicate is empty; write for example: ranges.min < 0.5")
         root = self._or()
         if self._peek().kind != "end":
             raise self._fail(self._peek(), "expected 'and', 'or' or the end here")
-        return Expression(self._text, root)
+        return Predicate(root, self._text)
 
     def _or(self) -> Node:
         items = [self._and()]
@@ -351,8 +222,8 @@ class _Parser:
         self._at += 1
         pattern = regex_text(token)
         try:
-            check_regex(pattern, max_length=MAX_REGEX, max_unbounded=MAX_UNBOUNDED)
-        except UnsafeRegexError as error:
+            compile_regex(pattern)
+        except RegexError as error:
             # The pattern begins after the quote.
             place = token.position + 1 + min(error.position, len(token.text))
             raise error_at(self._text, place, f"the pattern is refused: {error}") from None
@@ -373,9 +244,7 @@ class _Parser:
         token = self._peek()
         self._at += 1
         if token.kind in {"number", "time"}:
-            number = -token.number if sign < 0 else token.number
-            # The lexer lets 2**63 through for the sake of -2**63.
-            return float(number) if number == 2**63 else number
+            return -token.number if sign < 0 else token.number
         if token.keyword in {"inf", "infinity"}:
             return -math.inf if sign < 0 else math.inf
         if sign:

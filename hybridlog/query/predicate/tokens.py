@@ -16,7 +16,6 @@ from hybridlog_storage.errors import TimeError, WhereError
 MAX_TEXT = 10_000
 """Longest predicate, characters."""
 MAX_TOKENS = 2_000
-_INT64 = range(-(2**63), 2**63)
 _WINDOW = 100
 
 _PART = r"[^\W\d]\w*|`[^`]*`"
@@ -177,11 +176,8 @@ def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
         raise error_at(text, at, "the number has more than 400 characters")
     if _HEX.fullmatch(written) or _INTEGER.fullmatch(written):
         value = int(written, 16 if written[:2] in {"0x", "0X"} else 10)
-        # 2**63 itself: a minus may follow before it.
-        if value not in _INT64 and value != 2**63:
-            value = _too_large(text, at, value)
     elif _FLOAT.fullmatch(written):
-        value = _too_large(text, at, float(written))
+        value = _finite(text, at, float(written))
     else:
         kind = "time"
         try:
@@ -193,11 +189,7 @@ def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
     return Token(kind, written, at, number=value), word.end()
 
 
-def _too_large(text: str, at: int, value: float) -> float:
-    try:
-        number = float(value)
-    except OverflowError:
-        number = float("inf")
+def _finite(text: str, at: int, number: float) -> float:
     if number == float("inf"):
         raise error_at(text, at, "the number is too large for a double; write inf if that is meant")
     return number

@@ -1,0 +1,1 @@
+"""Predicates over the fields of messages: one tree, and what is made of it."""

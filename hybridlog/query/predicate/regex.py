@@ -1,0 +1,109 @@
+"""Regular expressions of RE2: every match takes linear time and bounded memory."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Protocol
+
+MAX_LENGTH = 1_000
+"""Longest pattern, characters."""
+_MAX_BYTES = 8 << 20  # of a compiled pattern; also what Arrow allows
+_SPECIAL = frozenset("\\.[](){}*+?^$|\0")
+_BYTE = "matches a byte, and strings are characters"
+
+
+class RegexError(ValueError):
+    """Why a pattern is refused.
+
+    Attributes:
+        position: Index of the character at fault.
+    """
+
+    def __init__(self, reason: str, position: int = 0) -> None:
+        super().__init__(reason)
+        self.position = position
+
+
+class Regex(Protocol):
+    """A compiled pattern."""
+
+    def search(self, text: str) -> object | None:
+        """A match anywhere in the text, None when there is none."""
+
+    def fullmatch(self, text: str) -> object | None:
+        """A match of the whole text, None when there is none."""
+
+
+@lru_cache(maxsize=256)
+def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
+    """Compile a pattern in RE2's syntax.
+
+    Args:
+        pattern: As the user wrote it.
+        max_length: Longest pattern, characters.
+
+    Raises:
+        RegexError: With the reason and the place.
+    """
+    if len(pattern) > max_length:
+        raise RegexError(f"longer than {max_length} characters", max_length)
+    import re2
+
+    options = re2.Options()
+    options.max_mem = _MAX_BYTES
+    options.log_errors = False
+    try:
+        pattern.encode()
+        compiled: Regex = re2.compile(pattern, options)
+    except UnicodeEncodeError as error:
+        raise RegexError("is not valid Unicode", error.start) from None
+    except re2.error as error:
+        raise _refusal(pattern, error.args[0]) from None
+    if (place := _byte_escape(pattern)) is not None:
+        raise RegexError(f"\\C {_BYTE}", place)
+    return compiled
+
+
+def text_of(value: str) -> str:
+    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return value.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
+    return value
+
+
+def is_literal(pattern: str) -> bool:
+    """Whether a pattern asks for a text as it stands, possibly at the beginning.
+
+    Any engine finds such a text, within any limit of its steps.
+    """
+    text = pattern.removeprefix("^")
+    return bool(text) and not _SPECIAL.intersection(text)
+
+
+def _refusal(pattern: str, reported: bytes | str) -> RegexError:
+    """The error for what RE2 says, such as `missing ): (a`."""
+    text = reported.decode(errors="replace") if isinstance(reported, bytes) else str(reported)
+    reason, _, fault = text.partition(": ")
+    place = max(pattern.find(fault), 0) if fault else 0
+    shown = "".join(char if char.isprintable() else "?" for char in text)
+    if reason == "invalid perl operator" or (
+        reason == "invalid escape sequence" and fault[1:].isdigit()
+    ):
+        shown += "; patterns have RE2's syntax, without looking around and back references"
+    return RegexError(f"not a regular expression of RE2: {shown}", place)
+
+
+def _byte_escape(pattern: str) -> int | None:
+    r"""Index of `\\C`, None when there is none."""
+    at = pattern.find("\\")
+    while at >= 0:
+        if pattern[at + 1 : at + 2] == "C":
+            return at
+        if pattern[at + 1 : at + 2] == "Q":
+            at = pattern.find("\\E", at)
+            if at < 0:
+                return None
+        at = pattern.find("\\", at + 2)
+    return None

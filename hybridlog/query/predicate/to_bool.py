@@ -1,0 +1,432 @@
+"""Predicates on one message in memory: the reference meaning.
+
+Every other engine gives the answer that `to_bool` gives on the decoded message. Arrays may
+be summarised, as index documents and reduced messages have them. A condition that a summary
+cannot decide is neither true nor false, and a predicate holds when it is surely true.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias, TypeGuard
+
+from hybridlog.query.predicate.numbers import HIGH, LOW, equal, is_number, nearest, ordered
+from hybridlog.query.predicate.regex import compile_regex, text_of
+from hybridlog.query.predicate.tree import (
+    And,
+    Compare,
+    Condition,
+    Exists,
+    Field,
+    Match,
+    Member,
+    Node,
+    Not,
+    Opaque,
+    Or,
+    Predicate,
+    Test,
+    Value,
+    root_of,
+)
+from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
+from hybridlog_storage.errors import WhereError
+
+Message: TypeAlias = Mapping[str, object]
+"""A decoded message: dict, list, str, bytes, bool, int, float, None."""
+Truth: TypeAlias = bool | None
+"""None when a summary cannot decide."""
+Decision: TypeAlias = Callable[[Message], Truth]
+
+_Parts: TypeAlias = tuple[str | int, ...]
+_Names: TypeAlias = tuple[str, ...]
+_WITH_NUMBERS = frozenset(STATS)
+_SUMMARIES = (_WITH_NUMBERS, frozenset({"n"}))
+
+
+def to_bool(
+    node: Predicate | Node,
+    types: FieldTypes | Mapping[str, str] | None = None,
+    *,
+    summarised: bool = False,
+) -> Test:
+    """A predicate as a test of one message after the other.
+
+    Args:
+        node: The predicate.
+        types: Types of the fields; None when each message decides.
+        summarised: Whether long arrays are summaries in messages without types.
+
+    Raises:
+        WhereError: Only MongoDB can answer a part of it.
+    """
+    decide = to_truth(node, types, summarised=summarised)
+    return lambda message: decide(message) is True
+
+
+def to_truth(
+    node: Predicate | Node,
+    types: FieldTypes | Mapping[str, str] | None = None,
+    *,
+    summarised: bool = False,
+) -> Decision:
+    """A predicate as a function that is None for messages whose summaries cannot decide.
+
+    Args:
+        node: The predicate.
+        types: As for `to_bool`.
+        summarised: As for `to_bool`.
+
+    Raises:
+        WhereError: Only MongoDB can answer a part of it.
+    """
+    reader = _Reader(FieldTypes.of(types), summarised)
+    return _node(root_of(node), reader)
+
+
+def numbers_at(message: Message, path: str) -> list[float]:
+    """The numbers that a path such as `pose.position.x` or `ranges.min` leads to.
+
+    Args:
+        message: A message or an index document.
+        path: Names and places with dots between them.
+    """
+    parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
+    found = _Reader(FieldTypes.of(None), summarised=False).leaves(message, Field(parts))
+    values = (value for leaf in found for value in (leaf if isinstance(leaf, list) else [leaf]))
+    return [value for value in values if is_number(value)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Hidden:
+    """Elements, or fields of elements, of an array of which only a summary is there.
+
+    Attributes:
+        least: The least finite element; None when it is not known, or there is none.
+        greatest: The greatest finite element, or None.
+        surely: Whether the path leads to something in any case.
+        elements: Whether the path leads to the array itself.
+        numeric: Whether the elements are numbers or booleans.
+        booleans: Whether they are booleans; None when that is not known.
+    """
+
+    least: object
+    greatest: object
+    surely: bool
+    elements: bool
+    numeric: bool
+    booleans: bool | None
+
+    def may_equal(self, wanted: Value) -> bool:
+        """Whether an element may be equal to a value."""
+        if not self.numeric:
+            return True
+        if isinstance(wanted, bool):
+            return self.booleans is not False
+        if not is_number(wanted) or self.booleans:
+            return False
+        if isinstance(wanted, float) and not math.isfinite(wanted):
+            return True
+        if not is_number(self.least) or not is_number(self.greatest):
+            return False
+        # Ends beyond int64 may be rounded to doubles.
+        low, high = nearest(self.least), nearest(self.greatest)
+        return low <= nearest(wanted) <= high
+
+    def is_ordered(self, order: str, wanted: Value) -> Truth:
+        """Whether an element is in order."""
+        if not self.numeric:
+            return None
+        if not self.elements:
+            return None if is_number(wanted) and not self.booleans else False
+        end = self.least if order in {"<", "<="} else self.greatest
+        if not is_number(wanted) or self.booleans or not is_number(end):
+            return False
+        rounded = isinstance(end, float) and abs(end) >= 2**63
+        if rounded and nearest(wanted) == end:
+            return None
+        found = ordered(order, end, wanted)
+        # A summary counts true as 1 and false as 0.
+        return None if found and self.booleans is None and end in {0, 1} else found
+
+
+_UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
+"""What a name leads to in the summary of an element: nothing, if that is an array."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Reader:
+    """Follows paths into messages.
+
+    Attributes:
+        types: Types of the fields.
+        summarised: Whether arrays without types may be summaries.
+    """
+
+    types: FieldTypes
+    summarised: bool
+
+    def leaves(self, message: Message, asked: Field) -> list[object]:
+        """What a path leads to: values, whole arrays, statistics of arrays, hidden elements."""
+        parts = asked.parts
+        stat = self.types.statistic(parts)
+        if stat is None:
+            return list(self._reach(message, parts, ()))
+        arrays = list(self._values(message, parts[:-1], ()))
+        found: list[object] = []
+        if self.types.known:
+            for array in arrays:
+                found.extend(self._typed_statistic(stat, array, parts[:-1]))
+            return found
+        found.extend(self._reach(message, parts, ()))
+        found.extend(
+            statistic(stat, array)
+            for array in arrays
+            if isinstance(array, list) and _has_statistic(array, stat)
+        )
+        return found
+
+    def _typed_statistic(self, stat: Stat, array: object, parts: _Parts) -> Iterator[object]:
+        if isinstance(array, list | bytes):
+            kind = self.types.kind(".".join(part for part in parts if isinstance(part, str)))
+            if stat == "n" or kind != "other":
+                yield statistic(stat, array)
+        elif isinstance(array, _Hidden):
+            yield array
+        elif isinstance(array, Mapping) and stat in array:
+            yield array[stat]
+
+    def _are_booleans(self, names: _Names) -> bool | None:
+        return self.types.kind(".".join(names)) == "bool" if self.types.known else None
+
+    def _is_summary(
+        self, value: object, names: _Names, *, element: bool
+    ) -> TypeGuard[Mapping[str, object]]:
+        if not isinstance(value, Mapping):
+            return False
+        if self.types.known:
+            # The types list the array, not its elements.
+            return not element and ".".join(names) in self.types.arrays
+        return self.summarised and value.keys() in _SUMMARIES
+
+    def _reach(
+        self, value: object, parts: _Parts, names: _Names, *, element: bool = False
+    ) -> Iterator[object]:
+        """What a path leads to; through an array, each element that it leads into."""
+        if self._is_summary(value, names, element=element):
+            if not self.types.known and len(parts) == 1 and parts[0] in value and "min" in value:
+                yield value[str(parts[0])]
+            else:
+                yield from _hidden(value, parts, self._are_booleans(names))
+            return
+        if not parts:
+            yield value
+            return
+        part, rest = parts[0], parts[1:]
+        if isinstance(value, Mapping):
+            if str(part) in value:
+                yield from self._reach(value[str(part)], rest, (*names, str(part)))
+        elif isinstance(value, list):
+            if isinstance(part, int) and part < len(value):
+                yield from self._reach(value[part], rest, names, element=True)
+            # MongoDB takes a number for a name, too.
+            for inner in value:
+                if self._is_summary(inner, names, element=True):
+                    yield _UNKNOWN
+                elif isinstance(inner, Mapping):
+                    yield from self._reach(inner, parts, names, element=True)
+
+    def _values(
+        self, value: object, parts: _Parts, names: _Names, *, element: bool = False
+    ) -> Iterator[object]:
+        """What a path leads to, as a whole: arrays are not gone into at its end."""
+        if not parts:
+            yield value
+            return
+        if self._is_summary(value, names, element=element):
+            yield from _hidden(value, parts, self._are_booleans(names))
+            return
+        part, rest = parts[0], parts[1:]
+        if isinstance(part, int) and isinstance(value, list) and part < len(value):
+            yield from self._values(value[part], rest, names, element=True)
+        # MongoDB takes a number for a name, too.
+        for inner in value if isinstance(value, list) else [value]:
+            if isinstance(inner, Mapping) and str(part) in inner:
+                yield from self._values(inner[str(part)], rest, (*names, str(part)))
+
+
+def _hidden(
+    summary: Mapping[str, object],
+    parts: _Parts,
+    booleans: bool | None,  # noqa: FBT001
+) -> Iterator[_Hidden]:
+    """What stands behind a summary when a path goes on with these parts."""
+    count = summary.get("n")
+    first = parts[0] if parts else None
+    if isinstance(first, int) and isinstance(count, int) and first >= count:
+        return
+    numeric = "min" in summary
+    if numeric and parts and (isinstance(first, str) or len(parts) > 1):
+        return  # numbers have no fields
+    yield _Hidden(
+        summary.get("min"),
+        summary.get("max"),
+        surely=not parts or (len(parts) == 1 and (isinstance(first, int) or first == "n")),
+        elements=not parts,
+        numeric=numeric,
+        booleans=booleans,
+    )
+
+
+def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
+    """Whether an array has a statistic, and its elements have no field of that name."""
+    if stat == "n":
+        return not any(isinstance(value, Mapping) and stat in value for value in values)
+    return all(isinstance(value, int | float) for value in values)
+
+
+def statistic(stat: Stat, values: Sequence[object]) -> float | None:
+    """A statistic of an array, as its summary in the index has it."""
+    if stat == "n":
+        return len(values)
+    numbers = [value for value in values if isinstance(value, int | float)]
+    finite = [
+        value * 1  # True counts as 1
+        for value in numbers
+        if isinstance(value, int) or math.isfinite(value)
+    ]
+    if not finite:
+        return None
+    if stat == "mean":
+        return _mean(numbers)
+    return min(finite) if stat == "min" else max(finite)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    import numpy as np
+
+    from hybridlog.schema.column import Scalars
+    from hybridlog.schema.summary import summarise
+
+    integers = all(isinstance(value, int) for value in values)
+    if integers and min(values) >= LOW and max(values) <= HIGH:
+        numbers = np.array(values)
+    elif integers and min(values) >= 0 and max(values) < 2**64:
+        numbers = np.array(values, np.uint64)
+    else:
+        numbers = np.array([nearest(value) for value in values], np.float64)
+    found = summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
+    return float(found.mean[0]) if found.has[0] else None
+
+
+def _node(node: Node, reader: _Reader) -> Decision:
+    match node:
+        case Not(item):
+            return partial(_negated, _node(item, reader))
+        case And(items):
+            return partial(_all, [_node(item, reader) for item in items])
+        case Or(items):
+            return partial(_any, [_node(item, reader) for item in items])
+        case Opaque():
+            raise WhereError(f"only MongoDB can answer {node.to_filter()}")
+        case Exists(asked, present):
+            exists = partial(_exists, reader, asked)
+            return exists if present else partial(_negated, exists)
+        case Compare(order="!=") | Member(negated=True) | Match(negated=True):
+            positive = partial(_negated, partial(_holds, reader, node.field, _test_of(node)))
+            return partial(_all, [partial(_exists, reader, node.field), positive])
+        case Compare() | Member() | Match():
+            return partial(_holds, reader, node.field, _test_of(node))
+
+
+def _negated(inner: Decision, message: Message) -> Truth:
+    found = inner(message)
+    return None if found is None else not found
+
+
+def _all(tests: Sequence[Decision], message: Message) -> Truth:
+    unknown = False
+    for test in tests:
+        found = test(message)
+        if found is False:
+            return False
+        unknown |= found is None
+    return None if unknown else True
+
+
+def _any(tests: Sequence[Decision], message: Message) -> Truth:
+    unknown = False
+    for test in tests:
+        found = test(message)
+        if found:
+            return True
+        unknown |= found is None
+    return None if unknown else False
+
+
+def _exists(reader: _Reader, asked: Field, message: Message) -> Truth:
+    found = reader.leaves(message, asked)
+    if any(not isinstance(leaf, _Hidden) or leaf.surely for leaf in found):
+        return True
+    return None if found else False
+
+
+_Leaf: TypeAlias = Callable[[object, bool], Truth]
+"""Tests a value; the second argument says whether it is an element of an array."""
+
+
+def _holds(reader: _Reader, asked: Field, test: _Leaf, message: Message) -> Truth:
+    """Whether a test holds of any value that a path leads to."""
+    unknown = False
+    for leaf in reader.leaves(message, asked):
+        if isinstance(leaf, list):
+            if any(test(element, True) for element in leaf):
+                return True
+            continue
+        found = test(leaf, False)
+        if found:
+            return True
+        unknown |= found is None
+    return None if unknown else False
+
+
+def _test_of(node: Condition) -> _Leaf:
+    """The test of a condition; of a negated one, what must not hold."""
+    match node:
+        case Compare(order="==" | "!=", value=value):
+            return partial(_is_one_of, (value,))
+        case Compare(order=order, value=value):
+            return partial(_is_ordered, order, value)
+        case Member(values=values):
+            return partial(_is_one_of, values)
+        case Match(pattern=pattern):
+            return partial(_matches, compile_regex(pattern).search)
+        case Exists():
+            raise AssertionError(node)
+
+
+def _is_one_of(values: tuple[Value, ...], found: object, _element: bool) -> Truth:  # noqa: FBT001
+    if isinstance(found, _Hidden):
+        return None if any(map(found.may_equal, values)) else False
+    if isinstance(found, str):
+        found = text_of(found)
+    return any(equal(found, value) for value in values)
+
+
+def _is_ordered(order: str, value: Value, found: object, element: bool) -> Truth:  # noqa: FBT001
+    if isinstance(found, _Hidden):
+        return found.is_ordered(order, value)
+    if isinstance(found, str):
+        found = text_of(found)
+    if element and isinstance(found, float) and math.isinf(found):
+        return False
+    return ordered(order, found, value)
+
+
+def _matches(search: Callable[[str], object], found: object, _element: bool) -> Truth:  # noqa: FBT001
+    if isinstance(found, _Hidden):
+        return False if found.numeric else None
+    return isinstance(found, str) and search(text_of(found)) is not None

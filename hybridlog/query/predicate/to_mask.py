@@ -1,0 +1,636 @@
+"""Predicates on Arrow columns of decoded messages.
+
+Columns say less than messages: a null is a missing field or a null, and a summary stands
+for a long array. So each condition gives two masks: where it may hold, and where it surely
+does. Where both differ in the end, the columns cannot tell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import reduce
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.query.predicate.numbers import (
+    for_doubles,
+    for_integers,
+    is_nan,
+    is_number,
+    nearest,
+)
+from hybridlog.query.predicate.tree import (
+    And,
+    Compare,
+    Exists,
+    Field,
+    Match,
+    Member,
+    Node,
+    Not,
+    Opaque,
+    Or,
+    Predicate,
+    Value,
+    root_of,
+)
+from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Mask = NDArray[np.bool_]
+    Rows = NDArray[np.intp]
+
+Records: TypeAlias = "pa.StructArray | pa.Table | pa.RecordBatch"
+
+_ORDERS: dict[str, np.ufunc] = {
+    "==": np.equal,
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+}
+_TEXT_ORDERS: dict[str, Callable[..., Any]] = {
+    "==": pc.equal,
+    "<": pc.less,
+    "<=": pc.less_equal,
+    ">": pc.greater,
+    ">=": pc.greater_equal,
+}
+_SUMMARIES = (set(STATS), {"n"})
+
+
+def to_mask(
+    node: Predicate | Node,
+    types: FieldTypes | Mapping[str, str] | None,
+    records: Records,
+) -> Mask | None:
+    """Of which rows a predicate holds.
+
+    Args:
+        node: The predicate.
+        types: Types of the fields; None when each message decides.
+        records: Decoded messages with at least the fields of the predicate. Arrays are
+            whole, or structs of `n`, `min`, `max` and `mean`.
+
+    Returns:
+        bool[rows]; None when these columns cannot tell.
+    """
+    compiled = FieldTypes.of(types)
+    root = root_of(node)
+    found = [_mask(root, compiled, part) for part in _parts(records)]
+    masks = [mask for mask in found if mask is not None]
+    if len(masks) < len(found):
+        return None
+    return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
+
+
+def _parts(records: Records) -> Iterator[pa.StructArray]:
+    """The records piece by piece."""
+    if isinstance(records, pa.Table):
+        yield from (batch.to_struct_array() for batch in records.to_batches())
+    elif isinstance(records, pa.RecordBatch):
+        yield records.to_struct_array()
+    elif isinstance(records, pa.ChunkedArray):
+        yield from records.chunks
+    else:
+        yield records
+
+
+def _mask(root: Node, types: FieldTypes, records: pa.StructArray) -> Mask | None:
+    try:
+        found = _Columns(types, records).node(root)
+    except _UnfitError:
+        return None
+    if found.possible is found.certain or bool((found.possible == found.certain).all()):
+        return found.certain
+    return None
+
+
+class _UnfitError(Exception):
+    """The columns do not have what is asked for."""
+
+
+class _Pair(NamedTuple):
+    """Where something may hold, and where it surely holds: bool[rows] each."""
+
+    possible: Mask
+    certain: Mask
+
+
+class _Leaves(NamedTuple):
+    """Values that a path leads to, in any order.
+
+    Attributes:
+        values: One entry a value.
+        rows: The row of each value.
+        is_element: Whether they are elements of an array: a null is one then, not missing.
+        is_hidden: Whether they are summaries that hide what the path leads to.
+        is_summary: Whether they are summaries that stand for the arrays themselves.
+    """
+
+    values: pa.Array
+    rows: Rows
+    is_element: bool = False
+    is_hidden: bool = False
+    is_summary: bool = False
+
+
+class _Columns:
+    def __init__(self, types: FieldTypes, records: pa.StructArray) -> None:
+        self._types = types
+        self._records = records
+        self._count = len(records)
+
+    def node(self, node: Node) -> _Pair:
+        """Where a predicate may hold, and where it surely does."""
+        match node:
+            case And(items):
+                return self._joined(np.logical_and, items, start=True)
+            case Or(items):
+                return self._joined(np.logical_or, items, start=False)
+            case Not(item):
+                return _not(self.node(item))
+            case Exists(asked, present):
+                found = self._exists(asked)
+                return found if present else _not(found)
+            case Opaque():
+                raise _UnfitError
+            case _:
+                return self._condition(node)
+
+    def _joined(self, join: np.ufunc, items: Sequence[Node], *, start: bool) -> _Pair:
+        pairs = [self.node(item) for item in items] or [self._all(start)]
+        return _Pair(
+            reduce(join, (pair.possible for pair in pairs)),
+            reduce(join, (pair.certain for pair in pairs)),
+        )
+
+    def _all(self, answer: bool) -> _Pair:  # noqa: FBT001
+        mask = np.full(self._count, answer)
+        return _Pair(mask, mask)
+
+    def _condition(self, node: Compare | Member | Match) -> _Pair:
+        negated = node.order == "!=" if isinstance(node, Compare) else node.negated
+        found = self._holds(node)
+        if not negated:
+            return found
+        exists, other = self._exists(node.field), _not(found)
+        return _Pair(exists.possible & other.possible, exists.certain & other.certain)
+
+    def _exists(self, asked: Field) -> _Pair:
+        possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
+        for leaves in self._leaves(asked):
+            possible[leaves.rows] = True
+            if leaves.is_hidden:
+                continue
+            if leaves.is_element or not leaves.values.null_count:
+                certain[leaves.rows] = True
+            else:
+                certain[leaves.rows[_valid(leaves.values)]] = True
+        return _Pair(possible, certain)
+
+    def _holds(self, node: Compare | Member | Match) -> _Pair:
+        """Where a value satisfies a condition, as if it was not negated."""
+        possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
+        for leaves in self._leaves(node.field):
+            for each in _elements(leaves):
+                found = _tested(node, each, self._types)
+                possible[each.rows[found.possible]] = True
+                certain[each.rows[found.certain]] = True
+        return _Pair(possible, certain)
+
+    # Paths.
+
+    def _leaves(self, asked: Field) -> list[_Leaves]:
+        """What a path leads to.
+
+        Raises:
+            _UnfitError: These columns do not tell.
+        """
+        parts = asked.parts
+        if parts[0] in {"_meta", "_id"}:
+            raise _UnfitError
+        top = self._records.type
+        if top.get_field_index(str(parts[0])) < 0:
+            raise _UnfitError
+        start = _Leaves(self._records, np.arange(self._count))
+        stat = self._types.statistic(parts)
+        if stat is None:
+            return list(self._reach(start, parts, ()))
+        arrays = list(self._reach(start, parts[:-1], ()))
+        if self._types.known:
+            return [self._statistic(array, stat) for array in arrays]
+        return [leaf for array in arrays for leaf in self._either(array, stat)]
+
+    def _statistic(self, leaves: _Leaves, stat: Stat) -> _Leaves:
+        """A statistic of arrays whose types are known."""
+        if leaves.is_hidden:
+            return leaves
+        if leaves.is_summary:
+            if leaves.values.type.get_field_index(stat) < 0:
+                raise _UnfitError
+            values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
+            return _Leaves(pc.struct_field(values, stat), rows, is_element=True)
+        return _computed(leaves, stat)
+
+    def _either(self, leaves: _Leaves, stat: Stat) -> Iterator[_Leaves]:
+        """A statistic of an array, or a field of that name, where no types are known."""
+        kind = leaves.values.type
+        if leaves.is_hidden or _is_scalar(kind):
+            if leaves.is_hidden:
+                yield leaves
+            return
+        if pa.types.is_struct(kind):
+            if set(_names(kind)) == {"n"}:
+                raise _UnfitError  # it may be the summary of an array of anything
+            yield from self._reach(leaves, (stat,), ())
+            return
+        if not _is_list(kind) or pa.types.is_struct(kind.value_type):
+            raise _UnfitError
+        if stat == "n" or (_is_numeric(kind.value_type) and not leaves.values.flatten().null_count):
+            yield _computed(leaves, stat)
+            return
+        raise _UnfitError
+
+    def _reach(
+        self,
+        leaves: _Leaves,
+        parts: tuple[str | int, ...],
+        names: tuple[str, ...],
+    ) -> Iterator[_Leaves]:
+        """What a path leads to from some values; through an array, from each element."""
+        values, rows = _plain(leaves.values), leaves.rows
+        kind = values.type
+        if pa.types.is_null(kind):
+            if not parts:
+                yield leaves
+            return
+        if names and self._is_summary(kind, names, is_element=leaves.is_element):
+            yield from self._behind(_Leaves(values, rows), parts)
+            return
+        if not parts:
+            yield leaves._replace(values=values)
+            return
+        part, rest = parts[0], parts[1:]
+        if pa.types.is_struct(kind):
+            if kind.get_field_index(str(part)) >= 0:
+                values, rows = _some(values, rows, _valid(values))
+                inner = _Leaves(pc.struct_field(values, str(part)), rows)
+                yield from self._reach(inner, rest, (*names, str(part)))
+        elif _is_list(kind):
+            yield from self._into_list(values, rows, parts, names)
+        elif not _is_scalar(kind):
+            raise _UnfitError
+
+    def _into_list(
+        self, values: pa.Array, rows: Rows, parts: tuple[str | int, ...], names: tuple[str, ...]
+    ) -> Iterator[_Leaves]:
+        """What a path leads to through lists."""
+        part = parts[0]
+        elements = _flattened(values, rows)
+        inside = elements.values.type
+        named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
+        if isinstance(part, int):
+            if named:
+                raise _UnfitError  # a place, or a field that is called as one
+            yield from self._reach(_at_place(values, rows, part), parts[1:], names)
+        elif named:
+            yield from self._reach(elements, parts, names)
+        elif not (_is_scalar(inside) or pa.types.is_struct(inside) or _is_list(inside)):
+            raise _UnfitError
+
+    def _is_summary(self, kind: pa.DataType, names: tuple[str, ...], *, is_element: bool) -> bool:
+        if not pa.types.is_struct(kind):
+            return False
+        if self._types.known:
+            return not is_element and ".".join(names) in self._types.arrays
+        return set(_names(kind)) in _SUMMARIES
+
+    def _behind(self, leaves: _Leaves, parts: tuple[str | int, ...]) -> Iterator[_Leaves]:
+        """What stands behind summaries when a path goes on with some parts."""
+        if not self._types.known:
+            # It may as well be a message with fields of these names.
+            stat = len(parts) == 1 and parts[0] in _names(leaves.values.type)
+            if not stat:
+                raise _UnfitError
+            values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
+            yield _Leaves(pc.struct_field(values, str(parts[0])), rows)
+        elif not parts:
+            yield leaves._replace(is_summary=True)
+        else:
+            numeric = "min" in _names(leaves.values.type)
+            if numeric and (isinstance(parts[0], str) or len(parts) > 1):
+                return
+            chosen = _valid(leaves.values)
+            if isinstance(parts[0], int):
+                counts = _numpy(pc.fill_null(pc.struct_field(leaves.values, "n"), 0))
+                chosen &= counts > parts[0]
+            values, rows = _some(leaves.values, leaves.rows, chosen)
+            yield _Leaves(values, rows, is_hidden=True)
+
+
+def _not(pair: _Pair) -> _Pair:
+    if pair.possible is pair.certain:
+        mask = ~pair.possible
+        return _Pair(mask, mask)
+    return _Pair(~pair.certain, ~pair.possible)
+
+
+# Arrays.
+
+
+def _plain(values: pa.Array) -> pa.Array:
+    """Values without dictionaries.
+
+    Raises:
+        _UnfitError: They stand for something else, such as JSON text.
+    """
+    if isinstance(values.type, pa.BaseExtensionType):
+        raise _UnfitError
+    return values.dictionary_decode() if pa.types.is_dictionary(values.type) else values
+
+
+def _names(kind: pa.DataType) -> list[str]:
+    return [kind.field(index).name for index in range(kind.num_fields)]
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    test = pa.types
+    return bool(test.is_list(kind) or test.is_large_list(kind) or test.is_fixed_size_list(kind))
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+
+def _is_time(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_timestamp(kind) or pa.types.is_duration(kind))
+
+
+def _is_numeric(kind: pa.DataType) -> bool:
+    test = pa.types
+    return bool(test.is_integer(kind) or test.is_floating(kind) or test.is_boolean(kind))
+
+
+def _is_binary(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_binary(kind) or pa.types.is_large_binary(kind))
+
+
+def _is_scalar(kind: pa.DataType) -> bool:
+    if pa.types.is_dictionary(kind):
+        return _is_scalar(kind.value_type)
+    is_plain = _is_numeric(kind) or _is_text(kind) or _is_binary(kind) or _is_time(kind)
+    return is_plain or bool(pa.types.is_null(kind))
+
+
+def _numpy(values: pa.Array) -> NDArray[Any]:
+    found: NDArray[Any] = values.to_numpy(zero_copy_only=False)
+    return found
+
+
+def _valid(values: pa.Array) -> Mask:
+    if not values.null_count:
+        return np.ones(len(values), np.bool_)
+    return _numpy(values.is_valid())
+
+
+def _some(values: pa.Array, rows: Rows, chosen: Mask) -> tuple[pa.Array, Rows]:
+    if chosen.all():
+        return values, rows
+    return values.filter(pa.array(chosen)), rows[chosen]
+
+
+def _flattened(values: pa.Array, rows: Rows) -> _Leaves:
+    """The elements of lists; a list that is null has none."""
+    parents = _numpy(pc.list_parent_indices(values))
+    return _Leaves(pc.list_flatten(values), rows[parents], is_element=True)
+
+
+def _lengths(values: pa.Array) -> NDArray[np.int64]:
+    """Elements of each list, 0 of a null."""
+    lengths = _numpy(pc.fill_null(pc.list_value_length(values), 0)).astype(np.int64)
+    return np.where(_valid(values), lengths, 0)
+
+
+def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
+    """The element at a place of each list that is long enough."""
+    values, rows = _some(values, rows, _lengths(values) > place)
+    if not len(values):
+        return _Leaves(pa.nulls(0, values.type.value_type), rows, is_element=True)
+    return _Leaves(pc.list_element(values, place), rows, is_element=True)
+
+
+def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
+    """A statistic of lists, as their summaries in the index have it."""
+    from hybridlog.schema.column import Scalars
+    from hybridlog.schema.summary import summarise
+
+    values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
+    kind = values.type
+    if pa.types.is_null(kind):
+        return _Leaves(pa.nulls(0), rows[:0])
+    if not _is_list(kind) and not (_is_binary(kind) and stat == "n"):
+        raise _UnfitError
+    if stat == "n":
+        count = pc.binary_length(values) if _is_binary(kind) else pa.array(_lengths(values))
+        return _Leaves(count, rows, is_element=True)
+    elements = _as_integers(pc.list_flatten(values))
+    if elements.null_count or not _is_numeric(elements.type):
+        raise _UnfitError
+    offset = np.concatenate(([0], np.cumsum(_lengths(values))))
+    found = summarise(Scalars(_numpy(elements)), offset)
+    return _Leaves(pa.array(getattr(found, stat), mask=~found.has), rows, is_element=True)
+
+
+def _as_integers(values: pa.Array) -> pa.Array:
+    """Times and durations as nanoseconds; other values as they are.
+
+    Raises:
+        _UnfitError: They are in another unit.
+    """
+    if not _is_time(values.type):
+        return values
+    if values.type.unit != "ns":
+        raise _UnfitError
+    return values.cast(pa.int64())
+
+
+# Conditions on values.
+
+
+def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
+    """The values themselves, or the elements of those that are lists; and nulls."""
+    values, rows = leaves.values, leaves.rows
+    if leaves.is_hidden or leaves.is_summary:
+        yield leaves
+        return
+    if _is_list(values.type):
+        inner = _flattened(values, rows)
+        yield inner._replace(values=_plain(inner.values))
+    else:
+        yield _Leaves(values, rows)
+    if values.null_count:
+        rows = rows[~_valid(values)]
+        yield _Leaves(pa.nulls(len(rows)), rows, is_element=leaves.is_element)
+
+
+def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
+    """Which values may satisfy a condition, and which surely do: bool[values] each."""
+    if leaves.is_hidden or leaves.is_summary:
+        return _of_summaries(node, leaves, types)
+    match node:
+        case Match(pattern=pattern):
+            found = _matching(leaves.values, pattern)
+            return _Pair(found, found)
+        case Compare(order="==" | "!=", value=value):
+            return _equal_to(leaves, (value,))
+        case Member(values=values):
+            return _equal_to(leaves, values)
+        case Compare(order=order, value=value):
+            found = _compared(leaves.values, order, value)
+            if leaves.is_element and pa.types.is_floating(leaves.values.type):
+                found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
+            return _Pair(found, found)
+
+
+def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> _Pair:
+    found = np.zeros(len(leaves.values), np.bool_)
+    for value in values:
+        if value is not None:
+            found |= _compared(leaves.values, "==", value)
+    if None not in values or not leaves.values.null_count:
+        return _Pair(found, found)
+    possible = found | ~_valid(leaves.values)
+    return _Pair(possible, possible if leaves.is_element else found)
+
+
+def _matching(values: pa.Array, pattern: str) -> Mask:
+    if not _is_text(values.type):
+        return np.zeros(len(values), np.bool_)
+    try:
+        found = pc.match_substring_regex(values, pattern)
+    except pa.ArrowInvalid as error:
+        raise _UnfitError from error
+    return _filled(found)
+
+
+def _filled(found: pa.Array) -> Mask:
+    """A mask of Arrow as one of numpy, False for null."""
+    return _numpy(pc.fill_null(found, fill_value=False))
+
+
+def _compared(values: pa.Array, order: str, value: Value) -> Mask:
+    """Which values are in order with a value of the same kind; none of another kind."""
+    none = np.zeros(len(values), np.bool_)
+    kind = values.type
+    if isinstance(value, bool):
+        return _filled(pc.equal(values, value)) if pa.types.is_boolean(kind) else none
+    if isinstance(value, str):
+        return _texts_compared(values, order, value) if _is_text(kind) else none
+    if not is_number(value):
+        return none
+    if pa.types.is_decimal(kind):
+        raise _UnfitError
+    values = _as_integers(values)
+    kind = values.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return none
+    chosen = _valid(values)
+    numbers = _numpy(values if chosen.all() else values.filter(pa.array(chosen)))
+    compare = _integers_compared if pa.types.is_integer(kind) else _floats_compared
+    none[chosen] = compare(numbers, order, value)
+    return none
+
+
+def _texts_compared(values: pa.Array, order: str, value: str) -> Mask:
+    try:
+        wanted = pa.scalar(value, values.type)
+    except (pa.ArrowInvalid, UnicodeEncodeError):
+        raise _UnfitError from None
+    return _filled(_TEXT_ORDERS[order](values, wanted))
+
+
+def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
+    """Integers with any number, exactly."""
+    bound = for_integers(order, value)
+    if isinstance(bound, bool):
+        return bound
+    order, limit = bound
+    info = np.iinfo(numbers.dtype)
+    if limit > info.max:
+        return order in {"<", "<="}
+    if limit < info.min:
+        return order in {">", ">="}
+    return _ORDERS[order](numbers, numbers.dtype.type(limit))
+
+
+def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
+    """Floats with any number, exactly."""
+    wide = numbers.astype(np.float64, copy=False)
+    if is_nan(value):
+        return np.isnan(wide) if order == "==" else False
+    if order == "==":
+        near = nearest(value)
+        return wide == near if near == value else False
+    order, bound = for_doubles(order, value)
+    return _ORDERS[order](wide, bound)
+
+
+# Conditions on summaries.
+
+
+def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
+    """Conditions on elements of arrays of which only summaries are there."""
+    summaries = leaves.values
+    there = _valid(summaries)
+    none = np.zeros(len(summaries), np.bool_)
+    wanted = _values_of(node)
+    if None in wanted:
+        return _Pair(~none, none)
+    if "min" not in _names(summaries.type):
+        return _Pair(there, none)
+    path = node.field.names
+    if types.kind(path) == "bool":
+        wanted = tuple(value for value in wanted if isinstance(value, bool))
+    low, high = (pc.struct_field(summaries, name) for name in ("min", "max"))
+    is_ordered = isinstance(node, Compare) and node.order not in {"==", "!="}
+    possible = none
+    for value in wanted:
+        rounded = not types.are_floats(path) and _is_rounded(low, value)
+        if is_ordered and is_number(value) and not leaves.is_hidden and not rounded:
+            assert isinstance(node, Compare)
+            found = _compared(low if node.order in {"<", "<="} else high, node.order, value)
+            return _Pair(found, found)
+        if is_ordered or rounded:
+            possible = possible | (there & is_number(value))
+        else:
+            possible = possible | (there & _may_equal(low, high, value))
+    return _Pair(possible, none)
+
+
+def _values_of(node: Compare | Member | Match) -> tuple[Value, ...]:
+    """What a field is compared with."""
+    if isinstance(node, Match):
+        return ()
+    return (node.value,) if isinstance(node, Compare) else node.values
+
+
+def _is_rounded(end: pa.Array, value: Value) -> bool:
+    """Whether ends may be integers that were rounded to the double they are compared with."""
+    return pa.types.is_floating(end.type) and is_number(value) and abs(nearest(value)) >= 2**53
+
+
+def _may_equal(low: pa.Array, high: pa.Array, value: Value) -> Mask:
+    """Whether an element between two ends may be equal to a value."""
+    always = np.ones(len(low), np.bool_)
+    if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
+        return always
+    if not is_number(value):
+        return ~always
+    return _compared(low, "<=", value) & _compared(high, ">=", value)

@@ -1,0 +1,269 @@
+"""The tree of a predicate, whether it was written as text or as a MongoDB filter.
+
+Nodes are immutable and can be hashed and pickled. Two nodes are equal when they ask for the
+same: where they stand in the text does not count, and NaN equals NaN.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Value: TypeAlias = bool | int | float | str | None
+"""What a field is compared with; times and durations are integer nanoseconds."""
+Order = Literal["==", "!=", "<", "<=", ">", ">="]
+
+
+class _Node:
+    """Equality and hash of nodes."""
+
+    __slots__ = ()
+
+    def _key(self) -> tuple[object, ...]:
+        named = (getattr(self, each.name) for each in dataclasses.fields(self) if each.compare)  # type: ignore[arg-type]
+        return (type(self).__name__, *map(_key_of, named))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Node) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+
+def _key_of(value: object) -> object:
+    if isinstance(value, tuple):
+        return tuple(map(_key_of, value))
+    if isinstance(value, bool):
+        return "bool", value  # True would equal 1
+    if isinstance(value, float) and value != value:  # noqa: PLR0124
+        return ("nan",)
+    return value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field(_Node):
+    """A field path.
+
+    Attributes:
+        parts: Names, and ints for elements of arrays.
+        position: Where it stands in the text.
+    """
+
+    parts: tuple[str | int, ...]
+    position: int = dataclasses.field(default=0, compare=False)
+
+    @property
+    def path(self) -> str:
+        """The path as MongoDB writes it: `position.0`."""
+        return ".".join(map(str, self.parts))
+
+    @property
+    def names(self) -> str:
+        """The path without places in arrays, as the types of fields are listed."""
+        return ".".join(part for part in self.parts if isinstance(part, str))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compare(_Node):
+    """`field order value`."""
+
+    field: Field
+    order: Order
+    value: Value
+    position: int = dataclasses.field(default=0, compare=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member(_Node):
+    """`field in [...]`, or `not in` when negated."""
+
+    field: Field
+    values: tuple[Value, ...]
+    negated: bool
+    position: int = dataclasses.field(default=0, compare=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exists(_Node):
+    """`field exists`, or `missing` when not present."""
+
+    field: Field
+    present: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match(_Node):
+    """`field ~ pattern`, or `!~` when negated; the pattern is in RE2's syntax."""
+
+    field: Field
+    pattern: str
+    negated: bool
+    position: int = dataclasses.field(default=0, compare=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class And(_Node):
+    """All of the items hold; without items, always."""
+
+    items: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Or(_Node):
+    """One of the items holds."""
+
+    items: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Not(_Node):
+    """The item does not hold."""
+
+    item: Node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opaque(_Node):
+    """A piece of a MongoDB filter that only MongoDB can answer.
+
+    Attributes:
+        filter: The piece, as `frozen` gives it.
+    """
+
+    filter: object
+
+    def to_filter(self) -> dict[str, object]:
+        """The piece as a new dictionary."""
+        found = thawed(self.filter)
+        assert isinstance(found, dict)
+        return found
+
+
+Condition: TypeAlias = Compare | Member | Exists | Match
+Node: TypeAlias = Condition | And | Or | Not | Opaque
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Predicate:
+    """A predicate that was read and checked.
+
+    Attributes:
+        root: The tree.
+        text: As it was written; messages show it.
+    """
+
+    root: Node
+    text: str = dataclasses.field(default="", compare=False)
+
+    def __bool__(self) -> bool:
+        """Whether it asks for anything."""
+        return self.root != And(())
+
+    def __and__(self, other: Predicate) -> Predicate:
+        """Both predicates hold."""
+        asked = [each for each in (self, other) if each]
+        if len(asked) < 2:
+            return asked[0] if asked else self
+        items = [
+            item
+            for each in asked
+            for item in (each.root.items if isinstance(each.root, And) else (each.root,))
+        ]
+        return Predicate(And(tuple(items)), " and ".join(f"({each.text})" for each in asked))
+
+    def __repr__(self) -> str:
+        return f"<Predicate {spelled(self.root)}>"
+
+    def conditions(self) -> Iterator[Condition]:
+        """Every single condition, from left to right."""
+        return (node for node in nodes(self.root) if isinstance(node, Condition))
+
+    def fields(self) -> list[str]:
+        """The paths asked for, as MongoDB writes them, each once."""
+        return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
+
+    @property
+    def is_opaque(self) -> bool:
+        """Whether a part of it can be answered by MongoDB only."""
+        return any(isinstance(node, Opaque) for node in nodes(self.root))
+
+
+def root_of(node: Predicate | Node) -> Node:
+    """The tree of a predicate; a node is a tree already."""
+    return node.root if isinstance(node, Predicate) else node
+
+
+def nodes(node: Node) -> Iterator[Node]:
+    """All nodes of a tree, parents before children, from left to right."""
+    yield node
+    match node:
+        case And(items) | Or(items):
+            for item in items:
+                yield from nodes(item)
+        case Not(item):
+            yield from nodes(item)
+        case _:
+            pass
+
+
+def frozen(value: object) -> object:
+    """A value of a MongoDB filter, with tuples for mappings and lists."""
+    if isinstance(value, Mapping):
+        return "{}", tuple((name, frozen(inner)) for name, inner in value.items())
+    if isinstance(value, list):
+        return "[]", tuple(map(frozen, value))
+    return value
+
+
+def thawed(value: object) -> object:
+    """A value of a MongoDB filter from its frozen form."""
+    match value:
+        case ("{}", tuple(items)):
+            return {name: thawed(inner) for name, inner in items}
+        case ("[]", tuple(items)):
+            return [thawed(inner) for inner in items]
+    return value
+
+
+def spelled(node: Node) -> str:
+    """The node as text of the language; an opaque one as MongoDB writes it."""
+    match node:
+        case Not(item):
+            return f"not ({spelled(item)})"
+        case Opaque():
+            return str(node.to_filter())
+        case And(items):
+            return " and ".join(map(_bracketed, items)) or "anything"
+        case Or(items):
+            return " or ".join(map(_bracketed, items)) or "nothing"
+        case _:
+            return _condition(node)
+
+
+def _condition(node: Condition) -> str:
+    match node:
+        case Compare(asked, order, value):
+            return f"{asked.path} {order} {_literal(value)}"
+        case Member(asked, values, negated):
+            members = ", ".join(map(_literal, values))
+            return f"{asked.path} {'not in' if negated else 'in'} [{members}]"
+        case Exists(asked, present):
+            return f"{asked.path} {'exists' if present else 'missing'}"
+        case Match(asked, pattern, negated):
+            return f"{asked.path} {'!~' if negated else '~'} {pattern!r}"
+
+
+def _bracketed(node: Node) -> str:
+    return f"({spelled(node)})" if isinstance(node, And | Or) else spelled(node)
+
+
+def _literal(value: Value) -> str:
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+Test: TypeAlias = Callable[[Mapping[str, object]], bool]
+"""A predicate as a test of one message after the other."""

@@ -1,0 +1,246 @@
+"""Types of the fields that a predicate asks for, and whether it fits them."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+from hybridlog.query.predicate.tokens import error_at
+from hybridlog.query.predicate.tree import (
+    Compare,
+    Condition,
+    Exists,
+    Field,
+    Match,
+    Member,
+    Predicate,
+    Value,
+)
+from hybridlog_storage.errors import WhereError
+
+Stat = Literal["n", "min", "max", "mean"]
+Kind = Literal["number", "string", "bool", "time", "date", "other"]
+
+STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
+"""Names of what the summary of an array says."""
+_SHOWN = 10
+_ANY_ELEMENT = re.compile(r"\[\*?\]")
+_FLOATS = {"float", "double", "float32", "float64"}
+_SMALL = {"byte", "char", "octet", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32"}
+_KINDS: dict[str, Kind] = {
+    "bool": "bool",
+    "boolean": "bool",
+    "string": "string",
+    "time": "time",
+    "duration": "time",
+    "date": "date",
+    **dict.fromkeys(_FLOATS | _SMALL | {"uint64", "int", "uint", "number", "integer"}, "number"),
+}
+_META = {
+    "_meta.inserted_at": "date",
+    "_meta.t": "time",
+    "_meta.pub": "time",
+    "_meta.rec": "string",
+    "_meta.topic": "string",
+    "_meta.seq": "int64",
+    "_meta.ref.seg": "int32",
+    "_meta.ref.chunk": "int64",
+    "_meta.ref.off": "int64",
+    "_meta.ref.len": "int64",
+    "_meta.error": "string",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FieldTypes:
+    """The types of the fields of a topic.
+
+    Attributes:
+        known: False when only `_meta.*` is known, as of JSON messages.
+        types: Type of each path, without marks of arrays in the path.
+        arrays: Paths that are arrays.
+        inner: Paths that have fields below them.
+    """
+
+    known: bool
+    types: dict[str, str]
+    arrays: set[str] = field(default_factory=set)
+    inner: set[str] = field(default_factory=set)
+
+    @staticmethod
+    def of(types: FieldTypes | Mapping[str, str] | None) -> FieldTypes:
+        """The types as listed by a codec: path to type; None when they are not known.
+
+        Args:
+            types: Path (dotted, with or without `[]` after arrays) to type as definitions
+                write it: `float64`, `time`, `float32[]`, `uint8[9]`, `pkg/Type[]`.
+        """
+        if isinstance(types, FieldTypes):
+            return types
+        return _listed(None if types is None else tuple(types.items()))
+
+    def is_open(self, asked: Field) -> bool:
+        """Whether each message decides what stands at a path."""
+        name = asked.names
+        if str(asked.parts[0]) == "_meta":
+            return False
+        return not self.known or not (
+            name in self.types
+            or name in self.inner
+            or name in self.arrays
+            or self.statistic(asked.parts) is not None
+        )
+
+    def statistic(self, parts: tuple[str | int, ...]) -> Stat | None:
+        """The statistic of an array that a path asks for; None when it asks for a field.
+
+        Where the types are not known it may be either, and each message decides.
+        """
+        stat = STATS.get(str(parts[-1]))
+        if stat is None or len(parts) < 2 or parts[0] == "_meta" or not self.known:
+            return stat if len(parts) > 1 and parts[0] != "_meta" else None
+        names = [part for part in parts if isinstance(part, str)]
+        path, parent = ".".join(names), ".".join(names[:-1])
+        if path in self.types or path in self.inner or parent not in self.arrays:
+            return None
+        numeric = _KINDS.get(self.base(parent)) in {"number", "bool", "time"}
+        return stat if numeric or stat == "n" else None
+
+    def base(self, path: str) -> str:
+        """Type of a field, or of the elements of an array; empty for messages."""
+        return self.types.get(path, "").split("[", 1)[0]
+
+    def kind(self, path: str) -> Kind:
+        """Kind of a field, or of the elements of an array."""
+        return _KINDS.get(self.base(path), "other")
+
+    def are_floats(self, path: str) -> bool:
+        """Whether a field, or the elements of an array, are floating-point numbers."""
+        return self.base(path) in _FLOATS
+
+    def are_int64(self, path: str) -> bool:
+        """Whether a field, or the elements of an array, are integers that fit into int64."""
+        return self.base(path) in _SMALL
+
+
+@lru_cache(maxsize=64)
+def _listed(types: tuple[tuple[str, str], ...] | None) -> FieldTypes:
+    found = FieldTypes(types is not None, {})
+    for written, kind in {**dict(types or ()), **_META}.items():
+        parts = written.split(".")
+        for count in range(1, len(parts) + 1):
+            path = _ANY_ELEMENT.sub("", ".".join(parts[:count]))
+            if _ANY_ELEMENT.search(parts[count - 1]):
+                found.arrays.add(path)
+            if count < len(parts):
+                found.inner.add(path)
+        path = _ANY_ELEMENT.sub("", written)
+        found.types[path] = kind
+        if kind.endswith("]") or kind == "bytes":
+            found.arrays.add(path)
+    return found
+
+
+def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
+    """Refuse a predicate that asks for unknown fields, or compares things of two kinds.
+
+    Raises:
+        WhereError: With the place in the predicate's text.
+    """
+    checker = _Checker(predicate.text, FieldTypes.of(types))
+    for condition in predicate.conditions():
+        checker.check(condition)
+
+
+class _Checker:
+    def __init__(self, text: str, types: FieldTypes) -> None:
+        self._text = text
+        self._types = types
+
+    def check(self, node: Condition) -> None:
+        kind = self._kind(node.field)
+        if not isinstance(node, Exists):
+            self._check_leaf(node.field)
+        match node:
+            case Compare(value=value, position=position):
+                self._check_value(kind, value, position)
+            case Member(values=values, position=position):
+                for value in values:
+                    self._check_value(kind, value, position)
+            case Match(position=position) if kind not in {"string", "other"}:
+                raise error_at(self._text, position, f"the field is a {kind}, not a string")
+            case _:
+                pass
+
+    def _kind(self, asked: Field) -> Kind:
+        types = self._types
+        path = asked.names
+        if asked.parts[0] == "_id":
+            raise self._fail(asked, "_id cannot be asked for; use _meta.t, _meta.rec and _meta.seq")
+        if asked.parts[0] != "_meta" and not types.known:
+            return "other"
+        if path in types.types:
+            return types.kind(path)
+        if types.statistic(asked.parts) is not None:
+            return "number"
+        if path in types.inner or path in types.arrays:
+            return "other"
+        raise self._unknown(asked, path)
+
+    def _check_leaf(self, asked: Field) -> None:
+        """Refuse a comparison with a message, which has fields and no value of its own."""
+        path = asked.names
+        if path not in self._types.inner:
+            return
+        below = [name for name in self._types.types if name.startswith(f"{path}.")]
+        leaves = [name for name in below if name not in self._types.inner]
+        names = ", ".join(leaves[:_SHOWN]) + (" …" if len(leaves) > _SHOWN else "")
+        raise self._fail(
+            asked, f"{path} is a message, not a value; ask for one of its fields: {names}"
+        )
+
+    def _check_value(self, kind: Kind, value: Value, position: int) -> None:
+        if kind == "date":
+            raise error_at(
+                self._text, position, "_meta.inserted_at has milliseconds only; ask for _meta.t"
+            )
+        if kind == "other" or value is None:
+            return
+        if isinstance(value, bool):
+            given = "bool"
+        elif isinstance(value, str):
+            given = "string"
+        else:
+            given = "number"
+        if given == kind or (given == "number" and kind == "time"):
+            return
+        hints = {
+            "bool": "; write true or false",
+            "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
+            "string": "; write it in quotes",
+        }
+        raise error_at(
+            self._text,
+            position,
+            f"the field is a {kind}, the value is a {given}{hints.get(kind, '')}",
+        )
+
+    def _unknown(self, asked: Field, path: str) -> WhereError:
+        known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
+        lowered = {name.lower(): name for name in known}
+        near = [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
+        near += [
+            lowered[key]
+            for key in difflib.get_close_matches(path.lower(), lowered, n=_SHOWN, cutoff=0.5)
+        ]
+        shown = list(dict.fromkeys(near or known))
+        names = ", ".join(shown[:_SHOWN]) + (" …" if len(shown) > _SHOWN else "")
+        hint = f"; did you mean {names}?" if near else f"; there are {names}" if names else ""
+        return self._fail(asked, f"there is no field {path}{hint}")
+
+    def _fail(self, asked: Field, message: str) -> WhereError:
+        return error_at(self._text, asked.position, message)
