@@ -60,8 +60,10 @@ ALLOWED = {
         "hybridlog.schema.arrow_objects",
         "hybridlog.schema.arrow_protobuf",
         "hybridlog.schema.arrow_types",
+        "hybridlog.query",
     ),
     "pymongo": ("hybridlog_storage.database",),
+    "re2": ("hybridlog.query.predicate.regex",),
     "rclpy": ("hybridlog.live_sources.ros2_middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
@@ -85,6 +87,7 @@ DISTRIBUTIONS = {
     "bson": "pymongo",
     "google": "mcap-protobuf-support",
     "mcap_protobuf": "mcap-protobuf-support",
+    "re2": "google-re2",
     "ruamel": "ruamel.yaml",
 }
 

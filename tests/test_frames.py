@@ -478,6 +478,3 @@ def test_real_log_agrees_with_rosbags(topic: str) -> None:
                 assert got.value == value.sec * 10**9 + value.nanosec
             else:
                 assert got == value
-        if path in index.column_names and not pa.types.is_nested(table[path].type):
-            assert index[path].type == table[path].type
-            assert index[path].equals(table[path])

@@ -10,23 +10,29 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog.live.ring import Held, Ring
 from hybridlog.losses import Cause, Ledger
-from hybridlog.query.evaluate import compiled, numbers_at
-from hybridlog.query.mongo_filter import to_filter
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import numbers_at, to_bool
+from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher
-from hybridlog.query.where import Expression, parse
 from hybridlog.schema.codec import codec_for
-from hybridlog_storage.errors import HybridlogError, UsageError, WhereError
+from hybridlog_storage.errors import (
+    DefinitionError,
+    HybridlogError,
+    PayloadError,
+    UsageError,
+    WhereError,
+)
 
 if TYPE_CHECKING:
     from hybridlog.live.recording import LiveRecording
-    from hybridlog.query.evaluate import Test
+    from hybridlog.query.predicate.tree import Predicate, Test
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.messages import Channel
 
@@ -47,7 +53,7 @@ class Trigger:
 
     text: str
     fits: TopicMatcher
-    predicate: Expression | None
+    predicate: Predicate | None
 
     @classmethod
     def of(cls, text: str) -> Trigger:
@@ -63,13 +69,13 @@ class Trigger:
         if not topic:
             raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
         fits = matcher([topic])
-        expression = parse(predicate) if predicate.strip() else None
-        for path in [] if expression is None else expression.fields():
+        asked = parse(predicate) if predicate.strip() else None
+        for path in [] if asked is None else asked.fields():
             if path.split(".", 1)[0] in {"_id", "_meta"}:
                 raise WhereError(
                     f"a trigger is asked of a message before it is stored: {path} is not there yet"
                 )
-        return cls(text, fits, expression)
+        return cls(text, fits, asked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +109,13 @@ class _Watch(NamedTuple):
 
     Attributes:
         reason: The trigger's text.
-        test: Of a message's fields; None when any message fires it.
+        test: Of a message; None when any message fires it.
+        names: Fields at the top of the message that the test looks at.
     """
 
     reason: str
     test: Test | None
+    names: frozenset[str] = frozenset()
 
 
 class Snapshots:
@@ -319,11 +327,12 @@ class Snapshots:
                 continue
             types = {path.path: path.type for path in codec_for(channel).paths()} or None
             try:
-                to_filter(trigger.predicate, types)
+                check(trigger.predicate, types)
             except WhereError as error:
                 self._say(f"trigger {trigger.text!r} can never fire on {channel.topic}: {error}")
             else:
-                yield _Watch(trigger.text, compiled(trigger.predicate, types))
+                names = frozenset(path.split(".", 1)[0] for path in trigger.predicate.fields())
+                yield _Watch(trigger.text, to_bool(trigger.predicate, types), names)
 
     def _write_out(self, reason: str, at: int) -> None:
         """Start a recording with what the ring holds; runs on the worker."""
@@ -388,9 +397,13 @@ class Snapshots:
 
 def _happened(watches: tuple[_Watch, ...], held: Held) -> Iterator[str]:
     """The triggers that fire for a message."""
-    fields: dict[str, object] | None = None
-    for reason, test in watches:
-        if test is not None and fields is None:
-            fields = codec_for(held.channel).fields(held.payload)
-        if test is None or (fields is not None and test(fields)):
+    names = frozenset[str]().union(*(watch.names for watch in watches))
+    message: Mapping[str, object] | None = None
+    for reason, test, _ in watches:
+        if test is not None and message is None:
+            try:
+                message = codec_for(held.channel).plain(held.payload, names)
+            except (PayloadError, DefinitionError):
+                message = {}  # it has no fields, as in an answer
+        if test is None or (message is not None and test(message)):
             yield reason

@@ -114,7 +114,7 @@ class MessageFilter:
         unreadable = 0
         for row in rows.tolist():
             try:
-                fields = dict(channel.codec.plain(batch.payload(row)))
+                fields = dict(channel.codec.plain(batch.payload(row), self._fields))
             except (PayloadError, DefinitionError):
                 fields = {}
                 unreadable += 1

@@ -25,6 +25,7 @@ from hybridlog.query.answers.last_message import just_before, message_at
 from hybridlog.query.answers.latched import in_force
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
+from hybridlog.query.predicate.from_mongo import from_mongo
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
@@ -128,8 +129,6 @@ class Query:
         if isinstance(predicate, str):
             checked = self._session.predicate(predicate, self.topics, self.recordings)
         else:
-            from hybridlog.query.predicate.from_mongo import from_mongo
-
             checked = from_mongo(predicate)
         if self.question.predicate is not None:
             checked = self.question.predicate & checked

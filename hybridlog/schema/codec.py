@@ -108,10 +108,14 @@ class Codec(Protocol):
     def fields(self, payload: Buffer) -> dict[str, object]:
         """What the index document holds of this message; empty when it holds nothing."""
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
-        """The whole message as plain values: dict, list, str, bytes, bool, int, float, None.
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
+        """The whole message as plain values: dict, list, str, bool, int, float, None.
 
-        Times and durations are integer nanoseconds.
+        Times and durations are integer nanoseconds; protobuf `bytes` are `{"n": length}`.
+
+        Args:
+            payload: The serialized message.
+            names: Fields of the top level that are needed, at least; None for all.
 
         Raises:
             PayloadError: The payload does not fit its definition.
@@ -208,7 +212,7 @@ class OpaqueCodec:
         """Nothing."""
         return {}
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """Nothing."""
         return {}
 

@@ -62,7 +62,7 @@ class JsonCodec:
             return {}
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """The message as plain values; see `Codec.plain`."""
         return cast("dict[str, object]", top(_parsed(memoryview(payload))))
 

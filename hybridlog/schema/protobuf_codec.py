@@ -110,9 +110,9 @@ class ProtobufCodec:
             return {}
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """The message as plain values; `bytes` are their length, `{"n": 1024}`."""
-        return cast("dict[str, object]", _plain(self._parsed(memoryview(payload))))
+        return cast("dict[str, object]", top(_plain(self._parsed(memoryview(payload)))))
 
     def decode(self, payload: Buffer) -> object:
         """The protobuf message.

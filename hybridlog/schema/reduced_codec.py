@@ -113,7 +113,7 @@ class ReducedCodec:
         body = _body(memoryview(payload))
         return {} if isinstance(body, PayloadError) else _document(body)
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """The fields that were kept; long arrays are summaries."""
         return self.fields(payload)
 

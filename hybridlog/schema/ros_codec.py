@@ -24,7 +24,7 @@ from hybridlog.schema.definition import (
     parse_definition,
     paths,
 )
-from hybridlog.schema.document import TooLarge, bodies
+from hybridlog.schema.document import TooLarge, bodies, top_level_names
 from hybridlog.schema.wire import Decoded, WireReader
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
@@ -100,14 +100,16 @@ class RosCodec:
         body = group.body.tobytes()
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
 
-    def plain(self, payload: Buffer) -> dict[str, object]:
+    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """The message as plain values; see `Codec.plain`."""
         start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
         decoded = self.columns(payload, start, size, None)
         if decoded.unreadable:
             reason = decoded.unreadable[0].reason
             raise PayloadError(f"the payload does not fit {self._name}: {reason}")
-        return {name: row_of(column, 0) for name, column in decoded.records.fields.items()}
+        columns = decoded.records.fields
+        spelled = zip(top_level_names(columns), columns.values(), strict=True)
+        return {n: row_of(column, 0) for n, column in spelled if names is None or n in names}
 
     def decode(self, payload: Buffer) -> object:
         """The message as rosbags makes it: attributes, arrays as numpy views.

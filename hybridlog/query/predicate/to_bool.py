@@ -153,6 +153,10 @@ class _Hidden:
         return None if found and self.booleans is None and end in {0, 1} else found
 
 
+_UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
+"""What a name leads to in the summary of an element: nothing, if that is an array."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Reader:
     """Follows paths into messages.
@@ -230,13 +234,15 @@ class _Reader:
                 yield from self._reach(value[part], rest, names, element=True)
             # MongoDB takes a number for a name, too.
             for inner in value:
-                if isinstance(inner, Mapping):
+                if self._is_summary(inner, names, element=True):
+                    yield _UNKNOWN
+                elif isinstance(inner, Mapping):
                     yield from self._reach(inner, parts, names, element=True)
 
     def _values(
         self, value: object, parts: _Parts, names: _Names, *, element: bool = False
     ) -> Iterator[object]:
-        """What a path leads to; a number in it is a place in an array and no name."""
+        """What a path leads to, as a whole: arrays are not gone into at its end."""
         if not parts:
             yield value
             return
@@ -244,13 +250,12 @@ class _Reader:
             yield from _hidden(value, parts, self._are_booleans(names))
             return
         part, rest = parts[0], parts[1:]
-        if isinstance(part, int):
-            if isinstance(value, list) and part < len(value):
-                yield from self._values(value[part], rest, names, element=True)
-            return
+        if isinstance(part, int) and isinstance(value, list) and part < len(value):
+            yield from self._values(value[part], rest, names, element=True)
+        # MongoDB takes a number for a name, too.
         for inner in value if isinstance(value, list) else [value]:
-            if isinstance(inner, Mapping) and part in inner:
-                yield from self._values(inner[part], rest, (*names, part))
+            if isinstance(inner, Mapping) and str(part) in inner:
+                yield from self._values(inner[str(part)], rest, (*names, str(part)))
 
 
 def _hidden(

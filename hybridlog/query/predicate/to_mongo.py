@@ -39,6 +39,7 @@ _NOTHING: Filter = {"$nor": [{}]}
 _OPERATORS = {"<": "$lt", "<=": "$lte", ">": "$gt", ">=": "$gte"}
 _NULL: Filter = {"$type": "null"}
 _INF = math.inf
+_NUMBER_TYPES = ["int", "long", "double", "bool"]  # booleans count as 0 and 1
 _BOOLEANS = [
     {"case": {"$eq": ["$$b", True]}, "then": 1},
     {"case": {"$eq": ["$$b", False]}, "then": 0},
@@ -140,8 +141,7 @@ class _Compiler:
             case Opaque():
                 return _exact(node.to_filter())
             case Exists(asked, present):
-                found = self._exists(asked)
-                return found if present else _not(found)
+                return self._exists(asked) if present else self._missing(asked)
             case _:
                 return self._condition(node)
 
@@ -234,13 +234,41 @@ class _Compiler:
 
     def _exists(self, asked: Field) -> _Pair:
         found = [_exact({asked.path: {"$exists": True}})]
-        if self._stat(asked) is not None:
+        stat = self._stat(asked)
+        if stat is not None:
             array = Field(asked.parts[:-1])
-            is_list: Filter = {array.path: {"$type": "array"}}
             if self._types.known:
+                is_list: Filter = {array.path: {"$type": "array"}}
                 return _any_of([*found, _exact(is_list), *self._behind_summaries(array)])
-            found.append(_perhaps(is_list))
+            there: Filter = {"$and": [found[0].certain, self._unambiguous(array, stat)]}
+            found = [
+                _Pair(found[0].possible, there),
+                _exact({"$expr": _anywhere(array.parts, _Counted(stat, {}))}),
+                *self._named_by_numbers(array),
+            ]
         return _any_of([*found, *self._behind_summaries(asked)])
+
+    def _named_by_numbers(self, array: Field) -> list[_Pair]:
+        """Lists that a path may lead to because a number in it is the name of a field."""
+        if all(isinstance(part, str) for part in array.parts):
+            return []
+        return [_perhaps({array.path: {"$type": "array"}})]
+
+    def _unambiguous(self, array: Field, stat: Stat) -> Filter:
+        """Finds documents in which a field called as a statistic means what it says.
+
+        An element of a list may be the summary of a list within it. And where there is an
+        `n` and no `min`, elements that are hidden may have a field `n` of their own.
+        """
+        found: Filter = {array.path: {"$not": {"$type": "array"}}}
+        if stat == "n":
+            found[f"{array.path}.min"] = {"$exists": True}
+        return found
+
+    def _missing(self, asked: Field) -> _Pair:
+        if self._is_single(asked):
+            return _exact({asked.path: {"$exists": False}})
+        return _not(self._exists(asked))
 
     # Values.
 
@@ -256,12 +284,23 @@ class _Compiler:
         if stat is None:
             return _any_of([found, *self._behind_summaries(asked)])
         array = Field(asked.parts[:-1])
-        if stat == "n":
-            # Where there is no `min`, the elements may have a field `n` of their own.
-            counted: Filter = {f"{array.path}.min": {"$exists": True}}
-            found = _Pair(found.possible, {"$and": [found.certain, counted]})
-        lists = _perhaps({array.path: {"$type": "array"}})
-        return _any_of([found, lists, *self._behind_summaries(asked)])
+        found = _Pair(found.possible, {"$and": [found.certain, self._unambiguous(array, stat)]})
+        lists = [self._of_open_lists(array, stat, order, value) for value in values]
+        lists += self._named_by_numbers(array)
+        return _any_of([found, *lists, *self._behind_summaries(asked)])
+
+    def _of_open_lists(self, array: Field, stat: Stat, order: str, value: Value) -> _Pair:
+        """A condition on a statistic of lists that are in the index, where types are unknown."""
+        if value is None:
+            return _exact({"$expr": _anywhere(array.parts, _Counted(stat, None))})
+        if not is_number(value) or is_nan(value):
+            return _exact(_NOTHING)
+        if stat == "mean":
+            return _perhaps({array.path: {"$type": "array"}})
+        return self._pair(
+            lambda test: {"$expr": _anywhere(array.parts, _Counted(stat, test))},
+            self._statistic_bounds(array, stat, order, value),
+        )
 
     def _equals(self, asked: Field, values: Sequence[Value]) -> list[_Pair]:
         plain = [v for v in values if v is not None and self._is_plain(v, asked)]
@@ -465,7 +504,7 @@ class _Test:
 
     Attributes:
         stat: The statistic.
-        base: Kind of the elements.
+        base: Kind of the elements; `any` when it is not known.
         test: One operator and its value; None when the statistic must be null.
     """
 
@@ -487,7 +526,7 @@ class _Test:
         if self.stat == "n":
             return {"$size": here}
         numbers: object = here
-        if self.base == "bool":
+        if self.base in {"bool", "any"}:
             number = {"$switch": {"branches": _BOOLEANS, "default": "$$b"}}
             numbers = {"$map": {"input": here, "as": "b", "in": number}}
         finite = {
@@ -500,6 +539,55 @@ class _Test:
         }
         operator = {"min": "$min", "max": "$max", "mean": "$avg"}[self.stat]
         return {operator: finite}
+
+
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    """Whether a value is a list that has a statistic, and no field of that name.
+
+    Attributes:
+        stat: The statistic.
+        test: One operator and its value; None when the statistic must be null, empty when
+            any will do.
+    """
+
+    stat: Stat
+    test: Filter | None
+
+    def on(self, here: str) -> object:
+        """The aggregation expression for the value at `here`."""
+        each: object = {"$in": [{"$type": "$$e"}, _NUMBER_TYPES]}
+        if self.stat == "n":
+            named = {"$ne": [{"$type": f"$$e.{self.stat}"}, "missing"]}
+            each = {"$not": [{"$and": [{"$eq": [{"$type": "$$e"}, "object"]}, named]}]}
+        fits = {"$allElementsTrue": [{"$map": {"input": here, "as": "e", "in": each}}]}
+        found: object = fits
+        if self.test != {}:
+            found = {"$and": [fits, _Test(self.stat, "any", self.test).on(here)]}
+        return {"$cond": [{"$isArray": [here]}, found, False]}
+
+
+def _anywhere(parts: tuple[str | int, ...], test: _Counted) -> object:
+    """An aggregation expression: whether a test holds of any value that a path leads to.
+
+    Any value on the way may be an array.
+    """
+    return _further(f"${parts[0]}", parts[1:], test, 0)
+
+
+def _further(here: str, parts: tuple[str | int, ...], test: _Counted, depth: int) -> object:
+    if not parts:
+        return test.on(here)
+    part, rest, variable = parts[0], parts[1:], f"v{depth}"
+    if isinstance(part, int):
+        element = {"$cond": [{"$isArray": [here]}, {"$arrayElemAt": [here, part]}, None]}
+        inner = _further(f"$${variable}", rest, test, depth + 1)
+        return {"$let": {"vars": {variable: element}, "in": inner}}
+    inner = _further(f"$${variable}.{part}", rest, test, depth + 1)
+    is_object = {"$eq": [{"$type": f"$${variable}"}, "object"]}
+    values = {"$cond": [{"$isArray": [here]}, here, [here]]}
+    each = {"$cond": [is_object, inner, False]}
+    return {"$anyElementTrue": [{"$map": {"input": values, "as": variable, "in": each}}]}
 
 
 def _none_of(values: Sequence[Value]) -> Filter:

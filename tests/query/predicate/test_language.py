@@ -3,19 +3,25 @@ from __future__ import annotations
 import math
 import re
 
-import numpy as np
 import pytest
-from bson import Code, Int64, ObjectId, Regex
-from hybridlog.query.filters import check_filter
-from hybridlog.query.where import compile_filter, parse
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pymongo.collection import Collection
 
-from hybridlog.query import evaluate
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import to_bool, to_truth
+from hybridlog.query.predicate.to_mongo import to_mongo
+from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
+
+
+def compile_filter(where: str, field_types: dict[str, str] | None = None) -> Document:
+    predicate = parse(where)
+    check(predicate, field_types)
+    return to_mongo(predicate, field_types).filter
+
 
 TYPES = {
     "x": "float64",
@@ -34,8 +40,12 @@ TYPES = {
 
 ANYTHING = dict.fromkeys(
     ["x", "y", "z", "w", "s", "in", "not", "status[].level", "position", "a-b.in"], "any"
-)
+) | {"s": "string", "u": "uint64"}
 """Fields of a kind that nothing is known of, so that any value may stand beside them."""
+
+
+LONG_STATUS = {"status.n": {"$exists": True}, "status.min": {"$exists": False}}
+"""Documents in which the elements of `status` are too many to be there."""
 
 
 @pytest.mark.parametrize(
@@ -49,10 +59,12 @@ ANYTHING = dict.fromkeys(
         ("0 < x < 5", {"$and": [{"x": {"$gt": 0}}, {"x": {"$lt": 5}}]}),
         ("x between 1 and 2", {"$and": [{"x": {"$gte": 1}}, {"x": {"$lt": 2}}]}),
         ("x IN [1, 2.5, -3,]", {"x": {"$in": [1, 2.5, -3]}}),
-        ("x not in ('a')", {"x": {"$nin": ["a"], "$exists": True}}),
-        ("in in[1]", {"in": {"$in": [1]}}),
-        ("s ~ '^\\d+\"$'", {"s": {"$regex": '^\\d+"$'}}),
-        ("s !~ 'a'", {"s": {"$not": {"$regex": "a"}, "$exists": True}}),
+        ("x not in ('a')", {"x": {"$ne": "a", "$exists": True}}),
+        ("x not in ('a', 2)", {"x": {"$nin": ["a", 2], "$exists": True}}),
+        ("in in[1]", {"in": {"$eq": 1}}),
+        ("s ~ '^\\d+\"$'", {"s": {"$type": "string"}}),  # for candidates
+        ("s ~ 'slip: '", {"s": {"$regex": "slip: "}}),
+        ("s !~ '^a'", {"$and": [{"s": {"$exists": True}}, {"$nor": [{"s": {"$regex": "^a"}}]}]}),
         ("x exists", {"x": {"$exists": True}}),
         ("x MISSING", {"x": {"$exists": False}}),
         ("x == null", {"x": {"$type": "null"}}),
@@ -60,20 +72,31 @@ ANYTHING = dict.fromkeys(
         ("x == 0x1F", {"x": {"$eq": 31}}),
         ("x == 1e-3", {"x": {"$eq": 0.001}}),
         ("x == .5", {"x": {"$eq": 0.5}}),
-        ("x < -inf", {"x": {"$lt": -math.inf}}),
+        ("x < -inf", {"x": {"$lte": -math.inf}}),  # of integers beyond doubles, all are
         ("x == 9223372036854775807", {"x": {"$eq": 2**63 - 1}}),
         ("x == -9223372036854775808", {"x": {"$eq": -(2**63)}}),
         ("x == 9223372036854775808", {"x": {"$eq": 2.0**63}}),
+        ("u == 18364758544493064721", {"u": {"$eq": 18364758544493064721.0}}),
+        ("u < 18364758544493064721", {"u": {"$lte": 18364758544493064721.0}}),
         ("x < 5ms", {"x": {"$lt": 5_000_000}}),
         ("x > -1m30s", {"x": {"$gt": -90_000_000_000}}),
         ('x > t"1970-01-01T00:00:01.000000001Z"', {"x": {"$gt": 1_000_000_001}}),
         (r'x == "a\"\n\u00e9\ud83d\ude00"', {"x": {"$eq": 'a"\né😀'}}),
         ("x == 'it is \"so\"'", {"x": {"$eq": 'it is "so"'}}),
-        ("status[].level == 2", {"status.level": {"$eq": 2}}),
-        ("status[*].level == 2", {"status.level": {"$eq": 2}}),
-        ("position[0] == 2", {"position.0": {"$eq": 2}}),
-        ("position.0 == 2", {"position.0": {"$eq": 2}}),
-        ("`a-b`.`in`[3] == 2", {"a-b.in.3": {"$eq": 2}}),
+        ("status[].level == 2", {"$or": [{"status.level": {"$eq": 2}}, LONG_STATUS]}),
+        ("status[*].level == 2", {"$or": [{"status.level": {"$eq": 2}}, LONG_STATUS]}),
+        (
+            "position[0] == 2",
+            {"$or": [{"position.0": {"$eq": 2}}, {"position.n": {"$exists": True}}]},
+        ),
+        (
+            "position.0 == 2",
+            {"$or": [{"position.0": {"$eq": 2}}, {"position.n": {"$exists": True}}]},
+        ),
+        (
+            "`a-b`.`in`[3] == 2",
+            {"$or": [{"a-b.in.3": {"$eq": 2}}, {"a-b.in.n": {"$exists": True}}]},
+        ),
         ("`not` == 2", {"not": {"$eq": 2}}),
         ("_meta.t >= 5", {"_meta.t": {"$gte": 5}}),
         ("not x < 1", {"$nor": [{"x": {"$lt": 1}}]}),
@@ -95,13 +118,12 @@ ANYTHING = dict.fromkeys(
 )
 def test_grammar(where: str, expected: Document) -> None:
     assert compile_filter(where, field_types=ANYTHING) == expected
-    check_filter(expected)
     if "_meta" not in where:
         assert parse(where).fields()
 
 
 def test_nan() -> None:
-    (condition,) = compile_filter("x == NaN").values()
+    (condition,) = compile_filter("x == NaN", {"x": "float64"}).values()
     assert isinstance(condition, dict)
     assert math.isnan(condition["$eq"])
 
@@ -115,17 +137,21 @@ def test_nan() -> None:
         ("x < 1)", "expected 'and'", 5),
         ("x < nan", "nan", 4),
         ("x < true", "order", 4),
-        ("x ~ '(a+)+'", "take forever", 9),
-        ("x ~ '('", "not a regular", 5),
+        ("x ~ 'ab(?=c)'", "refused: .*without looking around", 7),
+        (r"x ~ '(a)\1'", "back references", 8),
+        (r"x ~ 'a\C'", "matches a byte", 6),
+        ("x ~ 'a{1001}'", "invalid repetition size", 6),
+        ("x ~ 'a++'", "bad repetition operator", 6),
+        ("x ~ '[b-a]'", "invalid character class range", 6),
+        ("x ~ '('", "not a regular expression of RE2", 5),
         ("x ~ '" + "a" * 1001 + "'", "longer than 1000", None),
-        ("x ~ '.*.*.*.*.*.*.*b'", "unbounded", None),
+        (r"x ~ '(\pL{100}){9}'", "too large", None),
         ('x == "a\\q"', "no escape", 7),
         ('x == "\\ud800"', "surrogate", 5),
         ("x == 'abc", "not closed", 5),
         ("x.", "does not end", 1),
         ("x == 5furlongs", "nor a duration", 5),
         ("x == 1e999", "too large", 5),
-        ("x == " + "9" * 399, "too large", None),
         ("x == " + "9" * 500, "400 characters", None),
         ("x == t'noon'", "not a time", 5),
         ("x == t'+5s'", "counts from a recording", 5),
@@ -215,10 +241,12 @@ def test_types(where: str, message: str) -> None:
 @example("t'")
 def test_any_text_is_a_filter_or_an_error(where: str) -> None:
     try:
-        compiled = compile_filter(where)
+        predicate = parse(where)
     except WhereError:
         return
-    check_filter(compiled)
+    to_mongo(predicate)
+    to_bool(predicate)
+    assert parse(predicate.text) == predicate
 
 
 # Against a real server -------------------------------------------------------------
@@ -235,9 +263,17 @@ def summary(values: list[float]) -> Document:
     return {"n": len(values), "min": min(finite), "max": max(finite), "mean": mean}
 
 
-def stored(values: list[float]) -> object:
-    """An array as index documents hold it; the limit here is 3, to see both forms."""
-    return values if len(values) <= 3 else summary(values)
+def stored(document: Document) -> Document:
+    """A message as index documents hold it; the limit of arrays is 3 here, to see both forms."""
+    found = dict(document)
+    for name in ("a", "q"):
+        values = document.get(name)
+        if isinstance(values, list) and len(values) > 3:
+            found[name] = summary(values)
+    parts = document.get("m")
+    if isinstance(parts, list):
+        found["m"] = [stored(part) for part in parts] if len(parts) <= 3 else {"n": len(parts)}
+    return found
 
 
 # Multiples of 1/4, so that means of up to four are exact however they are added up.
@@ -254,12 +290,10 @@ documents = st.fixed_dictionaries(
         "s": words,
         "b": st.booleans(),
         "z": st.none() | ints,
-        "a": arrays.map(stored),
+        "a": arrays,
         "flags": st.lists(st.booleans(), max_size=2),
         "o": st.fixed_dictionaries({"y": ints}),
-        "m": st.lists(
-            st.fixed_dictionaries({"v": ints}, optional={"q": arrays.map(stored)}), max_size=2
-        ),
+        "m": st.lists(st.fixed_dictionaries({"v": ints}, optional={"q": arrays}), max_size=4),
     },
 )
 
@@ -358,13 +392,11 @@ def leaves(document: Document, path: str) -> list[object]:
     parts = re.sub(r"\[(\d*)\]", lambda m: f".{m[1]}" if m[1] else "", path).split(".")
     last = parts[-1]
     if last in {"n", "min", "max", "mean"}:
-        found = []
-        for array in reached(document, parts[:-1]):
-            if isinstance(array, list):
-                found.append(summary([float(item) for item in array])[last])
-            elif isinstance(array, dict):
-                found.append(array[last])
-        return found
+        return [
+            summary([float(item) for item in array])[last]
+            for array in reached(document, parts[:-1])
+            if isinstance(array, list)
+        ]
     return reached(document, parts)
 
 
@@ -411,10 +443,18 @@ def holds(question: Question, document: Document) -> bool:
         case "compare", ["!=", value]:
             return bool(found) and not any(compares(item, "==", value) for item in values)
         case "compare", [order, value]:
-            end = "min" if order in {"<", "<="} else "max"
-            ends = [leaf[end] for leaf in found if isinstance(leaf, dict) and end in leaf]
-            ends = ends if order != "==" else []
-            return any(compares(item, order, value) for item in (*values, *ends))
+            if order != "==":  # of arrays, it is about finite elements
+                values = [
+                    item
+                    for leaf in found
+                    for item in (
+                        [item for item in leaf if math.isfinite(item)]
+                        if isinstance(leaf, list)
+                        else [leaf]
+                    )
+                    if not isinstance(item, dict)
+                ]
+            return any(compares(item, order, value) for item in values)
         case "in", [wanted]:
             return any(compares(item, "==", value) for item in values for value in wanted)
         case "not in", [wanted]:
@@ -438,160 +478,30 @@ def test_a_server_answers_as_the_language_says(
     collection: Collection[Document], docs: list[Document], asked: list[Question]
 ) -> None:
     collection.delete_many({})
-    collection.insert_many([{"_id": number, **document} for number, document in enumerate(docs)])
+    collection.insert_many([{"_id": number, **stored(each)} for number, each in enumerate(docs)])
     types = {**TYPES, "z": "any"}
     for question in asked:
         where = write(question)
-        compiled = compile_filter(where, field_types=types)
-        for query in (compiled, check_filter(compiled)):
-            found = {document["_id"] for document in collection.find(query, {"_id": 1})}
-            expected = {n for n, document in enumerate(docs) if holds(question, document)}
-            assert found == expected, (where, [docs[n] for n in found ^ expected])  # type: ignore[index]
-        # Triggers ask the same of a message that is in no database yet.
-        parsed = parse(where)
-        in_memory = {
-            n for n, document in enumerate(docs) if evaluate.holds(parsed, document, types)
-        }
-        assert in_memory == expected, (where, [docs[n] for n in in_memory ^ expected])
+        expected = {n for n, document in enumerate(docs) if holds(question, document)}
+
+        def wrong(found: set[object], where: str = where, expected: set[int] = expected) -> object:
+            return where, [docs[n] for n in found ^ expected]  # type: ignore[index]
+
+        predicate = parse(where)
+        test = to_bool(predicate, types)
+        in_memory: set[object] = {n for n, document in enumerate(docs) if test(document)}
+        assert in_memory == expected, wrong(in_memory)
+        compiled = to_mongo(predicate, types)
+        possible = {found["_id"] for found in collection.find(compiled.filter, {"_id": 1})}
+        certain = {found["_id"] for found in collection.find(compiled.certain, {"_id": 1})}
+        assert certain <= expected <= possible, wrong(possible)
+        assert possible == expected or not compiled.is_exact, wrong(possible)
+        truth = to_truth(predicate, types)
+        for n, document in enumerate(docs):
+            assert truth(stored(document)) in {None, n in expected}, (where, document)
 
 
 def test_the_deepest_predicate_is_taken(collection: Collection[Document]) -> None:
     where = "not " * 49 + "m.q.min < 5"
     collection.find_one(compile_filter(where, field_types=TYPES))
     collection.find_one(compile_filter(" or ".join(["m.q.mean < 5"] * 200), field_types=TYPES))
-
-
-def test_both_engines_take_the_pattern(collection: Collection[Document]) -> None:
-    collection.delete_many({})
-    collection.insert_many([{"_id": 1, "s": "base_link"}, {"_id": 2, "s": "Laser 12"}])
-    for pattern, ids in {
-        r"(?i)^LASER \d+$": {2},
-        "^(?:base|map)_": {1},
-        "[aeiou]{2}": set(),
-    }.items():
-        found = collection.find(compile_filter(f"s ~ '{pattern}'"))
-        assert {document["_id"] for document in found} == ids
-
-
-# Filters of users ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "query",
-    [
-        {},
-        {"position": 0.0},
-        {"a.b": {"$gt": 1, "$lt": 2}, "c": None},
-        {"$and": [{"a": 1}, {"$or": [{"b": 2}, {"c": {"$exists": False}}]}]},
-        {"a": {"$in": [1, "x", None]}, "b": {"$nin": [1]}},
-        {"a": {"$not": {"$gt": 5}}},
-        {"a": {"$elemMatch": {"b": 1, "c": {"$gt": 2}}}},
-        {"a": {"$elemMatch": {"$gt": 1, "$lt": 2}}},
-        {"a": {"$all": [1, 2]}},
-        {"a": {"$all": [{"$elemMatch": {"b": 1}}]}},
-        {"a": {"$size": 3}, "b": {"$type": ["int", "double"]}, "c": {"$mod": [4, 0]}},
-        {"a": {"$regex": "^x", "$options": "i"}},
-        {"a": {"b": 1, "c": [1, {"d": 2}]}},
-        {"_id": b"12345678901234567890"},
-        {"_id": ObjectId("0123456789abcdef01234567"), "n": Int64(5)},
-        {"$expr": {"$gt": [{"$size": {"$ifNull": ["$a", []]}}, 3]}},
-        {"$expr": {"$let": {"vars": {"x": "$a"}, "in": {"$eq": ["$$x", {"$literal": "$b"}]}}}},
-        {"a": math.inf},
-    ],
-)
-def test_allowed(query: Document, collection: Collection[Document]) -> None:
-    checked = check_filter(query)
-    assert checked == query
-    list(collection.find(checked))
-
-
-@pytest.mark.parametrize(
-    ("query", "place"),
-    [
-        ({"$where": "sleep(1000)"}, r"\$where"),
-        ({"a": {"$where": "1"}}, r"\$where"),
-        ({"$or": [{"a": 1}, {"$where": "1"}]}, r"\$or → \$where"),
-        ({"$expr": {"$function": {"body": "x", "args": [], "lang": "js"}}}, r"\$function"),
-        ({"$expr": {"$eq": [1, {"$accumulator": {}}]}}, r"\$accumulator"),
-        ({"$expr": {"$range": [0, 10**9]}}, r"\$range"),
-        ({"$expr": {"$reduce": {}}}, r"\$reduce"),
-        ({"$expr": {"$gt": [1, 2], "$lt": [1, 2]}}, "one operator"),
-        ({"$text": {"$search": "x"}}, r"\$text"),
-        ({"$jsonSchema": {}}, r"\$jsonSchema"),
-        ({"a": {"$near": [0, 0]}}, r"\$near"),
-        ({"a": {"$elemMatch": {"$where": "1"}}}, r"\$where"),
-        ({"a": {"$elemMatch": {"$or": [{"$where": "1"}]}}}, r"\$where"),
-        ({"a": {"$elemMatch": {"b": {"$where": "1"}}}}, r"\$where"),
-        ({"a": {"$elemMatch": {"$expr": {}, "$or": [{}]}}}, r"\$expr"),
-        ({"a": {"$all": [{"$elemMatch": {"$where": "1"}}]}}, r"\$where"),
-        ({"a": {"$not": {"$where": "1"}}}, r"\$where"),
-        ({"a": {"$not": 5}}, "mapping"),
-        ({"a": {"$not": {}}}, "operators"),
-        ({"a": {"$eq": {"$where": "1"}}}, r"\$where"),
-        ({"a": {"b": {"$gt": 1}}}, r"\$gt"),
-        ({"a": {"$gt": 1, "b": 2}}, "mixes"),
-        ({"a": {"$in": 5}}, "list"),
-        ({"$or": []}, "list"),
-        ({"$or": {}}, "list"),
-        ({"$or": [5]}, "mapping"),
-        ({"a": Code("x")}, "Code"),
-        ({"a": [Code("x", {})]}, "Code"),
-        ({"a": {"$regex": "(a+)+"}}, "forever"),
-        ({"a": {"$regex": "a", "$options": "x"}}, "options"),
-        ({"a": {"$options": "i"}}, r"\$options"),
-        ({"a": re.compile("(a*)*")}, "forever"),
-        ({"a": re.compile("a", re.VERBOSE)}, "flags"),
-        ({"a": re.compile(b"a")}, "string"),
-        ({"a": Regex("(a*)*")}, "forever"),
-        ({"a": 2**63}, "64 bits"),
-        ({"a": object()}, "object"),
-        ({"a": {1, 2}}, "set"),
-        ({"a": 1j}, "complex"),
-        ({"a": np.zeros(3)}, "ndarray"),
-        ({"a": "\ud800"}, "surrogates"),
-        ({"\ud800": 1}, "Unicode"),
-        ({"a\0": 1}, "NUL"),
-        ({5: 1}, "no string"),
-        ({"a": "x" * 2_000_000}, "too large"),
-        ({"a": [0] * 30_000}, "too large"),
-    ],
-)
-def test_refused(query: Document, place: str) -> None:
-    with pytest.raises(WhereError, match=place):
-        check_filter(query)
-
-
-def test_deep_filters() -> None:
-    deep: object = 1
-    for _ in range(5_000):
-        deep = {"a": deep}
-    with pytest.raises(WhereError, match="deeper"):
-        check_filter({"x": deep})
-    clause: Document = {"a": 1}
-    for _ in range(5_000):
-        clause = {"$or": [clause]}
-    with pytest.raises(WhereError, match="deeper"):
-        check_filter(clause)
-    with pytest.raises(WhereError, match="mapping"):
-        check_filter([])  # type: ignore[arg-type]
-
-
-def test_values_become_plain() -> None:
-    query = {
-        "a": np.float32(0.5),
-        "b": (1, np.int64(2)),
-        "c": re.compile("^x", re.IGNORECASE),
-        "d": np.str_("s"),
-        "e": np.bool_(True),
-    }
-    checked = check_filter(query)
-    assert checked == {
-        "a": 0.5,
-        "b": [1, 2],
-        "c": {"$regex": "^x", "$options": "i"},
-        "d": "s",
-        "e": True,
-    }
-    assert type(checked["a"]) is float
-    assert type(checked["d"]) is str
-    assert type(checked["e"]) is bool

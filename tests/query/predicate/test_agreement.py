@@ -1,0 +1,428 @@
+"""One question, one answer: of messages in memory, of Arrow columns and of MongoDB.
+
+Messages are made as JSON and as ROS messages, with arrays that the index holds whole and
+arrays that it holds as summaries. `to_bool` on the whole message is the reference.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from pymongo.collection import Collection
+
+from hybridlog.query.predicate.from_mongo import from_mongo
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import statistic, to_bool, to_truth
+from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.to_mongo import to_mongo
+from hybridlog.query.predicate.tree import Predicate
+from hybridlog.schema.codec import Codec, codec_for
+from hybridlog_storage.messages import Channel, Schema
+from tests.schema.wire_oracle import oracle
+
+Message = dict[str, object]
+Types = dict[str, str] | None
+Ask = Callable[[list[Message], list[Message], Iterable[str | Message], Types], None]
+
+LIMIT = 3
+"""Elements of an array that the index holds whole, here."""
+
+DEFINITION = """\
+float64 x
+float32 f
+int32 i
+uint64 u
+bool b
+string s
+float64[] a
+int64[] k
+uint64[] w
+bool[] flags
+string[] names
+Part[] m
+================================================================================
+MSG: demo/Part
+int32 v
+int32 n
+float32[] q
+Leaf[] leaves
+================================================================================
+MSG: demo/Leaf
+uint8 level
+"""
+SUMMARISED = ("a", "k", "w")
+
+
+@pytest.fixture(scope="module")
+def ask(collection: Collection[Message]) -> Ask:
+    def ask(
+        messages: list[Message],
+        documents: list[Message],
+        questions: Iterable[str | Message],
+        types: Types,
+    ) -> None:
+        collection.delete_many({})
+        collection.insert_many([{"_id": n, **document} for n, document in enumerate(documents)])
+        for question in questions:
+            predicate = parse(question) if isinstance(question, str) else from_mongo(question)
+            test = to_bool(predicate, types)
+            expected = {n for n, message in enumerate(messages) if test(message)}
+
+            def ids(query: Message) -> set[int]:
+                return {found["_id"] for found in collection.find(query, {"_id": 1})}  # type: ignore[misc]
+
+            def shown(wrong: set[int], question: object = question) -> object:
+                return repr((question, [(messages[n], documents[n]) for n in wrong]))
+
+            found = to_mongo(predicate, types)
+            possible, certain = ids(found.filter), ids(found.certain)
+            assert expected <= possible, shown(expected - possible)
+            assert certain <= expected, shown(certain - expected)
+            if found.is_exact:
+                assert possible == certain, shown(possible - certain)
+            truth = to_truth(predicate, types, summarised=True)
+            for n, document in enumerate(documents):
+                if not is_rounded(messages[n]):
+                    answer = truth(document)
+                    assert answer is None or answer == (n in expected), shown({n})
+            in_columns(predicate, types, messages, expected)
+
+    return ask
+
+
+def is_rounded(value: object) -> bool:
+    """Whether a message has integers that its document has as doubles."""
+    if isinstance(value, dict):
+        return any(map(is_rounded, value.values()))
+    if isinstance(value, list):
+        return any(map(is_rounded, value))
+    return isinstance(value, int) and not -(2**63) <= value < 2**63
+
+
+def in_columns(
+    predicate: Predicate, types: Types, messages: list[Message], expected: set[int]
+) -> None:
+    """Ask columns of the messages, if Arrow can hold them, whole and as summaries."""
+    try:
+        kind = None if types is None else ARROW
+        records = pa.array(messages, kind, from_pandas=False)
+    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError, OverflowError):
+        return
+    if not pa.types.is_struct(records.type) or not records.type.num_fields:
+        return
+    batches = [pa.RecordBatch.from_struct_array(part) for part in (records[:2], records[2:])]
+    tables: list[object] = [records, pa.Table.from_batches(batches)]
+    if types is not None:
+        tables.append(pa.array([summarised(message) for message in messages], SUMMARIES))
+    for table in tables:
+        mask = to_mask(predicate, types, table)  # type: ignore[arg-type]
+        if mask is not None:
+            found = set(np.flatnonzero(mask).tolist())
+            assert found == expected, (predicate, [messages[n] for n in found ^ expected])
+
+
+def summarised(message: Message) -> Message:
+    """The message with summaries for the arrays of numbers at its top, whatever their length."""
+    shorter: Message = {}
+    for name in SUMMARISED:
+        values = message[name]
+        assert isinstance(values, list)
+        shorter[name] = {stat: statistic(stat, values) for stat in ("n", "min", "max", "mean")}
+    return {**message, **shorter}
+
+
+PART = pa.struct(
+    [
+        ("v", pa.int32()),
+        ("n", pa.int32()),
+        ("q", pa.list_(pa.float32())),
+        ("leaves", pa.list_(pa.struct([("level", pa.uint8())]))),
+    ]
+)
+SINGLES = [
+    ("x", pa.float64()),
+    ("f", pa.float32()),
+    ("i", pa.int32()),
+    ("u", pa.uint64()),
+    ("b", pa.bool_()),
+    ("s", pa.dictionary(pa.int8(), pa.string())),
+]
+LISTS = [
+    ("flags", pa.list_(pa.bool_())),
+    ("names", pa.list_(pa.string())),
+    ("m", pa.list_(PART)),
+]
+NUMBERS = {"a": pa.float64(), "k": pa.int64(), "w": pa.uint64()}
+ARROW = pa.struct([*SINGLES, *LISTS, *((n, pa.list_(kind)) for n, kind in NUMBERS.items())])
+SUMMARIES = pa.struct(
+    [
+        *SINGLES,
+        *LISTS,
+        *(
+            (
+                name,
+                pa.struct(
+                    [("n", pa.int64()), ("min", kind), ("max", kind), ("mean", pa.float64())]
+                ),
+            )
+            for name, kind in NUMBERS.items()
+        ),
+    ]
+)
+
+BIG = [2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, -(2**63), -(2**63) - 1, 2**70 + 1]
+ordered = st.sampled_from(["<", "<=", ">", ">="])
+equal = st.sampled_from(["==", "!="])
+# Multiples of 1/4; others between integers; beyond doubles, int64 and uint64.
+bounds = st.sampled_from(
+    ["0", "1", "2", "3", "0.5", "1.5", "-1", "inf", "-0.0", "-inf", *map(str, BIG), "1e19", "1e300"]
+)
+values = bounds | st.sampled_from(["null", "nan", "true", "'a'", "'é'", "''", "'\\ud83d\\ude00'"])
+patterns = st.sampled_from(
+    ["a", "^a", "a$", ".", "^$", "[^a]", "(?i)A", "é", r"\\d", r"\\pL", "(a|b)*c", "(a+)+$", "\n"]
+)
+
+
+def questions_on(paths: list[str], compared: st.SearchStrategy[str] = values):  # type: ignore[no-untyped-def]
+    path = st.sampled_from(paths)
+    lists = st.lists(compared, min_size=1, max_size=3).map(", ".join)
+    one = st.one_of(
+        st.builds("{} {} {}".format, path, ordered, bounds),
+        st.builds("{} {} {}".format, path, equal, compared),
+        st.builds("{} {}in [{}]".format, path, st.sampled_from(["", "not "]), lists),
+        st.builds("{} {}".format, path, st.sampled_from(["exists", "missing"])),
+        st.builds("{} {} 'a'".format, path, ordered),
+        st.builds("{} {} '{}'".format, path, st.sampled_from(["~", "!~"]), patterns),
+    )
+    two = st.builds("{} {} {}".format, one, st.sampled_from(["and", "or"]), one)
+    return st.one_of(one, two, st.builds("not ({})".format, two), st.builds("not {}".format, one))
+
+
+small = st.sampled_from([-1, 0, 1, 2, 0.25, 1.5, -0.0, 2**53 + 1, True, False])
+plain = small | st.sampled_from(
+    [None, "a", "", "é", "abc", "😀", "a\n", math.nan, math.inf, -math.inf, *BIG, 10**400]
+)
+names = st.sampled_from(["a", "n", "min", "q", "0"])
+
+
+def lists_of(elements: st.SearchStrategy[object]) -> st.SearchStrategy[list[object]]:
+    return st.lists(elements, max_size=2) | st.lists(elements, min_size=4, max_size=5)
+
+
+arrays = lists_of(small) | lists_of(plain) | lists_of(lists_of(small))
+json_values = st.recursive(
+    plain | arrays,
+    lambda inner: st.dictionaries(names, inner, max_size=3) | lists_of(inner),
+    max_leaves=8,
+)
+json_messages = st.dictionaries(st.sampled_from(["a", "m"]), json_values, max_size=2)
+# Such as Arrow can hold: one type a field, with nulls and without some fields.
+even_messages = st.fixed_dictionaries(
+    {},
+    optional={
+        "a": st.none() | st.lists(st.none() | st.integers(-1, 2), max_size=5),
+        "m": st.none()
+        | st.lists(
+            st.fixed_dictionaries(
+                {},
+                optional={
+                    "a": st.none() | st.integers(-1, 2) | st.sampled_from([2**53 + 1]),
+                    "q": st.none() | st.lists(st.sampled_from([0.5, 1.5, math.nan, math.inf])),
+                    "n": st.none() | st.integers(0, 2),
+                },
+            ),
+            max_size=5,
+        ),
+        "d": st.none()
+        | st.fixed_dictionaries({}, optional={"a": st.none() | st.text("aé", max_size=2)}),
+        "g": st.none() | st.lists(st.none() | st.lists(st.integers(-1, 2), max_size=5), max_size=3),
+    },
+)
+json_paths = [
+    *("a", "a.n", "a[0]", "a[1][0]", "a[0][1][0]", "a[0].n", "a[5]", "a.a", "a[*].q", "a.q.n"),
+    *("m.n", "m.min", "m.max", "m.mean", "m[0].q", "m[1].q.min", "m[*].q.max", "m.a.n", "m.a[0]"),
+    *("m[0][0]", "m[1].min", "m.n.n", "m.q.mean", "m.a.q.n", "m[0].a[1].n", "`m`.`0`", "a.max"),
+]
+even_paths = [
+    *("a", "a.n", "a.min", "a.mean", "a[0]", "a[4]", "m", "m.a", "m.q", "m.q.max", "m[1].q[0]"),
+    *("m.n", "d", "d.a", "g", "g[0]", "g[0][1]", "g.n", "g[1].n", "m.q.n", "m[0].a", "m[0].n"),
+]
+
+SLOW = settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
+
+
+@SLOW
+@given(
+    st.lists(json_messages, min_size=4, max_size=16) | st.lists(even_messages, min_size=4),
+    st.lists(questions_on(json_paths), min_size=4, max_size=8),
+)
+@example([{"a": [1, 2]}, {"a": [1] * 40}, {"a": [{"n": 5}]}, {"a": []}], ["a.n >= 2", "a.n < 1"])
+@example([{"a": [[1, 2], [3]]}, {"a": [{"0": 1}]}], ["a[0] == 1", "a[0][1] == 2", "a[0].n == 2"])
+@example([{"a": [2**53 + 1] * 3}], ["a.max == 9007199254740993", "a.mean > 9007199254740992"])
+@example([{"a": [1, "x"] * 20}, {"a": {"n": 40}}], ["a == 1", "a > 0", "a.n == 40", "a.b missing"])
+@example([{"a": [{"n": 1}] * 40}], ["a.n >= 40", "a.n == 1", "a.min missing"])
+def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
+    codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
+    documents = [codec.fields(json.dumps(message).encode()) for message in messages]
+    ask(messages, documents, questions, None)
+
+
+@SLOW
+@given(
+    st.lists(even_messages, min_size=2, max_size=8),
+    st.lists(questions_on(even_paths), min_size=8, max_size=16),
+)
+def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
+    codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
+    documents = [codec.fields(json.dumps(message).encode()) for message in messages]
+    ask(messages, documents, questions, None)
+
+
+@pytest.mark.parametrize(
+    ("where", "expected"),
+    [
+        ("a < 100", "short long far"),  # any element
+        ("a == 500", "far"),
+        ("a != 500", "short long none parts nested named"),
+        ("a[39] == 500", "far"),
+        ("a.n >= 3", "short long far parts named"),
+        ("a.n == 40", "long far"),
+        ("a.n < 3", "none nested"),
+        ("a.n != 40", "short none parts nested named"),
+        ("a.n == 9", "named"),  # a field of that name, no count
+        ("a.min < 100", "short long far"),
+        ("a.max > 100", "far"),
+        ("a.mean == 2", "short long"),
+        ("a.min == null", "none"),
+        ("a.min missing", "parts nested named"),
+        ("a[0] == 2", "short long nested"),
+        ("a[0].n == 2", "nested"),
+        ("a[1][0] == 5", "nested"),
+        ("a.v == 7", "parts"),
+    ],
+)
+def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
+    messages: dict[str, Message] = {
+        "short": {"a": [2, 1, 3]},
+        "long": {"a": [2] * 40},
+        "far": {"a": [*[50] * 39, 500]},
+        "none": {"a": []},
+        "parts": {"a": [{"v": 7}, {"v": 8}, {"v": 9}]},
+        "nested": {"a": [[1, 2], [5]]},
+        "named": {"a": [{"n": 9}, {"n": 8}]},
+    }
+    codec = codec_for(Channel("/j", "json", None))
+    documents = [codec.fields(json.dumps(message).encode()) for message in messages.values()]
+    ask(list(messages.values()), documents, [where], None)
+    test = to_bool(parse(where))
+    assert [name for name, message in messages.items() if test(message)] == expected.split()
+
+
+def ros_codec() -> Codec:
+    schema = Schema("demo/Whole", "ros1msg", DEFINITION.encode())
+    return codec_for(Channel("/r", "ros1", schema), array_limit=LIMIT)
+
+
+doubles = st.sampled_from([-1.0, 0.0, -0.0, 0.25, 1.0, 1.5, 2.0, math.nan, math.inf, -math.inf])
+integers = st.sampled_from([-1, 0, 1, 2, 2**53 + 1, 2**63 - 1])
+unsigned = st.sampled_from([0, 1, 2, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1])
+fixed = st.fixed_dictionaries
+texts = st.text(st.sampled_from("abA1 _éÉ٣\n😀"), max_size=4)
+parts = fixed(
+    {
+        "v": st.integers(-1, 2),
+        "n": st.integers(0, 3),
+        "q": lists_of(doubles),
+        "leaves": lists_of(fixed({"level": st.integers(0, 2)})),
+    }
+)
+ros_messages = fixed(
+    {
+        "x": doubles | st.sampled_from([2.0**63, 2.0**64, 1e19]),
+        "f": doubles,
+        "i": st.integers(-1, 3),
+        "u": unsigned,
+        "b": st.booleans(),
+        "s": texts,
+        "a": lists_of(doubles),
+        "k": lists_of(integers),
+        "w": lists_of(unsigned),
+        "flags": lists_of(st.booleans()),
+        "names": lists_of(st.sampled_from(["", "a", "b"])),
+        "m": lists_of(parts),
+    }
+)
+ros_paths = [
+    *("x", "f", "i", "u", "b", "s", "a", "a[0]", "a[4]", "k", "k[1]", "w", "w[0]", "flags"),
+    *("m.v", "m.n", "m[1].n", "m[*].q", "m.q[0]", "names.n", "names", "names[0]", "m"),
+    *(f"{path}.{stat}" for path in ("a", "k", "w", "flags", "m.q") for stat in ("n", "min", "max")),
+    *("a.mean", "k.mean", "flags.mean", "m[0].q.mean", "m[1].q.n", "m.leaves.n", "m[0].leaves.n"),
+    *("m[*].leaves[*].level", "m[0].leaves[1].level", "m.leaves.level", "w.mean", "y", "m.y"),
+]
+
+
+@SLOW
+@given(
+    st.lists(ros_messages, min_size=4, max_size=12),
+    st.lists(questions_on(ros_paths), min_size=8, max_size=16),
+)
+def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]) -> None:
+    codec = ros_codec()
+    types = {path.path: path.type for path in codec.paths()}
+    ask(messages, [codec.fields(serialised(message)) for message in messages], questions, types)
+
+
+STORE = oracle("demo/msg/Whole", DEFINITION)
+ARRAYS = (("a", np.float64), ("k", np.int64), ("w", np.uint64), ("flags", np.bool_))
+
+
+def serialised(message: Message) -> bytes:
+    made = STORE.types
+    whole = made["demo/msg/Whole"](
+        **{**message, "m": [part(element) for element in message["m"]]},  # type: ignore[attr-defined]
+    )
+    for name, kind in ARRAYS:
+        setattr(whole, name, np.array(message[name], kind))
+    return bytes(STORE.serialize_ros1(whole, "demo/msg/Whole"))
+
+
+def part(values: Message) -> object:
+    leaf = STORE.types["demo/msg/Leaf"]
+    return STORE.types["demo/msg/Part"](
+        v=values["v"],
+        n=values["n"],
+        q=np.array(values["q"], np.float32),
+        leaves=[leaf(**inner) for inner in values["leaves"]],  # type: ignore[attr-defined]
+    )
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        {"x": {"$ne": 1}},
+        {"x": {"$gt": 0, "$lt": 2}},
+        {"i": {"$in": [1, 2]}, "x": {"$nin": [1.0]}},
+        {"$or": [{"i": 1}, {"$nor": [{"s": "a"}, {"b": True}]}]},
+        {"x": {"$not": {"$gte": 1}}},
+        {"y": {"$exists": False}},
+        {"s": {"$regex": "A", "$options": "i"}},
+        {"a": {"$lt": 1}},
+        {"u": 2**63 + 1},
+        {},
+    ],
+)
+@settings(max_examples=3, deadline=None, derandomize=True)
+@given(messages=st.lists(ros_messages, min_size=4, max_size=12))
+def test_of_filters(ask: Ask, question: Message, messages: list[Message]) -> None:
+    codec = ros_codec()
+    types = {path.path: path.type for path in codec.paths()}
+    ask(messages, [codec.fields(serialised(message)) for message in messages], [question], types)

@@ -1,0 +1,196 @@
+"""Predicates on Arrow columns, against exact arithmetic on each value."""
+
+from __future__ import annotations
+
+import math
+import operator
+from fractions import Fraction
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from hybridlog.query.predicate.from_mongo import from_mongo
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.tree import Compare, Field
+
+ORDERS = {
+    "==": operator.eq,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["int8", "uint32", "int64", "uint64", "float16", "float32", "float64"]
+)
+@pytest.mark.parametrize("order", ORDERS)
+def test_numbers_are_compared_by_value(name: str, order: str) -> None:
+    """Also with what lies between two integers, or is no value of the type."""
+    dtype = np.dtype(name)
+    values = np.array([0, 1, 2, 100], dtype)
+    if dtype.kind in "iu":
+        values = np.append(values, [np.iinfo(dtype).min, np.iinfo(dtype).max])
+        values = np.append(values, np.array([np.iinfo(dtype).max - 1], dtype))
+    else:
+        values = np.append(values, np.array([0.1, 0.5, -1.5, np.finfo(dtype).max], dtype))
+        values = np.append(
+            values, np.array([2.0**53, 2.0**63, 2.0**64][: dtype.itemsize // 2 - 1], dtype)
+        )
+    bounds: list[float] = [-1.5, -1, -0.5, 0, -0.0, 0.1, 0.5, 1, 1.5, 2, 2.5, 99.5, 127.5, 2**40]
+    bounds += [2**53 - 1, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 10**400]
+    bounds += [1e300, -1e300, 2.0**63, 2.0**64, -(2**63), -(2**63) - 1, -(10**400)]
+    for bound in bounds:
+        asked = Compare(Field(("x",)), order, bound)  # type: ignore[arg-type]
+        records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
+        mask = to_mask(asked, {"x": name}, records)
+        assert mask is not None
+        expected = [ORDERS[order](Fraction(v), Fraction(bound)) for v in values.tolist()]
+        assert mask.tolist() == expected, bound
+        test = to_bool(asked, {"x": name})
+        assert [test({"x": value}) for value in values.tolist()] == expected
+
+
+@pytest.mark.parametrize("kind", [pa.float32(), pa.float64()])
+def test_nan_and_infinities(kind: pa.DataType) -> None:
+    values = [math.nan, math.inf, -math.inf, 0.0, -0.0]
+    table = pa.table({"x": pa.array(values, kind, from_pandas=False)})
+    for text in ("x == nan", "x != nan", "x < inf", "x >= -inf", "x == 0", "x in [nan, inf]"):
+        mask = to_mask(parse(text), {"x": "float64"}, table)
+        test = to_bool(parse(text), {"x": "float64"})
+        assert mask is not None
+        assert mask.tolist() == [test({"x": value}) for value in values], text
+
+
+def mask_of(text: str, records: object, types: dict[str, str] | None = None) -> list[bool] | None:
+    mask = to_mask(parse(text), types, records)  # type: ignore[arg-type]
+    return None if mask is None else mask.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x == 1", [True, False]),
+        ("x < 5", [True, False]),
+        ("x in [1, 2]", [True, False]),
+        ("not x == 1", [False, True]),
+        ("x != 2", None),  # a null is not 2, and what is missing is nothing
+        ("x != 1", None),
+        ("x == null", None),
+        ("x in [1, null]", None),
+        ("x exists", None),
+        ("x missing", None),
+        ("x missing and x == 1", [False, False]),  # whatever the null is
+        ("x exists or x == 1 or y == 2", [True, True]),
+        ("y != 3", [True, True]),
+        ("y exists", [True, True]),
+        ("z == 1", None),  # there is no such column
+    ],
+)
+def test_nulls(text: str, expected: list[bool] | None) -> None:
+    table = pa.table({"x": [1, None], "y": [2, 2]})
+    assert mask_of(text, table) == expected
+    assert mask_of(text, table, {"x": "int64", "y": "int64", "z": "int64"}) == expected
+
+
+def test_texts() -> None:
+    words = ["a", "é", "", "slip: 5", "😀\n", None]
+    for column in (
+        pa.array(words),
+        pa.array(words).dictionary_encode(),
+        pa.array(words, pa.large_string()),
+    ):
+        table = pa.table({"s": column})
+        assert mask_of(r"s ~ '\d$'", table) == [False, False, False, True, False, False]
+        assert mask_of("s ~ '^.$'", table) == [True, True, False, False, False, False]
+        assert mask_of("s > 'z'", table) == [False, True, False, False, True, False]
+        assert mask_of("s !~ 'a' and s == 'é'", table) == [False, True, *[False] * 4]
+        assert mask_of("s == 5", table) == [False] * 6
+        assert mask_of("s !~ 'a'", table) is None
+
+
+def test_times_are_nanoseconds() -> None:
+    table = pa.table(
+        {
+            "t": pa.array([5, 10**18 + 1], pa.timestamp("ns", "UTC")),
+            "d": pa.array([5, -6], pa.duration("ns")),
+            "us": pa.array([5, 6], pa.timestamp("us")),
+        }
+    )
+    assert mask_of("t == 1000000000000000001", table) == [False, True]
+    assert mask_of("d < 0ms", table) == [False, True]
+    assert mask_of("us > 5", table) is None
+
+
+def test_arrays_of_any_depth() -> None:
+    records = pa.array(
+        [
+            {"g": [[1, 2], [3]], "m": [{"q": [0.5]}, {"q": []}]},
+            {"g": [[], [9]], "m": []},
+            {"g": [], "m": [{"q": [math.inf, 2.5]}]},
+        ]
+    )
+    assert mask_of("g[0] == 2", records) == [True, False, False]
+    assert mask_of("g[1][0] > 5", records) == [False, True, False]
+    assert mask_of("g == 2", records) == [False] * 3
+    assert mask_of("g.n == 2", records) == [True, True, False]
+    assert mask_of("m.q > 2", records) == [False, False, True]
+    assert mask_of("m.q > 5", records) == [False] * 3, "infinities are no finite elements"
+    assert mask_of("m.q == inf", records) == [False, False, True]
+    assert mask_of("m[0].q[0] > 5", records) == [False, False, True]
+    assert mask_of("m[1].q exists", records) == [True, False, False]
+    assert mask_of("m.q.max == 2.5", records) == [False, False, True]
+    assert mask_of("m.q.min missing", records) == [False, True, False]
+
+
+SUMMARY = pa.struct(
+    [("n", pa.int64()), ("min", pa.float64()), ("max", pa.float64()), ("mean", pa.float64())]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a < 2", [True, False]),
+        ("a > 8", [True, False]),
+        ("a == 20", [False, False]),
+        ("a == 5", None),
+        ("a != 20", [True, True]),
+        ("a != 5", None),
+        ("a == inf", None),
+        ("a[3] < 2", None),
+        ("a[50] < 2", [False, False]),
+        ("a.n == 40", [True, True]),
+        ("a.min == null", [False, True]),
+        ("a.max >= 9", [True, False]),
+        ("a exists", [True, True]),
+        ("a == 'x'", [False, False]),
+        ("a == 5 and a.n < 40", [False, False]),
+    ],
+)
+def test_summaries(text: str, expected: list[bool] | None) -> None:
+    summaries: list[dict[str, float | None]] = [
+        {"n": 40, "min": 1.0, "max": 9.0, "mean": 5.0},
+        {"n": 40, "min": None, "max": None, "mean": None},
+    ]
+    table = pa.table({"a": pa.array(summaries, SUMMARY)})
+    assert mask_of(text, table, {"a": "float64[]"}) == expected
+    if "exists" not in text and ".max" not in text:
+        assert mask_of("a < 2", table) is None, "it may be a message"
+
+
+def test_what_columns_cannot_tell() -> None:
+    text = pa.array(['{"a": 1}'], pa.json_())
+    assert mask_of("x == 1", pa.table({"x": text})) is None
+    assert mask_of("x.a == 1", pa.table({"x": text})) is None
+    table = pa.table({"x": [1]})
+    assert to_mask(from_mongo({"x": {"$mod": [2, 0]}}), None, table) is None
+    assert mask_of("_meta.seq > 1", table) is None
+    mask = to_mask(from_mongo({}), None, table)
+    assert mask is not None
+    assert mask.tolist() == [True]
+    assert mask_of("x == 1", table.slice(0, 0)) == []

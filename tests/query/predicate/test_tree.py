@@ -1,0 +1,87 @@
+"""Predicates as values: equal, hashed, pickled, joined, shown."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import pytest
+
+from hybridlog.query.predicate.from_mongo import from_mongo
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.tree import And, Compare, Field, Predicate
+
+TEXTS = [
+    "x < 5",
+    "x == nan",
+    "x == 1",
+    "x == true",
+    "x in [1, 'a', null]",
+    "x in [true, 'a', null]",
+    "x not in [1, 'a', null]",
+    "a[0].b exists",
+    "a.b exists",
+    "a[0].b missing",
+    "s ~ 'a'",
+    "s !~ 'a'",
+    "not (x < 5 or s ~ 'a') and y == 'x'",
+    "x == null",
+    "x == 'null'",
+]
+
+
+def test_predicates_are_equal_when_they_ask_for_the_same() -> None:
+    predicates = [parse(text) for text in TEXTS]
+    assert len(set(predicates)) == len(TEXTS)
+    for predicate in predicates:
+        again = pickle.loads(pickle.dumps(predicate))
+        assert again == predicate
+        assert hash(again) == hash(predicate)
+        assert again.text == predicate.text
+    assert parse("x   ==  1") == parse("1.0 == x")
+    one, other = (Predicate(Compare(Field(("x",)), "==", float("nan"))) for _ in range(2))
+    assert one == other == parse("x == nan")
+    assert hash(one) == hash(other)
+    assert parse("x == 1") != 1
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_predicate_shows_what_it_asks(text: str) -> None:
+    shown = repr(parse(text))
+    assert shown.startswith("<Predicate ")
+    for word in ("a.0.b", "a.b", "not in", "~", "nan", "true", "null"):
+        if word in text.replace("[0]", ".0"):
+            assert word in shown
+    # It is text of the language.
+    assert parse(shown.removeprefix("<Predicate ").removesuffix(">")) == parse(text)
+
+
+def test_what_mongodb_is_asked_is_shown_as_it_is_written() -> None:
+    shown = repr(from_mongo({"x": 1, "$or": [{"a": {"$size": 3}}, {"y": {"$lt": 2}}]}))
+    assert shown == "<Predicate x == 1 and ({'a': {'$size': 3}} or y < 2)>"
+    assert repr(from_mongo({})) == "<Predicate anything>"
+
+
+def test_joined() -> None:
+    everything = from_mongo({})
+    one, two = parse("x < 5"), parse("y > 1 and z == 2")
+    assert not everything
+    assert one
+    assert one & everything is one
+    assert everything & one is one
+    assert not everything & everything
+    assert one & two == parse("x < 5 and y > 1 and z == 2")
+    assert parse((one & two).text).fields() == ["x", "y", "z"]
+    assert (two & one).fields() == ["y", "z", "x"]
+    assert isinstance((one & two).root, And)
+
+
+def test_a_predicate_does_not_change_with_its_filter() -> None:
+    query: dict[str, object] = {"a": [1, {"b": 2}]}
+    predicate = from_mongo(query)
+    inner = query["a"]
+    assert isinstance(inner, list)
+    inner[1]["b"] = 3
+    assert predicate == from_mongo({"a": [1, {"b": 2}]})
+    assert predicate != from_mongo(query)
+    assert math.isnan(parse("x == nan").root.value)  # type: ignore[union-attr, arg-type]
