@@ -505,7 +505,7 @@ class Query:
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
-        from hybridlog.tables import arranged, collect
+        from hybridlog.frames.answer import arranged, collect
 
         table = collect(self).to_arrow()
         table = table.select(arranged(table.column_names, self._fields))
@@ -515,7 +515,7 @@ class Query:
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: scalars as columns, arrays as numpy cells, indexed by log time (UTC, ns)."""
-        from hybridlog.tables import arranged, collect
+        from hybridlog.frames.answer import arranged, collect
 
         frame = collect(self).to_pandas()
         names = list(frame.columns)

@@ -934,7 +934,7 @@ def test_a_query_is_a_value(store: hl.Store) -> None:
 
 def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:
     """Parts of bounded size end between messages, on every topic at the same time."""
-    from hybridlog.tables import stream
+    from hybridlog.frames.answer import stream
 
     types = get_typestore(Stores.ROS2_HUMBLE)
     count = 75_000

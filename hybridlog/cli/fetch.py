@@ -146,7 +146,7 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     """Write the rows; returns how many."""
     from hybridlog.export import open_table_writer
     from hybridlog.export.jsonl import JsonlWriter
-    from hybridlog.tables import stream
+    from hybridlog.frames.answer import stream
 
     written = 0
     if form == "jsonl":

@@ -35,7 +35,7 @@ def print_answer(query: Query) -> Query:
     Returns:
         The question that was answered, with its counters.
     """
-    from hybridlog.tables import stream
+    from hybridlog.frames.answer import stream
 
     limit = query.most
     # One more than is shown tells whether there is more.
