@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog import consent, field_indexes
 from hybridlog.columns.kept import KeptColumns
-from hybridlog.columns.stored import FieldColumns
 from hybridlog.entries import channels_of, take_inventory, text
 from hybridlog.field_indexes import FieldIndex
 from hybridlog.guarded import Belief, GuardedIndex
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
-_MOST_OPEN = 256  # segments, and files of columns
+_MOST_OPEN = 256  # segments
 _MOST_WORDS = 128  # topics and predicates whose meaning is remembered
 
 
@@ -154,7 +153,6 @@ class Store:
         self._schemas: dict[str, Schema] = {}
         self._lanes: dict[str, list[Lane]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
-        self._columns: dict[str, FieldColumns | None] = {}
         self._chunk_lists = ChunkLists()
         self.kept = KeptColumns(self)
         self.recent_chunks = RecentChunks()
@@ -286,7 +284,6 @@ class Store:
             for reader in self._segments.values():
                 reader.close()
             self._segments.clear()
-        self._columns.clear()
         self.recent_chunks.clear()
         self.disconnect()
         self.catalog.close()
@@ -355,8 +352,7 @@ class Store:
         self._schemas = {}
         self._lanes.clear()
         with self._lock:
-            self._columns.clear()  # closed by the last thread that reads from them
-            self._segments.clear()
+            self._segments.clear()  # closed by the last thread that reads from them
         self._chunk_lists.clear()
         self.kept.clear()
         self.recent_chunks.clear()
@@ -540,18 +536,6 @@ class Store:
                 reader = SegmentReader(path / f"{number:06d}.mcap", number)
                 self._segments[key] = reader
             return reader
-
-    def columns(self, recording: str) -> FieldColumns | None:
-        """The columns that lie beside the segments of a recording; None without good ones."""
-        with self._lock:
-            if recording not in self._columns:
-                _make_room(self._columns)
-                self._columns[recording] = None
-                with suppress(FileNotFoundError, StoreError, TopicError):  # the index has the same
-                    path = self.directory.recording(self.entry(recording).label)
-                    found = FieldColumns(path)
-                    self._columns[recording] = found
-            return self._columns[recording]
 
     # Changing.
 

@@ -1,10 +1,8 @@
 """Fields of whole topics as columns in memory, for who asks about them again and again.
 
 A recording that has ended does not change. So a field of all its messages can be kept as
-an array, and what is asked of it next takes a pass over numbers. Where it lies in a file
-of columns, getting it costs less than one question to MongoDB; elsewhere it costs as much
-as some, and is got when as much has been spent on such questions, so that nobody pays for
-columns that are never looked at again.
+an array, and what is asked of it next takes a pass over numbers. Getting it costs as much as
+some questions to MongoDB, and is done when as much has been spent on such questions.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,7 +36,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.judged import Judged
-    from hybridlog.columns.stored import FieldColumns
     from hybridlog.query.column_filter import Single
     from hybridlog.query.plan import Counters, Lane
     from hybridlog.query.predicate import Predicate
@@ -56,8 +52,6 @@ _QUESTION_S = 1e-3
 _LOOK_S = 0.6e-6  # at a document, by MongoDB
 _DOCUMENT_S = 4e-6  # sent by MongoDB and made a row
 _BYTE_S = 1.3e-9  # of a chunk, uncompressed, read
-_OPEN_S = 2e-4  # to find out what a file of columns has
-_STORED_BYTE_S = 1e-9  # of it, read
 
 
 class _Way(NamedTuple):
@@ -289,16 +283,6 @@ class KeptColumns:
 
     def _cheapest_way(self, recording: RecordingEntry, topic: str, wanted: _Wanted) -> _Way:
         """How columns are got for the least."""
-        file, known = self._store.columns(recording.id), self.types(recording, topic) or {}
-        if file is not None:
-            types = {path: kind for path, kind in known.items() if path in wanted.fields}
-            with suppress(StoreError):  # of what is damaged, the index has the same
-                if file.has(recording, topic, types):
-                    # It has no more bytes than the payloads, and there is nobody to be asked.
-                    size = file.size(topic, wanted.fields, ordered=wanted.ordered)
-                    # Of many recordings not all files are kept open until then.
-                    load = partial(_from_file, partial(self._store.columns, recording.id), topic)
-                    return _Way(_OPEN_S + _STORED_BYTE_S * size, load)
         question = partial(self._question, recording, topic)
         messages = recording.messages_of(topic)
         ways = [_Way(_QUESTION_S + _DOCUMENT_S * messages, partial(_from_index, question))]
@@ -368,25 +352,6 @@ def cost_s(messages: float, *, windows: int = 1, as_rows: bool = False) -> float
         as_rows: Whether the documents are sent, not counted.
     """
     return _QUESTION_S * (1 + windows / 14) + messages * (_DOCUMENT_S if as_rows else _LOOK_S)
-
-
-def _from_file(
-    opened: Callable[[], FieldColumns | None],
-    topic: str,
-    types: Mapping[str, str],
-    ordered: bool,  # noqa: FBT001
-    counters: Counters,
-) -> TopicColumns:
-    """Columns that were laid down with the recording."""
-    file = opened()
-    if file is None:
-        raise UnfitError
-    try:
-        columns = file.read(topic, types, ordered=ordered)
-    except StoreError as error:
-        raise UnfitError from error  # the index has what is damaged here
-    counters.bytes_read += file.size(topic, types, ordered=ordered)
-    return columns
 
 
 def _from_segments(

@@ -22,13 +22,12 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog import tables
 from hybridlog.columns import answers as column_answers
 from hybridlog.columns import kept as kept_columns
-from hybridlog.columns import stored
 from hybridlog.columns.judged import Judged
 from hybridlog.columns.kept import MOST_BYTES
 from hybridlog.columns.topic import TopicColumns
+from hybridlog.frames import answer as tables
 from hybridlog.query.column_filter import ColumnFilter, column_filter
 from hybridlog.reader import Query
 from hybridlog_storage.catalog import RecordingEntry
@@ -139,9 +138,6 @@ def get_by(patch: pytest.MonkeyPatch, way: str, price: float = 0.0) -> None:
     def only(
         kept: kept_columns.KeptColumns, recording: RecordingEntry, topic: str, _: object
     ) -> kept_columns._Way:
-        if way == "file":
-            opened = partial(kept._store.columns, recording.id)
-            return kept_columns._Way(price, partial(kept_columns._from_file, opened, topic))
         question = partial(kept._question, recording, topic)
         return kept_columns._Way(price, partial(from_others[way], question))
 
@@ -154,7 +150,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     get_by(monkeypatch, "segments")
 
 
-@pytest.fixture(params=["file", "segments", "index"])
+@pytest.fixture(params=["segments", "index"])
 def each_way(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """The same, in each of the ways."""
     get_by(monkeypatch, request.param)
@@ -364,8 +360,6 @@ def plain(store: hl.Store) -> hl.Store:
 
 
 def test_columns_come_when_asking_has_cost_as_much(plain: hl.Store) -> None:
-    for file in plain.directory.path.glob(f"recordings/*/{stored.NAME}"):
-        file.unlink()
     query = plain.topic("/state").where("i8 == 1")
     looks = []
     for _ in range(6):
