@@ -16,12 +16,13 @@ from pathlib import Path
 from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
 from hybridlog.index_writer import IndexWriter, Lag
 from hybridlog.indexing import ChunkIndexer
+from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
+from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.collection_names import collection_of
@@ -50,7 +51,7 @@ class Pace:
         has_room: Says whether so many bytes of chunks may wait for the index in memory.
         next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
         spare: Processors for what can wait: to pack a chunk, where there is no hurry, and to
-            make documents and columns of one.
+            make documents and tables of one.
         on_written: Called, on another thread, when less waits for the disk. Whoever appends
             never waits, and looks at `writer.waiting` instead.
         renew: Gives another connection to the index when one has failed.
@@ -114,8 +115,8 @@ class Capture:
         self.indexer = ChunkIndexer(self.entry.id)
         recording = directory.recording(self.entry.label)
         lag = Lag(recording, pace.behind, pace.has_room, pace.renew, pace.spare) if pace else None
-        self._gatherer = FieldGatherer(recording)
-        self.index = IndexWriter(self.indexer, database, lag=lag, gatherer=self._gatherer)
+        self._tables = TableWriter(directory.path, self.entry.id)
+        self.index = IndexWriter(self.indexer, database, lag=lag, tables=self._tables)
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
@@ -171,6 +172,8 @@ class Capture:
         if self._end is not None:
             lines.append(journal.event(journal.ENDED, end=dict(self._end)))
         self._journal.append(*lines)
+        messages = sum(channel.messages for channel in sealed.channels)
+        self._tables.seal(sealed.segment, sealed.digest, messages)
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
@@ -180,12 +183,12 @@ class Capture:
             if failure is None:
                 database = self.index.database
                 self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
-                self._gatherer.close(self.entry)
+                self._tables.close(self.entry)
         except DatabaseError as error:
             failure = error
         if failure is not None:
             self.entry = put_entry(self._directory, self.catalog, label)
-        self._gatherer.discard()
+        self._tables.discard()
         self._held.close()
         return failure
 
@@ -193,7 +196,7 @@ class Capture:
         """Stop at once; what was flushed stays, and the next opening of the store seals it."""
         self.writer.abort()
         self.index.abandon()
-        self._gatherer.discard()
+        self._tables.discard()
         self._held.close()
 
     def forget(self) -> None:
@@ -203,9 +206,11 @@ class Capture:
             announce_removal(self._directory, label)
         self.writer.abort()
         self.index.abandon()
-        self._gatherer.discard()
+        self._tables.discard()
         with suppress(HybridlogError):
             remove_files(self._directory, label)
+        with suppress(OSError):
+            tables.remove(self._directory, entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If the database is away, the next connection finds an entry without files.

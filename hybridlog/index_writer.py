@@ -32,8 +32,8 @@ from hybridlog_storage.threads import Threads
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.gatherer import FieldGatherer
     from hybridlog.indexing import ChunkIndexer, Documents
+    from hybridlog.tables.writer import TableWriter
     from hybridlog_storage.database import Database
 
 _SENDERS = 2
@@ -80,13 +80,13 @@ class _Few:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._chunks: list[StoredChunk] = []
-        self._ungathered: deque[StoredChunk] = deque()  # of these, in the order of the file
+        self._untabled: deque[StoredChunk] = deque()  # of these, in the order of the file
         self._channels: dict[int, Channel] = {}
         self._size = 0
         self._since = 0.0
 
     def add(
-        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_gathered: bool
+        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_in_tables: bool
     ) -> bool:
         """Have a chunk wait, if it is one of these, and there is room.
 
@@ -94,7 +94,7 @@ class _Few:
             chunk: The chunk.
             channels: What it is about; of a recording that is recovered each segment has its
                 own.
-            is_gathered: Whether its columns have been made.
+            is_in_tables: Whether it is in the tables.
 
         Returns:
             Whether it does.
@@ -112,8 +112,8 @@ class _Few:
             waits = replace(chunk, batch=batch)
             self._channels.update(channels)
             self._chunks.append(waits)
-            if not is_gathered:
-                self._ungathered.append(waits)
+            if not is_in_tables:
+                self._untabled.append(waits)
             self._size += size
         return True
 
@@ -127,21 +127,21 @@ class _Few:
         """Seconds for which the first one has waited; 0 without any."""
         return time.monotonic() - self._since if self._chunks else 0.0
 
-    def ungathered(
+    def untabled(
         self, before: StoredChunk | None = None
     ) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
-        """Those of which columns are to be made now, in the order of the file.
+        """Those that are to go into the tables now, in the order of the file.
 
         Args:
             before: Only those that lie before this chunk; None for all.
         """
         found = []
         with self._lock:
-            while self._ungathered:
-                first = self._ungathered[0]
+            while self._untabled:
+                first = self._untabled[0]
                 if before is not None and _place(first) > _place(before):
                     break
-                found.append(self._ungathered.popleft())
+                found.append(self._untabled.popleft())
         return found, self._channels
 
     def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
@@ -163,7 +163,7 @@ class Lag:
         behind: Says whether the recorder has more than it can write.
         has_room: Says whether so many bytes of chunks may wait in memory, where they are more
             than a few.
-        spare: Processors for what can wait. One is held while documents or columns are made.
+        spare: Processors for what can wait. One is held while documents or tables are made.
         renew: Another connection to the index, after one has failed; starts the embedded
             MongoDB again if that has ended. Raises `DatabaseError`.
     """
@@ -235,13 +235,13 @@ class _Forgotten(NamedTuple):
         segment: Number of the segment.
         place: Where it lies there.
         messages: Number of its messages.
-        is_gathered: Whether its columns have been made.
+        is_in_tables: Whether it is in the tables.
     """
 
     segment: int
     place: ChunkPlace
     messages: int
-    is_gathered: bool
+    is_in_tables: bool
 
 
 class IndexWriter:
@@ -257,7 +257,7 @@ class IndexWriter:
         indexer: Makes the documents.
         database: Where they go.
         lag: With it `submit` never waits: chunks that find no room in memory are read back.
-        gatherer: Gets each chunk of which documents are made, once.
+        tables: Gets each chunk of which documents are made, once.
     """
 
     def __init__(
@@ -266,7 +266,7 @@ class IndexWriter:
         database: Database,
         *,
         lag: Lag | None = None,
-        gatherer: FieldGatherer | None = None,
+        tables: TableWriter | None = None,
     ) -> None:
         self.failure: DatabaseError | None = None
         self.indexed = 0
@@ -276,7 +276,7 @@ class IndexWriter:
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
         self._indexer = indexer
         self._lag = lag
-        self._gatherer = gatherer
+        self._tables = tables
         self._spare = lag.spare if lag else nullcontext()
         self._forgotten: deque[_Forgotten] = deque()
         self._database = database
@@ -309,7 +309,7 @@ class IndexWriter:
         if self._crash is not None:
             raise self._crash
         self._channels = channels
-        if self.failure is None and self._few.add(chunk, channels, is_gathered=False):
+        if self.failure is None and self._few.add(chunk, channels, is_in_tables=False):
             if self._few.is_full:
                 self._maker.submit(self._make_few).add_done_callback(self._done)
             return
@@ -388,7 +388,7 @@ class IndexWriter:
         if self._lag is not None:
             self._lag.close()
 
-    def _forget(self, chunk: StoredChunk, *, is_gathered: bool = False) -> None:
+    def _forget(self, chunk: StoredChunk, *, is_in_tables: bool = False) -> None:
         """Keep only where a chunk lies."""
         place = ChunkPlace(
             offset=chunk.offset,
@@ -401,9 +401,7 @@ class IndexWriter:
             crc=chunk.crc,
             trailer_crc=chunk.trailer_crc,
         )
-        if self._gatherer is not None and not is_gathered:
-            self._gatherer.expect(chunk.segment, chunk.offset)
-        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), is_gathered))
+        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), is_in_tables))
 
     def _catch_up(self) -> None:
         """Ask for a forgotten chunk once none waits in memory.
@@ -481,25 +479,25 @@ class IndexWriter:
         chunk = self._lag.read(place)
         if self._forgotten:
             self._lag.read_ahead(self._forgotten[0])
-        self._make(chunk, self._channels, is_gathered=place.is_gathered)
+        self._make(chunk, self._channels, is_in_tables=place.is_in_tables)
 
     def _make(
-        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_gathered: bool = False
+        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_in_tables: bool = False
     ) -> None:
         if self.failure is not None:
             if self._lag is not None:
-                self._forget(chunk, is_gathered=is_gathered)
+                self._forget(chunk, is_in_tables=is_in_tables)
             else:
                 with self._lock:
                     self.missed += len(chunk.batch)
             return
         if self._lag is not None:
             self._lag.wait()
-        if not is_gathered:
-            # Columns are laid down in the order of the file, for as long as that can be.
-            self._gather(*self._few.ungathered(before=chunk))
-            self._gather([chunk], channels)
-        if not self._few.add(chunk, channels, is_gathered=True):
+        if not is_in_tables:
+            # In the order of the file, for as long as that can be: rows are sorted then.
+            self._add_to_tables(*self._few.untabled(before=chunk))
+            self._add_to_tables([chunk], channels)
+        if not self._few.add(chunk, channels, is_in_tables=True):
             self._index([chunk], channels)
         elif self._few.is_full:
             self._make_few()
@@ -509,16 +507,18 @@ class IndexWriter:
         if self._lag is not None:
             self._lag.wait()
         chunks, channels = self._few.take()
-        self._gather(*self._few.ungathered())
+        self._add_to_tables(*self._few.untabled())
         if chunks:
             self._index(chunks, channels)
 
-    def _gather(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
-        """Make columns of chunks."""
-        if self._gatherer is not None:
+    def _add_to_tables(
+        self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
+    ) -> None:
+        """Give chunks to the tables."""
+        if self._tables is not None:
             for chunk in chunks:
                 with self._spare:
-                    self._gatherer.add(chunk, channels)
+                    self._tables.add(chunk, channels)
 
     def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
         with self._spare:

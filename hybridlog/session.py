@@ -20,6 +20,7 @@ from hybridlog.query.predicate.types import check
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
+from hybridlog.tables.reader import Tables
 from hybridlog_storage.errors import (
     CatalogError,
     DatabaseError,
@@ -55,6 +56,7 @@ class Session:
         connection: The connection to MongoDB.
         repairs: What was repaired when the store was opened.
         recent_chunks: Chunks that single messages were read from.
+        tables: Parquet tables of topics.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Session:
         self.connection = Connection(directory, mongo)
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
+        self.tables = Tables(directory.path)
         self._unavailable: HybridlogError | None = None
         self._progress = progress
         self._connecting = threading.RLock()
@@ -418,6 +421,7 @@ class Session:
             self._segments.clear()  # each is closed by the last thread that reads from it
         self._chunk_lists.clear()
         self.recent_chunks.clear()
+        self.tables.invalidate()
         self._remember_meanings()
 
     def close(self) -> None:
@@ -427,6 +431,7 @@ class Session:
                 reader.close()
             self._segments.clear()
         self.recent_chunks.clear()
+        self.tables.invalidate()
         self.disconnect()
         self.catalog.close()
 

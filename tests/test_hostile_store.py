@@ -38,8 +38,6 @@ FILES = {
     "segment": "recordings/small/000000.mcap",
     "next segment": "recordings/small/000001.mcap",
     "open segment": "recordings/small/000001.mcap.open",
-    "columns": "recordings/small/fields.columns",
-    "part of columns": "recordings/small/fields.columns.part",
     "segment of a new recording": "recordings/live/000000.mcap.open",
     "sign of a recorder": "recorders/live.json",
     "sign of another recorder": "recorders/other.json",
@@ -50,6 +48,8 @@ FOLDERS = {
     "new recording": "recordings/live",
     "removed recording": "recordings/.removed-small-0123abcd",
     "recorders": "recorders",
+    "tables": "tables",
+    "unfinished tables": "tables.part",
 }
 MONGOD_FILES = (
     "users.lock",
@@ -235,6 +235,24 @@ def test_a_file_that_leads_to_nothing(
     store = planted(template, tmp_path, FILES[kind], victims.place / "new")
     victims.watch()
     use(store, database(server, f"none{list(FILES).index(kind)}"), bag)
+    victims.check()
+
+
+@pytest.mark.parametrize("kind", ["tables/*", "tables/*/*", "tables/*/*/*", "tables.part/new"])
+@pytest.mark.parametrize("leads", ["out", "to nothing"])
+def test_tables_that_lead_out(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
+) -> None:
+    victims = Victims(tmp_path / "victims")
+    place = next(iter(template.glob(kind)), template / kind)
+    name = str(place.relative_to(template))
+    if leads == "to nothing":
+        target = victims.place / "new"
+    else:
+        target = victims.file(place.read_bytes()) if place.is_file() else victims.folder(place)
+    store = planted(template, tmp_path, name, target)
+    victims.watch()
+    use(store, database(server, f"tables{len(kind)}{leads[0]}"), bag)
     victims.check()
 
 

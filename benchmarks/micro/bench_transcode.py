@@ -59,18 +59,16 @@ def bench_few(bags: Path, benchmark: Any) -> None:
     assert [entry.messages for entry in entries] == [4] * 80
 
 
-def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:
-    """Fields of small messages to the columns beside the segments."""
+def bench_table(bags: Path, tmp_path: Path, benchmark: Any) -> None:
+    """Fields of small messages to rows of a table."""
     stream = read(bags / IMU, "/imu/data", 5000)
-    found = need("hybridlog.columns.gatherer", "FieldGatherer")
+    found = need("hybridlog.tables.writer", "TableWriter")
     batch: Any = stream.batches(5000)[0]
-    gatherer = found.FieldGatherer(tmp_path)
+    writer = found.TableWriter(tmp_path, "0" * 32)
     channels = dict.fromkeys(batch.channel.tolist(), stream.channel())
-    # So much is decoded at once, and not put together with more.
-    assert len(batch.buffer) > 1 << 20
-    benchmark.pedantic(gatherer.add, (_chunk(batch), channels), rounds=50, warmup_rounds=1)
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) > 50 * 5000 * 8
-    gatherer.discard()
+    benchmark.pedantic(writer.add, (_chunk(batch), channels), rounds=50, warmup_rounds=1)
+    assert sum(path.stat().st_size for path in tmp_path.rglob("*.parquet")) > 1 << 20
+    writer.discard()
 
 
 def _chunk(batch: Any) -> Any:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.columns.gatherer import FieldGatherer
-from hybridlog.columns.topic import is_small
 from hybridlog.entries import take_inventory
 from hybridlog.index_writer import IndexWriter
 from hybridlog.indexing import ChunkIndexer
+from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import describe_inventory, put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.collection_names import collection_of
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -154,6 +153,8 @@ def _remove_strangers(
         if key not in present:
             forget(state, key)
             report.removed.append(indexed.id or key)
+    if directory.is_writable:
+        tables.remove_strangers(directory, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
@@ -308,23 +309,37 @@ def _index(
     progress: Progress | None,
 ) -> None:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
-    gatherer = FieldGatherer(directory.recording(entry.label))
+    topics = tables.missing(directory, entry)
+    writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
     index = IndexWriter(ChunkIndexer(entry.id), database)
-    # What is indexed already is missing in the columns all the same.
-    found = _chunks(directory, catalog, entry, missing=missing, damage=damage, progress=progress)
+    # A chunk that is indexed already may be missing in the tables all the same.
+    found = _chunks(
+        directory,
+        catalog,
+        entry,
+        missing=missing,
+        topics=topics,
+        damage=damage,
+        progress=progress,
+    )
     try:
+        last = ""
         for chunk, channels in found:
-            gatherer.add(chunk, channels)
+            if last and str(chunk.segment) != last:
+                writer.cut(int(last), entry.digests[last])
+            last = str(chunk.segment)
+            writer.add(chunk, channels)
             if (chunk.segment, chunk.number) in missing:
                 index.submit(chunk, channels)
         index.close()
         if index.failure is not None:
             raise index.failure
-        gatherer.close(entry)
+        writer.close(entry)
     except BaseException:
         index.abandon()
-        gatherer.discard()
         raise
+    finally:
+        writer.discard()
 
 
 def _chunks(
@@ -333,19 +348,20 @@ def _chunks(
     entry: RecordingEntry,
     *,
     missing: Mapping[Place, int],
+    topics: Collection[str],
     damage: dict[Place, str],
     progress: Progress | None,
 ) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
-    """Chunks of a recording that are missing in the index, and small ones, in order."""
+    """Chunks of a recording that are missing in the index or in tables, in order."""
     total = entry.stored_bytes
     before = 0
     path = directory.recording(entry.label)
     for number, _, _ in entry.spans:
         with SegmentReader(path / f"{number:06d}.mcap", number) as reader:
             summary = reader.summary()
-            small = _small(summary.table)
+            is_in_tables = tables.chunks_with(entry, summary.table, topics)
             for place in summary.chunks:
-                if (number, place.number) not in missing and not small[place.number]:
+                if (number, place.number) not in missing and not is_in_tables[place.number]:
                     continue
                 try:
                     chunk = reader.read_chunk(place)
@@ -357,14 +373,6 @@ def _chunks(
                 if progress is not None:
                     progress(entry.label, before + place.offset + place.length, total)
             before += reader.size
-
-
-def _small(table: ChunkTable) -> list[bool]:
-    """For each chunk, whether its messages are small enough for `fields.columns`."""
-    chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-    sizes = np.bincount(chunk_of, table.parts["payload_bytes"], len(table.chunks))
-    counts = np.bincount(chunk_of, table.parts["messages"], len(table.chunks))
-    return [is_small(int(size), int(count)) for size, count in zip(sizes, counts, strict=True)]
 
 
 def finish(

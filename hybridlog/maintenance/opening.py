@@ -37,11 +37,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.recovery import Recovered
     from hybridlog_storage.segment_file import Sealed
 
-_OURS = frozenset({LOCK, "fields.columns", "fields.columns.part"})
+_OURS = frozenset({LOCK})
 """Names in a recording's directory that hold nothing that could be lost."""
-_LEFT_OVER = re.compile(
-    r"\.(journal(\.old)?|\d{6}\.mcap)\.([0-9a-f]{16}|rebuilt)|fields\.columns\.part"
-)
+_LEFT_OVER = re.compile(r"\.(journal(\.old)?|\d{6}\.mcap)\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
 _MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
 _TRIES = 10

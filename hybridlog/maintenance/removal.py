@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import forget
 from hybridlog.maintenance.opening import announce_removal
 from hybridlog.maintenance.report import being_written
@@ -43,6 +45,8 @@ def remove(
         hidden = directory.hide(entry.label)
         try:
             catalog.remove(entry.id)
+            with suppress(OSError):  # the next connection removes them
+                tables.remove(directory, entry.id)
             if database is not None:
                 _clear(IndexState(database), entry)
         finally:

@@ -7,9 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.stored import NAME as COLUMNS
-from hybridlog.columns.stored import FieldColumns
 from hybridlog.entries import journal_from_segments, sealed_line, take_inventory
+from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, reindex
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
 from hybridlog_storage import durability, files, journal
@@ -79,6 +78,8 @@ def repair(
             with directory.writing(label) as mine:
                 if mine:
                     done += _repair_one(directory, catalog, label)
+            if mine:
+                done += _repair_tables(directory, catalog, label)
         except StoreError as error:
             done.append(Repaired(label, "recording", str(error), is_cured=False))
     return done
@@ -92,16 +93,19 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, label: str) -> list
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         place = misfit.file or f"segment {misfit.segment}"
         done.append(Repaired(label, place, what, is_cured=False))
+    put_entry(directory, catalog, label)
+    return done
+
+
+def _repair_tables(directory: StoreDirectory, catalog: Catalog, label: str) -> list[Repaired]:
+    """Make tables again that are damaged."""
     entry = put_entry(directory, catalog, label)
     if entry.status == "damaged":
-        return done  # columns of what is lost fit again when that is restored
-    with suppress(FileNotFoundError):
-        try:
-            FieldColumns(directory.recording(label)).check(entry)
-        except StoreError:
-            files.unlink(directory.recording(label) / COLUMNS)
-            done.append(Repaired(label, "columns", "removed; the index answers instead"))
-    return done
+        return []  # tables of what is lost fit again when that is restored
+    damaged = tables.damage(directory, entry)
+    if not damaged or not tables.make(directory, entry, damaged):
+        return []
+    return [Repaired(label, f"table of {topic}", "made again") for topic in damaged]
 
 
 def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.stored import FieldColumns
 from hybridlog.entries import take_inventory
 from hybridlog.indexing import ChunkIndexer, Documents
+from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
 from hybridlog_storage.directory import LOCK
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; what it held is in `hybridlog losses`"
-_KNOWN = frozenset({LOCK, "fields.columns", "fields.columns.part", "journal.old"})
+_KNOWN = frozenset({LOCK, "journal.old"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def verify(
     labels: Iterable[str] | None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Check every byte of segments, journals and columns, and compare the index with them.
+    """Check every byte of segments, journals and tables, and compare the index with them.
 
     The documents of each chunk are made again and compared with those in the database, so
     that each reference is seen to name the message it was made for.
@@ -167,7 +167,7 @@ class _Check:
         if entry.status == "open":
             return
         self._index(entry)
-        self._columns(entry)
+        self._tables(entry)
 
     def _journal(self, inventory: Inventory) -> None:
         state = inventory.state
@@ -282,13 +282,9 @@ class _Check:
                 problem = f"{have} index documents, {want} messages in the segments"
                 self.found(f"collection {collection}", problem, self._reindex)
 
-    def _columns(self, entry: RecordingEntry) -> None:
-        try:
-            FieldColumns(self._path).check(entry)
-        except FileNotFoundError:
-            pass  # there need not be any
-        except StoreError as error:
-            self.found("columns", str(error), _REPAIR)
+    def _tables(self, entry: RecordingEntry) -> None:
+        for topic, problem in tables.damage(self._directory, entry).items():
+            self.found(f"table of {topic}", problem, _REPAIR)
 
 
 def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:

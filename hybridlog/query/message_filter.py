@@ -91,7 +91,9 @@ class MessageFilter:
         )
         records = decoded.records
         if "_meta" in self._fields:
-            records = _with_meta(records, channel, batch.take(decoded.rows), seq[decoded.rows])
+            good = decoded.rows
+            times = batch.log_time[good], seq[good], batch.publish_time[good]
+            records = meta_array(records, channel, *times)
         mask = to_mask(self._predicate.root, self._types, records)
         if mask is None:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
@@ -116,8 +118,10 @@ class MessageFilter:
             try:
                 fields = dict(channel.codec.plain(batch.payload(row), self._fields))
             except (PayloadError, DefinitionError):
-                fields = {}
                 unreadable += 1
+                if self._fields != {"_meta"}:
+                    continue
+                fields = {}
             if "_meta" in self._fields:
                 fields["_meta"] = _meta_of(channel, batch, seq, row)
             holds[row] = self._test(fields)
@@ -138,24 +142,33 @@ def _meta_of(
     return meta
 
 
-def _with_meta(
+def meta_array(
     records: pa.StructArray,
     channel: RecordedChannel,
-    batch: Batch,
+    log_time: NDArray[np.int64],
     seq: NDArray[np.int64],
+    publish_time: pa.Array[Any] | NDArray[np.int64] | None,
 ) -> pa.StructArray:
-    """The same records with the fields of `_meta` that a message itself tells."""
+    """The same records with a field `_meta` of what a message itself tells.
+
+    Args:
+        records: n rows.
+        channel: The channel of the messages.
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers.
+        publish_time: int64[n], ns; None when unknown.
+    """
     import pyarrow as pa
 
-    rows = len(batch)
+    rows = len(log_time)
     columns: dict[str, Any] = {
-        "t": pa.array(batch.log_time),
+        "t": pa.array(log_time),
         "rec": pa.array([channel.recording.key] * rows, pa.string()),
         "topic": pa.array([channel.channel.topic] * rows, pa.string()),
         "seq": pa.array(seq),
     }
-    if channel.channel.has_publish_time:
-        columns["pub"] = pa.array(batch.publish_time)
+    if channel.channel.has_publish_time and publish_time is not None:
+        columns["pub"] = pa.array(publish_time)
     meta = pa.StructArray.from_arrays(list(columns.values()), names=list(columns))
     names = [field.name for field in records.type]
     return pa.StructArray.from_arrays([*records.flatten(), meta], names=[*names, "_meta"])

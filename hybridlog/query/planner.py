@@ -16,11 +16,12 @@ import numpy as np
 
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
-from hybridlog.query.engines.base import Need
+from hybridlog.query.engines.base import Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.statistics import Statistics
+from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.message_filter import MessageFilter, residual
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
@@ -28,6 +29,7 @@ from hybridlog_storage.errors import (
     DatabaseError,
     IndexChangedError,
     SegmentError,
+    StoreError,
     TopicError,
 )
 
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
 
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
-_RETRIED = (DatabaseError, IndexChangedError, SegmentError)
+_RETRIED = (DatabaseError, IndexChangedError, SegmentError, StoreError, UndecidedError)
 """Failures of one engine that another engine may not have."""
 
 
@@ -63,9 +65,11 @@ class Planner:
         self._ranges = RangeResolver(session, question)
         self._mongo = Mongo(session, counters)
         self._scan = PayloadScan(session, counters)
+        self._tables = TablesEngine(session, counters)
         self._engines: tuple[Engine, ...] = (
             Statistics(),
             ChunkIndex(session, counters),
+            self._tables,
             self._mongo,
             self._scan,
         )
@@ -168,7 +172,7 @@ class Planner:
         filters: dict[int, MessageFilter] = {}
         place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
         for part in parts:
-            engine = self._choose(part, Need.SELECTION)[0]
+            engine = self._selecting(part)
             indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
             if engine is self._scan:
                 unindexed.update(indexes)
@@ -197,6 +201,18 @@ class Planner:
         return residual(part.predicate) if self._mongo.undecided(part) else None
 
     # Choosing.
+
+    def _selecting(self, part: Part) -> Engine:
+        """The engine that finds the matching messages of a part."""
+        for engine in self._choose(part, Need.SELECTION):
+            if engine is self._tables:
+                try:
+                    self._tables.check(part)
+                except _RETRIED:
+                    continue
+            return engine
+        self.session.database_for("A MongoDB filter")
+        raise DatabaseError("No engine answers this question.")
 
     def _choose(self, part: Part, need: Need, fields: Collection[str] = ()) -> list[Engine]:
         """The engines that can answer, the cheapest first.

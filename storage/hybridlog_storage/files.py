@@ -227,14 +227,26 @@ def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:
             os.close(made)
 
 
-def rename(old: Path, new: Path, *, depth: int = IN_RECORDING) -> None:
-    """Give a file or a folder another name in the same folder of the store.
+def rename(
+    old: Path, new: Path, *, depth: int = IN_RECORDING, new_depth: int | None = None
+) -> None:
+    """Give a file or a folder of the store another name.
+
+    Args:
+        old: Its name.
+        new: The name it gets; in another folder, too, if `new_depth` is given.
+        depth: As for `open_file`.
+        new_depth: The same of `new`.
 
     Raises:
         OSError: It is not there, or cannot be renamed.
     """
     with folder(old.parent, depth - 1) as fd:
-        system.rename(old.name, new.name, folder=fd, new_folder=fd)
+        if new_depth is None:
+            system.rename(old.name, new.name, folder=fd, new_folder=fd)
+            return
+        with folder(new.parent, new_depth - 1) as new_fd:
+            system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
 def unlink(path: Path, *, depth: int = IN_RECORDING) -> None:
@@ -251,6 +263,18 @@ def sync_folder(path: Path, *, depth: int = IN_FOLDER) -> None:
     """Return once renames, new names and removals in a folder are on the disk."""
     with folder(path, depth) as fd:
         system.sync(fd)
+
+
+def make_folders(path: Path, *, depth: int) -> None:
+    """Make a folder and those above it, as far as they are missing.
+
+    Raises:
+        OSError: One cannot be made.
+    """
+    for level in range(depth):
+        place = Path(*path.parts[: len(path.parts) - depth + level + 1])
+        with suppress(FileExistsError):
+            make_folder(place, depth=level + 1)
 
 
 def remove_tree(path: Path, *, depth: int) -> None:

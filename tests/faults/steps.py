@@ -463,7 +463,6 @@ def _serve() -> NoReturn:
     import pandas as pd
     import pymongo
 
-    import hybridlog.columns.stored
     import hybridlog.maintenance.edit
     import hybridlog.maintenance.imports
     import hybridlog.maintenance.index
@@ -472,6 +471,7 @@ def _serve() -> NoReturn:
     import hybridlog.recorder
     import hybridlog.sources.mcap
     import hybridlog.store
+    import hybridlog.tables.reader
     import tests.faults.logs
 
     logging.disable()

@@ -21,6 +21,7 @@ import hybridlog as hl
 from hybridlog.cli.coverage import losses_of
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
+from hybridlog.tables.layout import PARTS, TABLES
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog import _crc as crc_of
 from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
@@ -32,7 +33,7 @@ from tests.faults.logs import Content
 
 WHERE = 20
 """Messages with `n` of at least this are asked for."""
-_ANY_FILE = {"writer.lock", "fields.columns", "journal.old"}
+_ANY_FILE = {"writer.lock", "journal.old"}
 _MADE_UP = re.compile(r"\b[0-9a-f]{32}\b|\d{19}")
 
 
@@ -221,6 +222,7 @@ def look(case: Case) -> State:
         _check(verification.index, "the index was not compared")
         _check_database(store, database)
         _check_catalog(store)
+        _check_tables(store)
         _check(not store.repairs.unreadable, f"unreadable: {store.repairs.unreadable}")
     return State(seen, _files(case.path), tuple(_plain(f) for f in findings))
 
@@ -309,7 +311,19 @@ def _files(path: Path) -> frozenset[str]:
         "../catalog.sqlite",
         "../hybridlog.toml",
         "../recordings",
+        "../tables",
+        "../tables.part",
     }
+
+
+def _check_tables(store: hl.Store) -> None:
+    """None is of a recording that is gone, and nothing is unfinished."""
+    ids = {f"recording=r{entry.id}" for entry in store.recordings()}
+    path = store.directory.path
+    there = {p.name for p in (path / TABLES).glob("*")}
+    _check(there <= ids, f"there are tables of {there - ids}")
+    unfinished = [str(p) for p in (path / PARTS).glob("*/**/*")]
+    _check(not unfinished, f"unfinished tables are left: {unfinished}")
 
 
 def _check_database(store: hl.Store, database: Database) -> None:

@@ -21,13 +21,14 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog import index_writer
-from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.demo.write import write_bag
 from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording, provision
 from hybridlog.live import recording as live
 from hybridlog.maintenance import index
+from hybridlog.tables.reader import Tables
+from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import append_file, chunk_builder, segment_writer
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
@@ -594,7 +595,7 @@ def test_a_processor_is_left_to_who_brings_messages(
     monkeypatch.setattr(segment_writer, "_TURN_S", 30)
     slowly(segment_writer, "pack")
     slowly(ChunkIndexer, "documents_of")
-    slowly(FieldGatherer, "add")
+    slowly(TableWriter, "add")
     payloads = [text(bytes([n]) * 2000) for n in range(30)]
     with store.start("talk", settings=SegmentSettings(chunk_size=2000)) as recording:
         monkeypatch.setattr(index_writer, "_FEW", 0)
@@ -983,19 +984,19 @@ def test_no_more_than_so_many_chunks_wait_for_others(
     assert store.verify().findings == []
 
 
-def test_columns_are_made_in_the_order_of_the_file(
+def test_tables_get_chunks_in_the_order_of_the_file(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of chunks that wait, too: together, or when one comes that does not wait."""
     monkeypatch.setattr(live, "_patience", lambda _: 1e9)
-    gathered: list[int] = []
-    real = FieldGatherer.add
+    added: list[int] = []
+    real = TableWriter.add
 
-    def seen(self: FieldGatherer, chunk: StoredChunk, *args: Any) -> None:
-        gathered.append(chunk.offset)
+    def seen(self: TableWriter, chunk: StoredChunk, *args: Any) -> None:
+        added.append(chunk.offset)
         real(self, chunk, *args)
 
-    monkeypatch.setattr(FieldGatherer, "add", seen)
+    monkeypatch.setattr(TableWriter, "add", seen)
     slow, large = channel("/slow"), channel("/large")
     with store.start("talk", flush_interval_s=0.05) as recording:
         totals = recording._capture.writer.totals
@@ -1007,17 +1008,16 @@ def test_columns_are_made_in_the_order_of_the_file(
 
         say(slow, 2000)
         say(slow, 2000)
-        assert not gathered
+        assert not added
         say(large, 1_200_000)
-        wait_for(lambda: len(gathered) == 3)
+        wait_for(lambda: len(added) == 3)
         say(slow, 2000)
-        assert len(gathered) == 3
-    assert len(gathered) == 4
-    assert gathered == sorted(set(gathered))
+        assert len(added) == 3
+    assert len(added) == 4
+    assert added == sorted(set(added))
     (entry,) = store.recordings()
-    columns = store.columns(entry.id)
-    assert columns is not None
-    assert all(columns.has(entry, own.topic, {}) for own in (slow, large))
+    tables = Tables(store.directory.path)
+    assert all(tables.of(entry, own.topic) for own in (slow, large))
     assert store.verify().findings == []
 
 

@@ -28,6 +28,7 @@ from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.statistics import Statistics
+from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
@@ -62,6 +63,7 @@ FULL_DEFINITION = (
 ENGINES: dict[str, type[Engine]] = {
     "statistics": Statistics,
     "chunk index": ChunkIndex,
+    "tables": TablesEngine,
     "mongo": Mongo,
     "payload scan": PayloadScan,
 }
@@ -69,7 +71,8 @@ WAYS = {
     "planner": tuple(ENGINES),
     "mongo": ("mongo",),
     "payload scan": ("payload scan",),
-    "without mongo": ("statistics", "chunk index", "payload scan"),
+    "tables": ("tables", "payload scan"),
+    "without mongo": ("statistics", "chunk index", "tables", "payload scan"),
 }
 
 
@@ -233,7 +236,8 @@ pattern = st.sampled_from(["'^slip'", "'(?i)slip'", "'[0-9]$'", "'^$'", "'l.p 1'
 
 def _conditions(numbers: st.SearchStrategy[str], extra: list[str]) -> st.SearchStrategy[str]:
     one = st.one_of(
-        st.builds("{} {} {}".format, numbers, order, number),
+        st.builds("{} {} {}".format, numbers, order, number.filter(lambda n: n != "nan")),
+        st.builds("{} {} nan".format, numbers, st.sampled_from(["==", "!="])),
         st.builds("{} in [{}, {}]".format, numbers, number, number),
         st.builds("s ~ {}".format, pattern),
         st.builds("s !~ {}".format, pattern),

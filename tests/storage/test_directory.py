@@ -176,7 +176,7 @@ def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirector
     assert changed()
     (recording / "000002.mcap.open").write_bytes(b"")
     assert changed()
-    (recording / "fields.columns").write_bytes(b"x")
+    (recording / "notes.txt").write_bytes(b"x")
     assert not changed()
     recording.rename(recording.with_name("s"))
     assert store.listing("s").print == seen[-1]

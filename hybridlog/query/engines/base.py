@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterator, Sequence
 from enum import Enum, auto
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from hybridlog_storage.errors import HybridlogError
+
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import ChunkTask, RowSelection
     from hybridlog.query.question import Part
+
+
+class UndecidedError(HybridlogError):
+    """An engine cannot tell what it was asked: another one has to."""
 
 
 class Need(Enum):

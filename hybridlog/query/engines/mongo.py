@@ -11,7 +11,7 @@ import numpy as np
 from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, Values
-from hybridlog.query.predicate.to_mongo import to_mongo
+from hybridlog.query.predicate.to_mongo import MongoFilter, to_mongo
 from hybridlog.query.predicate.tree import And
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.collection_names import collection_of
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from hybridlog.guarded import GuardedIndex
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
-    from hybridlog.query.predicate.to_mongo import MongoFilter
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
     from hybridlog_storage.index_columns import KeyColumns
@@ -37,6 +36,7 @@ _WINDOWS_A_QUESTION = 14
 _BATCH = 50_000
 _DOCUMENTS = 10_000
 _Filter = dict[str, object]
+_READABLE: _Filter = {"_meta.error": {"$exists": False}}
 
 
 class Mongo:
@@ -69,8 +69,17 @@ class Mongo:
 
     def filter_of(self, part: Part) -> MongoFilter:
         """The predicate of a part as MongoDB understands it."""
-        predicate = And(()) if part.predicate is None else part.predicate.root
-        return to_mongo(predicate, part.field_types)
+        if part.predicate is None:
+            return to_mongo(And(()))
+        found = to_mongo(part.predicate.root, part.field_types)
+        is_open = part.recording.status == "open"
+        if not is_open and not any(stats.unreadable for stats in part.stats):
+            return found
+        if all(path.startswith("_meta") for path in part.predicate.fields()):
+            return found
+        # A message that cannot be read has no fields to be asked for.
+        possible, certain = (joined(_READABLE, f) for f in (found.filter, found.certain))
+        return MongoFilter(possible, certain, found.is_exact)
 
     def undecided(self, part: Part) -> int:
         """Number of documents that do not tell whether their message matches.

@@ -214,8 +214,6 @@ class _Columns:
             _UnfitError: These columns do not tell.
         """
         parts = asked.parts
-        if parts[0] in {"_meta", "_id"}:
-            raise _UnfitError
         top = self._records.type
         if top.get_field_index(str(parts[0])) < 0:
             raise _UnfitError
@@ -295,6 +293,8 @@ class _Columns:
         part = parts[0]
         elements = _flattened(values, rows)
         inside = elements.values.type
+        if isinstance(inside, pa.BaseExtensionType):
+            raise _UnfitError  # JSON text, of values of several types
         named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
         if isinstance(part, int):
             if named:

@@ -1,1 +1,0 @@
-"""Fields of whole topics as columns: laid down beside the segments, kept in memory, asked."""

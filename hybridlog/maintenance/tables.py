@@ -1,0 +1,191 @@
+"""Makes, checks and removes the tables of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.tables.layout import (
+    IN_TABLES,
+    OWN_FILE_ROWS,
+    PARTS,
+    TABLES,
+    parts_folder,
+    recording_folder,
+    table_schema,
+)
+from hybridlog.tables.writer import TableWriter
+from hybridlog_storage import files
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
+
+
+def topics_of(entry: RecordingEntry) -> set[str]:
+    """Topics of a recording that have messages."""
+    return {c.topic for c in entry.channels if c.stats.messages}
+
+
+def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
+    """Topics whose tables are missing, or are not what the catalog says.
+
+    Topics of few rows share files, so those of one file are missing together.
+    """
+    from hybridlog.tables.reader import Tables
+
+    tables = Tables(directory.path)
+    return together(entry, {t for t in topics_of(entry) if tables.of(entry, t) is None})
+
+
+def together(entry: RecordingEntry, topics: Collection[str]) -> set[str]:
+    """Topics, and those that share a file with one of them."""
+
+    def schemas(topic: str) -> set[str]:
+        if entry.messages_of(topic) >= OWN_FILE_ROWS:
+            return set()
+        return {
+            table_schema(c.message_encoding, c.schema, c.metadata)
+            for c in entry.channels
+            if c.topic == topic
+        }
+
+    shared = {schema for topic in topics for schema in schemas(topic)}
+    return {t for t in topics_of(entry) if t in topics or not shared.isdisjoint(schemas(t))}
+
+
+def make(
+    directory: StoreDirectory, entry: RecordingEntry, topics: Collection[str] | None = None
+) -> bool:
+    """Make tables of a recording again from its segments.
+
+    Args:
+        directory: The store.
+        entry: The recording, as the catalog has it.
+        topics: Of which; None for those that are missing.
+
+    Returns:
+        Whether they were made; not if the recording is being written, or the store cannot be.
+    """
+    if entry.status == "open" or not directory.is_writable:
+        return False
+    wanted = missing(directory, entry) if topics is None else together(entry, topics)
+    if not wanted:
+        return True
+    try:
+        with directory.writing(entry.label) as mine:
+            if not mine:
+                return False
+            writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
+            try:
+                for chunk, channels in _chunks(directory, entry, wanted, writer):
+                    writer.add(chunk, channels)
+                writer.close(entry)
+            finally:
+                writer.discard()
+    except StoreError:
+        return False
+    return True
+
+
+def _chunks(
+    directory: StoreDirectory,
+    entry: RecordingEntry,
+    topics: Collection[str],
+    writer: TableWriter,
+) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
+    """Chunks with messages of some topics, in order; those that are damaged are left out."""
+    path = directory.recording(entry.label)
+    for number, _, _ in entry.spans:
+        with SegmentReader(path / f"{number:06d}.mcap", number) as reader:
+            summary = reader.summary()
+            is_wanted = chunks_with(entry, summary.table, topics)
+            for place in summary.chunks:
+                if is_wanted[place.number]:
+                    with suppress(SegmentError):
+                        yield reader.read_chunk(place), summary.channels
+        writer.cut(number, entry.digests[str(number)])
+
+
+def chunks_with(entry: RecordingEntry, table: ChunkTable, topics: Collection[str]) -> list[bool]:
+    """For each chunk of a segment, whether it has messages of some topics."""
+    ids = [c.id for c in entry.channels if c.topic in topics]
+    chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
+    found = np.zeros(len(table.chunks), np.bool_)
+    found[chunk_of[np.isin(table.parts["channel"], ids)]] = True
+    return found.tolist()
+
+
+def damage(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, str]:
+    """What is wrong with the tables that are there, by topic. Reads every byte of them."""
+    from hybridlog.tables.reader import Tables
+
+    tables = Tables(directory.path)
+    found: dict[str, str] = {}
+    checked: dict[object, str] = {}
+    for topic in sorted(topics_of(entry)):
+        try:
+            for file in tables.check(entry, topic).files:
+                if file.path not in checked:
+                    checked[file.path] = ""
+                    try:
+                        file.check()
+                    except StoreError as error:
+                        checked[file.path] = str(error)
+                if checked[file.path]:
+                    found[topic] = checked[file.path]
+        except FileNotFoundError:
+            pass  # there need not be one
+        except StoreError as error:
+            found[topic] = str(error)
+    return found
+
+
+def remove(directory: StoreDirectory, recording: str) -> None:
+    """Remove all tables of a recording.
+
+    Raises:
+        OSError: One cannot be removed.
+    """
+    parts = parts_folder(directory.path, recording)
+    with suppress(FileNotFoundError):
+        files.remove_tree(parts, depth=files.IN_FOLDER)
+    folder = recording_folder(directory.path, recording)
+    try:
+        files.make_folders(parts, depth=files.IN_FOLDER)
+        files.rename(folder, parts / "removed", depth=IN_TABLES, new_depth=files.IN_RECORDING)
+    except FileNotFoundError:
+        pass
+    finally:
+        with suppress(FileNotFoundError):
+            files.remove_tree(parts, depth=files.IN_FOLDER)
+
+
+def remove_strangers(directory: StoreDirectory, present: Iterable[str]) -> None:
+    """Remove tables of recordings that are not in the store any more.
+
+    Args:
+        directory: The store.
+        present: Keys of all recordings.
+    """
+    keys = set(present)
+    for top, beginning in ((TABLES, "recording=r"), (PARTS, "r")):
+        try:
+            names = files.names(directory.path / top, depth=files.IN_STORE)
+        except OSError:
+            continue
+        for name in names:
+            recording = name.removeprefix(beginning)
+            if recording != name and recording[:16] not in keys:
+                with suppress(OSError):
+                    remove(directory, recording)

@@ -1,0 +1,198 @@
+"""Answers about ended recordings from the Parquet tables of their topics."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.query.chunk_scan import ChunkKey, RowSelection
+from hybridlog.query.engines.base import Need, Outcomes, UndecidedError, Values
+from hybridlog.query.message_filter import can_decide, meta_array
+from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.chunk_scan import ChunkTask
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Part
+    from hybridlog.session import Session
+    from hybridlog.tables.reader import TableRows, TopicTable
+
+_OPEN_S = 2e-4  # seconds to ask a table that is open
+_BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
+_FIXED_ARRAY = re.compile(r"\[(\d+)\]$")
+_WHOLE = 32  # elements; tables hold longer arrays as summaries
+
+
+class TablesEngine:
+    """Reads the columns that a question is about, and nothing else.
+
+    Args:
+        session: The open store.
+        counters: Count the bytes that are read.
+    """
+
+    def __init__(self, session: Session, counters: Counters) -> None:
+        self._session = session
+        self._counters = counters
+        self._counts: dict[Part, int] = {}
+        self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
+
+    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+        """By the stored bytes of the columns; None without a table that can tell."""
+        table = self._session.tables.of(part.recording, part.topic)
+        if table is None or not part.is_by_log_time:
+            return None
+        asks_fields = part.predicate is not None or need is Need.VALUES
+        if table.reduced and asks_fields:
+            return None  # tables have no fields of reduced messages
+        if part.predicate is not None and not can_decide(part.predicate):
+            return None
+        if need is Need.VALUES and not _are_whole(part, fields):
+            return None
+        own = ("ref",) if need is Need.SELECTION else ()
+        wanted = {*_paths(table, part), *(fields if need is Need.VALUES else ())}
+        return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
+
+    def count(self, parts: Sequence[Part]) -> int:
+        """Number of rows of which the predicate holds.
+
+        Raises:
+            UndecidedError: the columns of a table cannot tell.
+            StoreError: a table is damaged.
+        """
+        return sum(map(self.check, parts))
+
+    def check(self, part: Part) -> int:
+        """The count of one part; afterwards it is known that the columns can tell."""
+        if part not in self._counts:
+            rows = self._rows(part)
+            self._counts[part] = sum(int(holds.sum()) for _, holds in rows)
+        return self._counts[part]
+
+    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+        """The outcome for each row, in order."""
+        self.check(part)
+        for rows, holds in self._rows(part):
+            yield Outcomes(rows.t, rows.seq, holds)
+
+    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+        """Columns of the rows of which the predicate holds, in order."""
+        self.check(part)
+        paths = [path.replace("[]", "") for path in fields]
+        for rows, holds in self._rows(part, paths):
+            chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
+            if len(chosen):
+                yield Values(chosen.t, chosen.seq, chosen.records)
+
+    def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
+        """Places of the rows of which the predicate holds."""
+        wanted = {task.key for task in tasks}
+        found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
+        for part in parts:
+            if part not in self._places:
+                self._places[part] = self._find(part)
+            for key, offsets in self._places[part].items():
+                if key in wanted:
+                    found[key].append(offsets)
+        return RowSelection({key: np.sort(np.concatenate(o)) for key, o in found.items()})
+
+    def _find(self, part: Part) -> dict[ChunkKey, NDArray[np.int64]]:
+        places: list[NDArray[np.int64]] = []
+        for rows, holds in self._rows(part, own=("ref",)):
+            ref = rows.own["ref"]
+            columns = [ref.field(name).to_numpy(zero_copy_only=False) for name in _REFERENCE]
+            places.append(np.stack(columns, axis=1).astype(np.int64)[holds])
+        if not places:
+            return {}
+        table = np.concatenate(places)
+        order = np.lexsort((table[:, 2], table[:, 1], table[:, 0]))
+        table = table[order]
+        edges = np.flatnonzero(np.any(table[1:, :2] != table[:-1, :2], axis=1)) + 1
+        return {
+            (part.recording.id, int(group[0, 0]), int(group[0, 1])): group[:, 2]
+            for group in np.split(table, edges)
+            if len(group)
+        }
+
+    def _rows(
+        self, part: Part, fields: Collection[str] = (), own: Collection[str] = ()
+    ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
+        """Rows of the part's time with the outcome for each.
+
+        Raises:
+            UndecidedError: the columns cannot tell.
+            StoreError: the table is damaged, or gone.
+        """
+        table = self._session.tables.of(part.recording, part.topic)
+        if table is None:
+            raise StoreError(f"The table of {part.topic} is not there any more.")
+        spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
+        columns = {*own, "state"} if table.unreadable else {*own}
+        if part.predicate is not None and "_meta.pub" in part.predicate.fields():
+            columns.add("pub")
+        self._counters.bytes_read += int(table.size({*_paths(table, part), *fields}, own))
+        try:
+            for rows in table.scan({*_paths(table, part), *fields}, own=columns, spans=spans):
+                yield rows, self._holds(part, rows)
+        except StoreError:
+            self._session.tables.reject(part.recording, part.topic)
+            raise
+
+    def _holds(self, part: Part, rows: TableRows) -> NDArray[np.bool_]:
+        predicate = part.predicate
+        if predicate is None:
+            return np.ones(len(rows), np.bool_)
+        records: Any = rows.records
+        asked = predicate.fields()
+        if any(path.startswith("_meta") for path in asked):
+            pub = rows.own.get("pub")
+            records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
+        found = to_mask(predicate, part.field_types, records)
+        if found is None:
+            raise UndecidedError(f"The table of {part.topic} cannot tell.")
+        if "state" in rows.own and not all(path.startswith("_meta") for path in asked):
+            states = rows.own["state"].cast("string").to_numpy(zero_copy_only=False)
+            found = found & (states != "unreadable")
+        return found
+
+
+_REFERENCE = ("seg", "chunk", "off")
+
+
+def _paths(table: TopicTable, part: Part) -> set[str]:
+    """Columns that the predicate of a part is about."""
+    found: set[str] = set()
+    for condition in part.predicate.conditions() if part.predicate is not None else ():
+        path = condition.field.names
+        if path.startswith("_meta"):
+            continue
+        # `ranges.min` is a column of its own, or the array that it is the least element of.
+        while "." in path and not table.has(path):
+            path = path.rpartition(".")[0]
+        found.add(path)
+    return found
+
+
+def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
+    """Whether tables hold these fields as the messages do: no array that may be a summary."""
+    types = part.field_types
+    if types is None:
+        return False
+    paths = list(types) if fields is None else list(fields)
+    for path in paths:
+        below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
+        if not below:
+            return False
+        for name in below:
+            kind = types[name]
+            fixed = _FIXED_ARRAY.search(kind)
+            if kind.endswith("]") and (fixed is None or int(fixed[1]) > _WHOLE):
+                return False
+    return True

@@ -1,0 +1,1 @@
+"""Parquet tables of topics: written beside the segments, read for answers."""

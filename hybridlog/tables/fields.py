@@ -1,0 +1,374 @@
+"""Fields of messages as columns of a table, and back.
+
+Arrays over the limit become `{n, min, max, mean}`, as in the index; of strings, bytes and
+messages, `{n}`. A message without fields becomes a boolean, because Parquet has no column
+for it. A column whose name differs from its field's says so in its metadata.
+"""
+
+# Where stubs for pyarrow are installed, they know too little of its buffers.
+# mypy: disable-error-code="no-any-return, arg-type, call-overload, return-value, assignment"
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.schema.column import Scalars
+from hybridlog.schema.summary import summarise
+from hybridlog.tables.layout import ORIGINAL, column_names
+
+LIMIT: Final = 32
+"""Elements up to which an array is kept whole."""
+_N: Final = ("n",)
+_SUMMARY: Final = ("n", "min", "max", "mean")
+
+Array = Any
+"""An Arrow array. Its stubs differ too much between versions to be of use here."""
+
+
+class UnfitError(Exception):
+    """Messages whose fields have no common type."""
+
+
+class FieldShape:
+    """Turns fields of one topic's messages into columns, always in the same way.
+
+    An array that was too long once is a summary from then on.
+    """
+
+    def __init__(self) -> None:
+        self._summarised: set[tuple[str, ...]] = set()
+        self._plain: dict[tuple[str, ...], Any] = {}
+
+    def columns(self, records: Array) -> Array:
+        """Fields as columns.
+
+        Args:
+            records: Messages, a struct each.
+
+        Returns:
+            A struct array; its fields are the columns.
+        """
+        return self._struct(records, (), column_names)
+
+    def _column(self, array: Array, path: tuple[str, ...]) -> Array:
+        kind = array.type
+        if pa.types.is_struct(kind):
+            if kind.num_fields == 0:
+                present = np.ones(len(array), np.bool_)
+                return pa.array(present, mask=_missing(array))
+            return self._struct(array, path, _inner_names)
+        if _is_list(kind):
+            if self._is_long(array, path):
+                return _summary(array)
+            values = self._column(_elements(array), path)
+            return _with_elements(array, values, plain=True)
+        if pa.types.is_binary(kind) or pa.types.is_large_binary(kind):
+            return _bytes_summary(array) if self._is_long(array, path) else array
+        return array
+
+    def _struct(
+        self,
+        array: Array,
+        path: tuple[str, ...],
+        naming: Callable[[list[str]], Iterator[tuple[str, str]]],
+    ) -> Array:
+        kind = array.type
+        if self._plain.get(path) == kind:
+            return array
+        inner = _fields(kind)
+        columns, fields = [], []
+        for number, (name, column) in enumerate(naming([field.name for field in inner])):
+            values = self._column(array.field(number), (*path, name))
+            columns.append(values)
+            fields.append(_named(column, name, values.type))
+        if kind == pa.struct(fields) and not any(map(_may_change, fields)):
+            self._plain[path] = kind
+            return array
+        return _struct_of(columns, fields, len(array), _missing(array))
+
+    def _is_long(self, array: Array, path: tuple[str, ...]) -> bool:
+        if path not in self._summarised:
+            if not len(array) or int(_lengths(array).max()) <= LIMIT:
+                return False
+            self._summarised.add(path)
+        return True
+
+
+def _may_change(field: Any) -> bool:
+    """Whether a column that is what it was may be something else next time, or is renamed."""
+    kind = field.type
+    if field.metadata:
+        return True
+    if pa.types.is_struct(kind):
+        return any(map(_may_change, _fields(kind)))
+    return _is_array(kind)
+
+
+def _inner_names(names: list[str]) -> Iterator[tuple[str, str]]:
+    return column_names(names, ())
+
+
+def _named(column: str, name: str, kind: Any) -> Any:
+    return pa.field(column, kind, metadata={ORIGINAL: name} if column != name else None)
+
+
+def original_name(field: Any) -> str:
+    """Name of the field that a column holds."""
+    name = (field.metadata or {}).get(ORIGINAL)
+    return field.name if name is None else name.decode()
+
+
+def records_of(columns: Array) -> Array:
+    """Columns as fields of messages again, under their own names.
+
+    Summaries stay what they are.
+    """
+    kind = columns.type
+    if pa.types.is_struct(kind):
+        inner = [kind.field(number) for number in range(kind.num_fields)]
+        if not any(map(_is_renamed, inner)):
+            return columns
+        values = [records_of(columns.field(number)) for number in range(kind.num_fields)]
+        fields = [
+            pa.field(original_name(field), value.type)
+            for field, value in zip(inner, values, strict=True)
+        ]
+        return _struct_of(values, fields, len(columns), _missing(columns))
+    if _is_list(kind) and _is_renamed(kind.value_field):
+        return _with_elements(columns, records_of(_elements(columns)))
+    return columns
+
+
+def _is_renamed(field: Any) -> bool:
+    """Whether the name of a column, or of one inside it, differs from its field's."""
+    if original_name(field) != field.name:
+        return True
+    kind = field.type
+    if pa.types.is_struct(kind):
+        return any(_is_renamed(kind.field(number)) for number in range(kind.num_fields))
+    return _is_list(kind) and _is_renamed(kind.value_field)
+
+
+def joined(pieces: Sequence[Array]) -> Array:
+    """Columns one after the other, of the type that holds them all.
+
+    A column that a piece lacks is null there. Where one piece has summaries of an array, all
+    have.
+
+    Raises:
+        UnfitError: There is no such type.
+    """
+    pieces = alike(pieces)
+    return pa.concat_arrays(pieces) if len(pieces) > 1 else pieces[0]
+
+
+def alike(pieces: Sequence[Array]) -> list[Array]:
+    """Columns of the type that holds them all; see `joined`."""
+    kind = pieces[0].type if pieces else None
+    if all(piece.type == kind for piece in pieces):
+        return list(pieces)
+    for piece in pieces[1:]:
+        kind = _common(kind, piece.type)
+    return [_as(piece, kind) for piece in pieces]
+
+
+def _common(one: Any, other: Any) -> Any:
+    """The type that values of two types have in common."""
+    if one == other or pa.types.is_null(other):
+        return one
+    if pa.types.is_null(one):
+        return other
+    if _is_summary(one) and _is_array(other):
+        return one
+    if _is_summary(other) and _is_array(one):
+        return other
+    if pa.types.is_struct(one) and pa.types.is_struct(other):
+        fields = {field.name: field for field in _fields(one)}
+        for field in _fields(other):
+            known = fields.get(field.name)
+            if known is not None and known.metadata != field.metadata:
+                raise UnfitError(f"{field.name} stands for two fields")
+            kind = field.type if known is None else _common(known.type, field.type)
+            fields[field.name] = field.with_type(kind)
+        return pa.struct(list(fields.values()))
+    if _is_list(one) and _is_list(other):
+        return pa.list_(_common(one.value_type, other.value_type))
+    raise UnfitError(f"{one} and {other} have no common type")
+
+
+def _as(array: Array, kind: Any) -> Array:
+    """Values as another type, which `_common` has found."""
+    if array.type == kind:
+        return array
+    if pa.types.is_null(array.type):
+        return pa.nulls(len(array), kind)
+    if _is_summary(kind) and _is_array(array.type):
+        found = _bytes_summary(array) if not _is_list(array.type) else _summary(array)
+        return _as(found, kind)
+    if pa.types.is_struct(kind):
+        names = [field.name for field in _fields(array.type)]
+        columns = [
+            _as(array.field(names.index(field.name)), field.type)
+            if field.name in names
+            else pa.nulls(len(array), field.type)
+            for field in _fields(kind)
+        ]
+        return _struct_of(columns, _fields(kind), len(array), _missing(array))
+    if _is_list(kind):
+        return _with_elements(array, _as(_elements(array), kind.value_type), plain=True)
+    return array.cast(kind)
+
+
+def _fields(kind: Any) -> list[Any]:
+    return [kind.field(number) for number in range(kind.num_fields)]
+
+
+def _is_summary(kind: Any) -> bool:
+    if not pa.types.is_struct(kind):
+        return False
+    return tuple(field.name for field in _fields(kind)) in {_N, _SUMMARY}
+
+
+def _is_array(kind: Any) -> bool:
+    return _is_list(kind) or pa.types.is_binary(kind) or pa.types.is_large_binary(kind)
+
+
+def _is_list(kind: Any) -> bool:
+    return (
+        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    )
+
+
+def _missing(array: Array) -> Any:
+    """Which rows are null, for Arrow; None if none is."""
+    return array.is_null() if array.null_count else None
+
+
+def _struct_of(columns: list[Array], fields: list[Any], rows: int, missing: Any) -> Array:
+    if not columns:
+        return pa.array([{}] * rows, pa.struct([]))
+    return pa.StructArray.from_arrays(columns, fields=fields, mask=missing)
+
+
+def _lengths(array: Array) -> Any:
+    """int64[n], elements of each row, 0 where there is none."""
+    if pa.types.is_fixed_size_list(array.type):
+        lengths = np.full(len(array), array.type.list_size, np.int64)
+    else:
+        lengths = np.diff(_offsets(array))
+    if array.null_count:
+        lengths[array.is_null().to_numpy(zero_copy_only=False)] = 0
+    return lengths
+
+
+def _offsets(array: Array) -> Any:
+    """int64[n + 1], where the elements of each row begin."""
+    wide = pa.types.is_large_list(array.type) or pa.types.is_large_binary(array.type)
+    dtype = np.dtype(np.int64 if wide else np.int32)
+    buffer = array.buffers()[1]
+    if buffer is None:
+        return np.zeros(len(array) + 1, np.int64)
+    found = np.frombuffer(buffer, dtype, len(array) + 1, array.offset * dtype.itemsize)
+    return found.astype(np.int64)
+
+
+def _elements(array: Array) -> Array:
+    """Elements of all rows that are there, one after the other."""
+    return array.flatten()
+
+
+def _with_elements(array: Array, values: Array, *, plain: bool = False) -> Array:
+    """Lists of the same lengths with other elements.
+
+    Args:
+        array: The lists.
+        values: Elements of all rows, those of missing rows left out.
+        plain: Whether the lists lose a fixed size.
+    """
+    is_plain = pa.types.is_list(array.type)
+    if values.type == array.type.value_type and (is_plain or not plain):
+        return array
+    offsets = np.zeros(len(array) + 1, np.int64)
+    np.cumsum(_lengths(array), out=offsets[1:])
+    large = pa.types.is_large_list(array.type) and not plain
+    kind = pa.LargeListArray if large else pa.ListArray
+    bounds = pa.array(offsets if large else offsets.astype(np.int32))
+    return kind.from_arrays(bounds, values, mask=_missing(array))
+
+
+def _summary(array: Array) -> Array:
+    """Each list as what the index has of a long one."""
+    offsets = np.zeros(len(array) + 1, np.int64)
+    np.cumsum(_lengths(array), out=offsets[1:])
+    numbers = _numbers(_elements(array))
+    missing = _missing(array)
+    if numbers is None:
+        count = pa.array(np.diff(offsets))
+        return pa.StructArray.from_arrays([count], names=list(_N), mask=missing)
+    values, is_there = numbers
+    lengths = np.diff(offsets)
+    if is_there is not None:
+        seen = np.concatenate(([0], np.cumsum(is_there, dtype=np.int64)))
+        values, offsets = values[is_there], seen[offsets]
+    found = summarise(Scalars(values), offsets)
+    return pa.StructArray.from_arrays(
+        [
+            pa.array(lengths),
+            *(pa.array(part, mask=~found.has) for part in (found.min, found.max, found.mean)),
+        ],
+        names=list(_SUMMARY),
+        mask=missing,
+    )
+
+
+def _numbers(values: Array) -> tuple[Any, Any] | None:
+    """Numbers as numpy has them, and which of them are there; None for anything else."""
+    kind = values.type
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        values = values.view(pa.int64())
+    elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        return None
+    if not values.null_count:
+        return values.to_numpy(zero_copy_only=False), None
+    is_there = values.is_valid().to_numpy(zero_copy_only=False)
+    return values.fill_null(0).to_numpy(zero_copy_only=False), is_there
+
+
+def _bytes_summary(array: Array) -> Array:
+    count = pa.array(_lengths(array))
+    return pa.StructArray.from_arrays([count], names=list(_N), mask=_missing(array))
+
+
+def detached(array: Array, begin: int, end: int) -> Array:
+    """An array that shares no memory with a range of addresses.
+
+    Args:
+        array: The array.
+        begin: First address of memory that will be used for something else.
+        end: The address behind it.
+    """
+    if any(b is not None and begin <= b.address < end for b in array.buffers()):
+        half = len(array) // 2
+        return pa.concat_arrays([array.slice(0, half), array.slice(half)])
+    return array
+
+
+def without(array: Array, rows: Any, total: int) -> Array:
+    """Rows in their places among others that are null.
+
+    Args:
+        array: k rows.
+        rows: intp[k], their places, ascending.
+        total: How many rows there are.
+    """
+    if len(rows) == total:
+        return array
+    places = np.zeros(total, np.int64)
+    places[rows] = np.arange(len(rows))
+    missing = np.ones(total, np.bool_)
+    missing[rows] = False
+    return array.take(pa.array(places, mask=missing))

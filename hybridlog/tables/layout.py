@@ -1,0 +1,213 @@
+"""Names of tables: folders, files, columns and the metadata of a file.
+
+```
+tables/recording=r<id>/topic=<collection>/<schema8>-<segment>.parquet
+tables/recording=r<id>/small/<type>~<schema8>.parquet
+tables.part/r<id>/      files that are being written; only whole ones get a name in `tables`
+```
+
+The folders are hive partitions. The id has a letter in front, because readers that infer
+types read `1e3` and `1000` as one number. The schema is part of the name of a file, so that
+files of one glob have one type.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.schema.reduced_codec import ORIGINAL_ENCODING
+from hybridlog_storage.catalog import schema_hash
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.messages import REDUCED
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel
+
+TABLES: Final = "tables"
+"""Folder of the store that holds finished tables."""
+PARTS: Final = "tables.part"
+"""Folder of the store that holds tables that are being written."""
+SMALL: Final = "small"
+"""Folder of a recording's tables that holds topics of few rows."""
+SUFFIX: Final = ".parquet"
+OWN_FILE_ROWS: Final = 1000
+"""Rows from which a topic has a file of its own."""
+IN_TABLES: Final = 2
+"""Depth of a recording's folder below the store."""
+IN_TOPIC: Final = 4
+"""Depth of a file of tables below the store."""
+OWN_COLUMNS: Final = (
+    "log_time",
+    "t",
+    "seq",
+    "pub",
+    "stamp",
+    "channel",
+    "state",
+    "error",
+    "ref",
+)
+"""Columns that every table has besides the fields of the messages."""
+TOPIC_COLUMN: Final = "topic"
+"""Column of a table of several topics."""
+STATES: Final = ("whole", "reduced", "unreadable", "expired")
+"""Values of the column `state`."""
+ORIGINAL: Final = b"hybridlog.name"
+"""Metadata of a column: the name of its field, where that differs."""
+ABOUT: Final = b"hybridlog"
+"""Metadata of a file: an `About` as JSON."""
+VERSION: Final = 1
+_RESERVED: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN, "recording"})
+_ODD: Final = re.compile(r"[^A-Za-z0-9_]")
+
+
+def recording_folder(root: Path, recording: str) -> Path:
+    """Folder of a recording's tables.
+
+    Args:
+        root: The store.
+        recording: Id of the recording.
+    """
+    return root / TABLES / f"recording=r{recording}"
+
+
+def parts_folder(root: Path, recording: str) -> Path:
+    """Folder of a recording's tables while they are written."""
+    return root / PARTS / f"r{recording}"
+
+
+def topic_folder(topic: str) -> str:
+    """Name of the folder of a topic's tables."""
+    return f"topic={collection_of(topic)}"
+
+
+def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[str, str]) -> str:
+    """Hash of all that decides the columns of a channel's messages: 64 hexadecimal digits.
+
+    Args:
+        message_encoding: Of the channel.
+        schema: Hash of its schema, if it has one.
+        metadata: Of the channel; a reduced one names its original encoding there.
+    """
+    if message_encoding == REDUCED:
+        message_encoding = metadata.get(ORIGINAL_ENCODING, "")
+    return hashlib.sha256(f"{message_encoding}:{schema or ''}".encode()).hexdigest()
+
+
+def table_schema_of(channel: Channel) -> str:
+    """The same of a channel itself."""
+    schema = schema_hash(channel.schema) if channel.schema is not None else None
+    return table_schema(channel.message_encoding, schema, channel.metadata)
+
+
+def topic_file(schema: str, segment: int, part: int = 0) -> str:
+    """Name of a file of one topic.
+
+    Args:
+        schema: See `table_schema`.
+        segment: The last one with messages in it.
+        part: How many such files there are already: columns of one file have one type.
+    """
+    return f"{schema[:8]}-{segment:06d}{f'-{part}' if part else ''}{SUFFIX}"
+
+
+def small_file(type_name: str, schema: str) -> str:
+    """Name of a file of several topics of one type."""
+    return f"{_ODD.sub('_', type_name)[:100] or 'untyped'}~{schema[:8]}{SUFFIX}"
+
+
+def column_names(
+    names: Iterable[str], reserved: Collection[str] = _RESERVED
+) -> Iterator[tuple[str, str]]:
+    """Fields of a message, and the column that each gets.
+
+    A field with a name of ours gets `_` behind it, one that differs from an earlier one only
+    in case a number: DuckDB takes such names for the same.
+
+    Args:
+        names: Names of the fields, in order.
+        reserved: Names that are taken; none inside of a nested message.
+    """
+    names = list(names)
+    taken = {name.casefold() for name in reserved}
+    lower = [name.casefold() for name in names]
+    for place, name in enumerate(names):
+        column, number = name, 2
+        if name.casefold() in taken:
+            is_ours = name.casefold() in reserved
+            column = f"{name}_" if is_ours else f"{name}_{number}"
+            while column.casefold() in taken or column.casefold() in lower[place + 1 :]:
+                column, number = f"{name}_{number}", number + 1
+        taken.add(column.casefold())
+        yield name, column
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a file of tables says of itself.
+
+    Attributes:
+        recording: Id of the recording.
+        schema: See `table_schema`.
+        type: Name of the type of the messages, or empty.
+        segments: Digest of each segment that has rows in it, by its number as text.
+        topics: Rows of each topic, in the order of the file.
+        bounds: Of each row group: its rows; where the file has one topic, log time and arrival
+            number of the first row, the least, and the same of the last one, else zeros.
+        unreadable: Rows without fields, because their messages do not fit their definition.
+        reduced: Rows without fields, because their messages were reduced under pressure.
+        body: Bytes before the footer.
+        checksums: CRC-32 of each block of these, 8 hexadecimal digits each.
+        version: Of the writer.
+    """
+
+    recording: str
+    schema: str
+    type: str
+    segments: Mapping[str, str]
+    topics: Mapping[str, int]
+    bounds: tuple[tuple[int, int, int, int, int], ...]
+    unreadable: int = 0
+    reduced: int = 0
+    body: int = 0
+    checksums: str = field(default="", repr=False)
+    version: int = VERSION
+
+    @property
+    def rows(self) -> int:
+        """Rows of all topics."""
+        return sum(self.topics.values())
+
+    def to_json(self) -> str:
+        """As text."""
+        return json.dumps(asdict(self), separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, text: bytes) -> About:
+        """From such a text.
+
+        Raises:
+            StoreError: It is none, or of another version.
+        """
+        try:
+            values: dict[str, Any] = json.loads(text)
+            if values["version"] != VERSION:
+                raise StoreError("the table is of another version")
+            values["bounds"] = tuple(tuple(map(int, bound)) for bound in values["bounds"])
+            about = cls(**values)
+            is_sound = (
+                all(len(bound) == 5 for bound in about.bounds)
+                and sum(bound[0] for bound in about.bounds) == about.rows
+            )
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise StoreError("the description of the table cannot be read") from error
+        if not is_sound:
+            raise StoreError("the description of the table contradicts itself")
+        return about

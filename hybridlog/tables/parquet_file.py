@@ -1,0 +1,434 @@
+"""Parquet files whose every byte has a checksum.
+
+Parquet checks pages at most, neither their heads nor the footer. So blocks of the body have
+checksums in the footer, and the footer holds a checksum of itself. Other readers ignore both.
+
+Files are read with `pread`: a mapped file that is cut would kill the process.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hybridlog.tables.layout import ABOUT, IN_TOPIC, About
+from hybridlog_storage import durability, files
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
+
+BLOCK: Final = 32 << 10
+"""Bytes of the body that share a checksum."""
+_WRITTEN: Final = 1 << 20  # bytes that are collected before they are written
+_TAIL: Final = 8  # bytes: length of the footer, `PAR1`
+_MAX_FOOTER: Final = 256 << 20
+_SAMPLE: Final = 256  # values of a column that show whether a dictionary is worth it
+_RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
+_SEAL: Final = re.compile(rb"hybridlog-footer:([0-9a-f]{8})")
+_BLANK: Final = b"hybridlog-footer:00000000"
+_SEALED_BY: Final = "hybridlog.footer"
+_NUMBERS: Final = count()
+
+
+class ParquetFileWriter:
+    """Writes one file of a table.
+
+    Args:
+        path: The file, in the folder of a recording's unfinished tables.
+        sample: Rows that stand for all: its schema is the file's.
+        depth: Parts of the path that lie inside the store.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+
+    def __init__(self, path: Path, sample: pa.Table, *, depth: int) -> None:
+        self.path = path
+        self._depth = depth
+        self._sink = _Sink(path, depth)
+        leaves = list(_leaves(sample.schema))
+        running = [leaf for leaf, kind in leaves if _runs(leaf, kind)]
+        try:
+            self._writer = pq.ParquetWriter(
+                pa.PythonFile(self._sink, mode="w"),
+                sample.schema,
+                compression="zstd",
+                compression_level=1,
+                use_dictionary=[
+                    leaf
+                    for leaf, array in _leaf_values(sample)
+                    if leaf not in running and _repeats(array)
+                ],
+                column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
+                # DuckDB answers wrongly from statistics of floats with NaN among them.
+                write_statistics=[leaf for leaf, kind in leaves if not pa.types.is_floating(kind)],
+            )
+        except BaseException:
+            self.discard()
+            raise
+
+    def write(self, table: pa.Table) -> None:
+        """Write a row group.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
+
+    def close(self, about: About) -> None:
+        """Finish the file.
+
+        Args:
+            about: What it says of itself, all but `body` and `checksums`.
+
+        Raises:
+            OSError: It cannot be written.
+            StoreError: Something in it looks like the checksum of a footer.
+        """
+        try:
+            body, checksums = self._sink.end_body()
+            about = replace(about, body=body, checksums=checksums)
+            self._writer.add_key_value_metadata(
+                {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
+            )
+            self._writer.close()
+            self._sink.finish()
+        except BaseException:
+            self.discard()
+            raise
+
+    def discard(self) -> None:
+        """Leave nothing of it."""
+        self._sink.abandon()
+        with suppress(OSError):
+            files.unlink(self.path, depth=self._depth)
+
+
+class _Sink:
+    """Where Parquet's bytes go: the body to the disk, the footer to memory until it is sealed."""
+
+    def __init__(self, path: Path, depth: int) -> None:
+        self.closed = False
+        self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, depth=depth)
+        self._waiting = bytearray()
+        self._position = 0
+        self._checksums: list[str] = []
+        self._rest = bytearray()  # of the body, less than a block
+        self._footer: bytearray | None = None
+
+    def write(self, data: Buffer) -> int:
+        """Take bytes."""
+        data = memoryview(data).cast("B")
+        self._position += len(data)
+        if self._footer is not None:
+            self._footer += data
+            return len(data)
+        self._rest += data
+        whole = len(self._rest) // BLOCK * BLOCK
+        if whole:
+            view = memoryview(self._rest)
+            self._checksums += [_checksum(view[at : at + BLOCK]) for at in range(0, whole, BLOCK)]
+            view.release()
+            del self._rest[:whole]
+        self._waiting += data
+        if len(self._waiting) >= _WRITTEN:
+            self._flush()
+        return len(data)
+
+    def end_body(self) -> tuple[int, str]:
+        """What is written from here on is the footer; returns size and checksums of the body."""
+        if self._rest:
+            self._checksums.append(_checksum(self._rest))
+        self._footer = bytearray()
+        return self._position, "".join(self._checksums)
+
+    def finish(self) -> None:
+        """Seal the footer, and write what is left."""
+        assert self._footer is not None
+        marks = [found.start(1) for found in _SEAL.finditer(self._footer)]
+        if len(marks) != 1:
+            raise StoreError("the table holds text that looks like the checksum of its footer")
+        at = marks[0]
+        self._footer[at : at + 8] = _checksum(self._footer).encode()
+        self._waiting += self._footer
+        self._flush()
+        os.close(self._fd)
+        self._fd = -1
+
+    def abandon(self) -> None:
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+
+    def _flush(self) -> None:
+        durability.write_all(self._fd, [bytes(self._waiting)])
+        self._waiting.clear()
+
+    def flush(self) -> None:
+        """Nothing: what waits is written in larger pieces."""
+
+    def tell(self) -> int:
+        return self._position
+
+    def close(self) -> None:
+        """Nothing: the footer follows."""
+
+
+class ParquetFileReader:
+    """Reads one file of a table. Thread safe.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileNotFoundError: There is none.
+        StoreError: It cannot be read, or is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.number = next(_NUMBERS)
+        """Differs from that of any other reader."""
+        self._lock = threading.Lock()
+        self._fd = -1
+        try:
+            self._fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=IN_TOPIC)
+            self._source = _Source(self._fd)
+            metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
+            self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
+            self._source.trust(self.about)
+            self._parquet = pq.ParquetFile(
+                pa.PythonFile(self._source, mode="r"),
+                metadata=metadata,
+                pre_buffer=False,
+                buffer_size=0,
+            )
+            self.schema: pa.Schema = self._parquet.schema_arrow
+            groups = [metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)]
+            if groups != [bound[0] for bound in self.about.bounds]:
+                raise StoreError("its row groups are not those that it describes")
+        except FileNotFoundError:
+            raise
+        except (OSError, StoreError, pa.ArrowException, KeyError) as error:
+            raise self._damaged(error) from error
+
+    def __del__(self) -> None:
+        if self._fd >= 0:
+            os.close(self._fd)
+
+    @property
+    def groups(self) -> int:
+        """Number of row groups."""
+        return len(self.about.bounds)
+
+    def size(self, group: int, leaves: Sequence[int]) -> int:
+        """Bytes of some columns of a row group, as they are stored."""
+        found = self._parquet.metadata.row_group(group)
+        return sum(found.column(leaf).total_compressed_size for leaf in leaves)
+
+    def read(self, group: int, leaves: Sequence[int]) -> pa.Table:
+        """Some columns of a row group.
+
+        Args:
+            group: Its number.
+            leaves: Numbers of columns as Parquet counts them: single values, depth first.
+
+        Raises:
+            StoreError: They are damaged.
+        """
+        try:
+            with self._lock:
+                reader: Any = self._parquet.reader
+                table: pa.Table = reader.read_row_group(
+                    group, column_indices=list(leaves), use_threads=False
+                )
+        except (OSError, StoreError, pa.ArrowException, ValueError) as error:
+            raise self._damaged(error) from error
+        if table.num_rows != self.about.bounds[group][0]:
+            raise self._damaged(StoreError("a row group has another number of rows"))
+        return table
+
+    def check(self) -> None:
+        """Read every byte, and every value.
+
+        Raises:
+            StoreError: Something is damaged.
+        """
+        leaves = range(len(list(_leaves(self.schema))))
+        try:
+            self._source.check()
+        except (OSError, StoreError) as error:
+            raise self._damaged(error) from error
+        for group in range(self.groups):
+            self.read(group, leaves)
+
+    def _damaged(self, error: Exception) -> StoreError:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        return StoreError(f"The table {self.path} is damaged: {reason}.")
+
+
+class _Source:
+    """Where Parquet's bytes come from: each is held against its checksum first."""
+
+    def __init__(self, fd: int) -> None:
+        self.closed = False
+        self._fd = fd
+        self._position = 0
+        self._size = os.fstat(fd).st_size
+        self._checksums: list[bytes] = []
+        tail = self._raw(self._size - _TAIL, _TAIL) if self._size > 2 * _TAIL else b""
+        length = int.from_bytes(tail[:4], "little") + _TAIL
+        if tail[4:] != b"PAR1" or length > min(self._size - 4, _MAX_FOOTER):
+            raise StoreError("its end is missing")
+        self._body = self._size - length
+        self.footer = self._raw(self._body, length)
+        found = list(_SEAL.finditer(self.footer))
+        if len(found) != 1:
+            raise StoreError("its footer has no checksum")
+        begin, end = found[0].span(1)
+        blank = self.footer[:begin] + b"0" * 8 + self.footer[end:]
+        if _checksum(blank).encode() != found[0][1]:
+            raise StoreError("the checksum of its footer differs")
+
+    def trust(self, about: About) -> None:
+        """Read the body from now on."""
+        if about.body != self._body or len(about.checksums) != -(-about.body // BLOCK) * 8:
+            raise StoreError("its body has another size than its footer says")
+        text = about.checksums.encode()
+        self._checksums = [text[at : at + 8] for at in range(0, len(text), 8)]
+
+    def check(self) -> None:
+        """Read the whole body."""
+        for at in range(0, self._body, 64 * BLOCK):
+            self._checked(at, min(at + 64 * BLOCK, self._body))
+
+    def read(self, size: int = -1) -> bytes:
+        """Read at the position."""
+        begin = self._position
+        end = self._size if size < 0 else min(begin + size, self._size)
+        self._position = max(begin, end)
+        if begin >= self._body:
+            return self.footer[begin - self._body : end - self._body]
+        if end <= self._body:
+            return self._checked(begin, end)
+        return self._checked(begin, self._body) + self.footer[: end - self._body]
+
+    def _checked(self, begin: int, end: int) -> bytes:
+        first, last = begin // BLOCK, -(-end // BLOCK)
+        start = first * BLOCK
+        data = self._raw(start, min(last * BLOCK, self._body) - start)
+        view = memoryview(data)
+        for number in range(first, last):
+            at = number * BLOCK - start
+            block = view[at : at + BLOCK]
+            if _checksum(block).encode() != self._checksums[number]:
+                raise StoreError(f"the checksum of the block at byte {number * BLOCK} differs")
+        return data[begin - start : end - start]
+
+    def _raw(self, offset: int, size: int) -> bytes:
+        data = os.pread(self._fd, size, offset)
+        if len(data) != size:
+            raise StoreError("it was cut")
+        return data
+
+    def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        self._position = base + position
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        """Nothing: the file stays open as long as its reader."""
+
+
+def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]]:
+    """Columns as Parquet counts them: the names on the way to each, lists left out."""
+    for top in schema:
+        for names, _, kind in _walk(top):
+            yield names, kind
+
+
+def _leaves(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
+    """The same by their dotted paths in the file."""
+    for top in schema:
+        for _, path, kind in _walk(top):
+            yield path, kind
+
+
+def _walk(top: pa.Field) -> Iterator[tuple[tuple[str, ...], str, pa.DataType]]:
+    kind = top.type
+    if pa.types.is_struct(kind):
+        for number in range(kind.num_fields):
+            for names, path, leaf in _walk(kind.field(number)):
+                yield (top.name, *names), f"{top.name}.{path}", leaf
+    elif _is_list(kind):
+        for names, path, leaf in _walk(kind.value_field.with_name("element")):
+            rest = path.removeprefix("element")
+            yield (top.name, *names[1:]), f"{top.name}.list.element{rest}", leaf
+    else:
+        yield (top.name,), top.name, kind
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    kinds = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    return any(is_kind(kind) for is_kind in kinds)
+
+
+def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
+    """The first values of each column as Parquet counts them."""
+    for top, column in zip(table.schema, table.columns, strict=True):
+        head = column.slice(0, _SAMPLE)
+        array = head.combine_chunks()
+        if isinstance(array, pa.ChunkedArray):
+            array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, top.type)
+        yield from _inner_values(top.name, array)
+
+
+def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Array[Any]]]:
+    if pa.types.is_struct(array.type):
+        for number in range(array.type.num_fields):
+            inner = array.type.field(number)
+            yield from _inner_values(f"{path}.{inner.name}", array.field(number))
+    elif _is_list(array.type):
+        yield from _inner_values(f"{path}.list.element", array.flatten())
+    else:
+        yield path, array
+
+
+def _repeats(array: pa.Array[Any]) -> bool:
+    """Whether a dictionary is worth it: half of the first values occur again."""
+    if pa.types.is_boolean(array.type):
+        return False
+    some = array.slice(0, 4 * _SAMPLE)
+    return bool(2 * len(some.unique()) <= max(len(some), 2))
+
+
+def _runs(path: str, kind: pa.DataType) -> bool:
+    """Whether neighbours differ by little: times and numbers that run."""
+    if path in _RUNNING or pa.types.is_timestamp(kind):
+        return True
+    return path.endswith(".seq") and bool(pa.types.is_integer(kind))
+
+
+def _checksum(data: Buffer) -> str:
+    return f"{crc32(data):08x}"

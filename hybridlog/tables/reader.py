@@ -1,0 +1,584 @@
+"""Reads tables of topics, as long as the catalog confirms them.
+
+A table is believed if its files are of this recording, topic and type, every segment with
+rows in it has the digest that the catalog knows, and it has as many rows as the catalog has
+messages of the topic. Every byte that is read is held against a checksum. Whatever is not
+so is no table, and other ways answer.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.schema.column import ranges
+from hybridlog.tables.fields import UnfitError, alike, original_name, records_of
+from hybridlog.tables.layout import (
+    IN_TOPIC,
+    ORIGINAL,
+    OWN_COLUMNS,
+    SMALL,
+    SUFFIX,
+    TOPIC_COLUMN,
+    recording_folder,
+    small_file,
+    table_schema,
+    topic_folder,
+)
+from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
+from hybridlog_storage import files
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.intervals import Span
+    from hybridlog_storage.catalog import RecordingEntry
+
+MAX_BYTES: Final = 64 << 20
+"""Most memory that decoded columns take."""
+_OPEN_FILES: Final = 256
+_TYPES: Final = 64  # of which a table remembers what they are
+_OWN: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN})
+_FIRST, _LAST = (-(1 << 63), -(1 << 63)), ((1 << 63) - 1, (1 << 63) - 1)
+
+_Key = tuple[int, int]
+"""Log time and arrival number: the order of messages."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableRows:
+    """Some messages of a topic, in order.
+
+    Attributes:
+        t: int64[n], log times, ns.
+        seq: int64[n], arrival numbers.
+        own: Columns of the table itself, by name: `pub`, `stamp`, `channel`, `state`,
+            `error`, `ref`.
+        records: Fields of the messages, a struct each, under their own names. Arrays over the
+            limit are `{n, min, max, mean}`.
+    """
+
+    t: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    own: Mapping[str, Any]
+    records: Any
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.t)
+
+    def take(self, rows: NDArray[np.intp]) -> TableRows:
+        """The chosen rows, in the order chosen."""
+        places = pa.array(rows)
+        own = {name: column.take(places) for name, column in self.own.items()}
+        return TableRows(self.t[rows], self.seq[rows], own, self.records.take(places))
+
+    def slice(self, begin: int, end: int) -> TableRows:
+        """Rows from one place to another."""
+        if begin == 0 and end == len(self):
+            return self
+        own = {name: column.slice(begin, end - begin) for name, column in self.own.items()}
+        records = self.records.slice(begin, end - begin)
+        return TableRows(self.t[begin:end], self.seq[begin:end], own, records)
+
+    def behind(self, key: _Key) -> int:
+        """Place of the first row that comes after a time and arrival number."""
+        first, end = (int(np.searchsorted(self.t, key[0], side)) for side in _SIDES)
+        return first + int(np.searchsorted(self.seq[first:end], key[1], "right"))
+
+
+_SIDES: Final[tuple[Any, Any]] = ("left", "right")
+
+
+class _Part(NamedTuple):
+    """Rows of one topic in a row group, in order.
+
+    Attributes:
+        file: The file.
+        group: Number of the row group.
+        begin: First row of the topic in it.
+        rows: Number of its rows.
+        first: Key of the first row, or less.
+        last: Key of the last row, or more.
+    """
+
+    file: ParquetFileReader
+    group: int
+    begin: int
+    rows: int
+    first: _Key
+    last: _Key
+
+
+class _Leaf(NamedTuple):
+    """A column as Parquet counts them.
+
+    Attributes:
+        top: Name of the table's column that it is in.
+        is_own: Whether that is one of ours, not a field's.
+        names: Names of the fields on the way to it.
+    """
+
+    top: str
+    is_own: bool
+    names: tuple[str, ...]
+
+
+class TopicTable:
+    """All messages of a topic in a recording.
+
+    Args:
+        topic: Full name.
+        parts: Its rows.
+        cache: Of decoded columns.
+
+    Attributes:
+        topic: Full name.
+        rows: Number of messages.
+        unreadable: Messages without fields, because they do not fit their definition.
+        reduced: Messages without fields, because they were reduced under pressure.
+        files: The files it is in.
+    """
+
+    def __init__(self, topic: str, parts: Sequence[_Part], cache: _Cache) -> None:
+        self.topic = topic
+        self.rows = sum(part.rows for part in parts)
+        self.files = list({part.file.number: part.file for part in parts}.values())
+        self.unreadable = sum(file.about.unreadable for file in self.files)
+        self.reduced = sum(file.about.reduced for file in self.files)
+        self._cache = cache
+        self._runs = list(_runs(parts))
+        self._leaves = {file.number: list(_leaves(file.schema)) for file in self.files}
+        self._types: dict[frozenset[str] | None, Any] = {}
+
+    def fields(self, paths: Collection[str] | None = None) -> Any:
+        """Type of `TableRows.records`.
+
+        Args:
+            paths: Dotted paths of fields, brackets left out or empty; None for all.
+
+        Raises:
+            UnfitError: The files have no common type.
+        """
+        return self.empty(paths).type
+
+    def has(self, path: str) -> bool:
+        """Whether there is a field."""
+        names = _names(path)
+        return any(
+            not leaf.is_own and leaf.names[: len(names)] == names
+            for leaves in self._leaves.values()
+            for leaf in leaves
+        )
+
+    def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:
+        """Bytes to be read for some fields, as they are stored.
+
+        Args:
+            paths: As for `fields`.
+            own: Columns of the table itself.
+        """
+        own = {"t", "seq", *own}
+        return sum(
+            part.file.size(part.group, self._chosen(part.file, paths, own))
+            for run in self._runs
+            for part in run
+        )
+
+    def scan(
+        self,
+        paths: Collection[str] | None = (),
+        *,
+        own: Collection[str] = (),
+        spans: Sequence[Span] | None = None,
+    ) -> Iterator[TableRows]:
+        """Messages by log time and arrival, a row group at a time.
+
+        Args:
+            paths: Dotted paths of fields, each with all below it; None for all.
+            own: Columns of the table itself besides log time and arrival number.
+            spans: Ranges of log time, ns, apart and in order; None for all times.
+
+        Raises:
+            StoreError: What is read is damaged.
+        """
+        kind = self.empty(paths)
+        streams = [self._read_run(run, paths, own, spans, kind) for run in self._runs]
+        return streams[0] if len(streams) == 1 else _merged(streams)
+
+    def _read_run(
+        self,
+        run: Sequence[_Part],
+        paths: Collection[str] | None,
+        own: Collection[str],
+        spans: Sequence[Span] | None,
+        kind: Any,
+    ) -> Iterator[TableRows]:
+        for part in run:
+            if spans is None:
+                yield self._read(part, paths, own, kind)
+                continue
+            low, high = part.first[0], part.last[0]
+            near = [span for span in spans if span[0] <= high and span[1] > low]
+            if not near:
+                continue
+            rows = self._read(part, paths, own, kind)
+            bounds = np.searchsorted(rows.t, np.array(near, np.int64).reshape(-1, 2))
+            begins, counts = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
+            if len(near) == 1:
+                rows = rows.slice(int(bounds[0, 0]), int(bounds[0, 1]))
+            else:
+                rows = rows.take(ranges(begins, counts))
+            if len(rows):
+                yield rows
+
+    def _read(
+        self, part: _Part, paths: Collection[str] | None, own: Collection[str], kind: Any
+    ) -> TableRows:
+        wanted = {"t", "seq", *own}
+        leaves = self._leaves[part.file.number]
+        by_top: dict[str, list[int]] = {}
+        for number in self._chosen(part.file, paths, wanted):
+            by_top.setdefault(leaves[number].top, []).append(number)
+        columns = {
+            top: self._cache.get(part.file, part.group, top, tuple(numbers)).slice(
+                part.begin, part.rows
+            )
+            for top, numbers in by_top.items()
+        }
+        ours = {name: columns.pop(name) for name in wanted if name in columns}
+        t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
+        named = [part.file.schema.field(top) for top in columns]
+        records = _records(list(columns.values()), named, part.rows)
+        return TableRows(t, seq, ours, alike([kind, records])[1])
+
+    def _chosen(
+        self, file: ParquetFileReader, paths: Collection[str] | None, own: Collection[str]
+    ) -> list[int]:
+        """Numbers of the columns that hold these."""
+        wanted = None if paths is None else list(map(_names, paths))
+        return [
+            number
+            for number, leaf in enumerate(self._leaves[file.number])
+            if (leaf.top in own if leaf.is_own else _is_wanted(leaf.names, wanted))
+        ]
+
+    def empty(self, paths: Collection[str] | None) -> Any:
+        """No rows, of the type that the rows of all files have in common.
+
+        Raises:
+            UnfitError: They have none.
+        """
+        key = None if paths is None else frozenset(paths)
+        if key not in self._types:
+            if len(self._types) >= _TYPES:
+                self._types.clear()
+            self._types[key] = self._find_type(paths)
+        return self._types[key]
+
+    def _find_type(self, paths: Collection[str] | None) -> Any:
+        found = []
+        for file in self.files:
+            leaves = self._leaves[file.number]
+            chosen = {leaves[number] for number in self._chosen(file, paths, ())}
+            tops = list(dict.fromkeys(leaf.top for leaf in leaves if leaf in chosen))
+            fields = [_only(file.schema.field(top), chosen, (), top) for top in tops]
+            kept = [field for field in fields if field is not None]
+            columns = [pa.nulls(0, field.type) for field in kept]
+            found.append(_records(columns, kept, 0))
+        first = alike(found)[0]
+        return first.slice(0, 0)
+
+
+class _Cache:
+    """Decoded columns, those that were used last. Thread safe."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes = most_bytes
+        self._columns: OrderedDict[tuple[int, int, str, tuple[int, ...]], Any] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+
+    def get(self, file: ParquetFileReader, group: int, top: str, leaves: tuple[int, ...]) -> Any:
+        """A column of a row group, or the parts of it that are wanted."""
+        key = file.number, group, top, leaves
+        with self._lock:
+            if key in self._columns:
+                self._columns.move_to_end(key)
+                return self._columns[key]
+        column = file.read(group, leaves).column(0).combine_chunks()
+        if isinstance(column, pa.ChunkedArray):
+            column = pa.concat_arrays(column.chunks)
+        with self._lock:
+            if key not in self._columns and column.nbytes <= self.most_bytes:
+                self._columns[key] = column
+                self._size += column.nbytes
+                while self._size > self.most_bytes:
+                    self._size -= self._columns.popitem(last=False)[1].nbytes
+        return column
+
+    def clear(self) -> None:
+        with self._lock:
+            self._columns.clear()
+            self._size = 0
+
+
+class Tables:
+    """The tables of a store. Thread safe.
+
+    Args:
+        root: The store.
+        most_bytes: Most memory that decoded columns take.
+    """
+
+    def __init__(self, root: Path, *, most_bytes: int = MAX_BYTES) -> None:
+        self._root = root
+        self._cache = _Cache(most_bytes)
+        self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
+        self._small: OrderedDict[Path, ParquetFileReader] = OrderedDict()
+        self._generation = 0
+        self._lock = threading.Lock()
+
+    def invalidate(self) -> None:
+        """Forget everything: files, columns, and what is no table."""
+        with self._lock:
+            self._generation += 1
+            self._found.clear()
+            self._small.clear()
+        self._cache.clear()
+
+    def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
+        """The table of a topic in a recording; None without one that the catalog confirms.
+
+        Args:
+            recording: As the catalog has it.
+            topic: Full name.
+        """
+        key = recording.id, topic
+        with self._lock:
+            generation = self._generation
+            if key in self._found:
+                self._found.move_to_end(key)
+                return self._found[key]
+        found = None
+        with suppress(FileNotFoundError, StoreError):
+            found = self.check(recording, topic)
+        self._remember(key, found, generation)
+        return found
+
+    def reject(self, recording: RecordingEntry, topic: str) -> None:
+        """A table was found to be damaged when it was read: there is none from now on."""
+        self._remember((recording.id, topic), None, self._generation)
+
+    def _remember(self, key: tuple[str, str], found: TopicTable | None, generation: int) -> None:
+        with self._lock:
+            if generation == self._generation:
+                self._found[key] = found
+                while len(self._found) > _OPEN_FILES:
+                    self._found.popitem(last=False)
+
+    def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
+        """The table of a topic in a recording.
+
+        Raises:
+            FileNotFoundError: There is none.
+            StoreError: There is one that is damaged, or that the catalog does not confirm.
+        """
+        if recording.status == "open":
+            raise FileNotFoundError
+        schemas = {
+            table_schema(c.message_encoding, c.schema, c.metadata): c.type
+            for c in recording.channels
+            if c.topic == topic and c.stats.messages
+        }
+        if len(schemas) != 1:
+            raise FileNotFoundError
+        ((schema, type_name),) = schemas.items()
+        folder = recording_folder(self._root, recording.id)
+        parts = list(self._own_parts(folder / topic_folder(topic)))
+        if not parts:
+            parts = list(self._small_parts(folder / SMALL / small_file(type_name, schema), topic))
+        if not parts:
+            raise FileNotFoundError
+        table = TopicTable(topic, parts, self._cache)
+        for file in table.files:
+            _confirm(file, recording, topic, schema)
+        if table.rows != recording.messages_of(topic):
+            raise StoreError(
+                f"The tables of {topic} have {table.rows} messages, the segments "
+                f"{recording.messages_of(topic)}."
+            )
+        try:
+            table.fields()
+        except UnfitError as error:
+            raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
+        return table
+
+    def _own_parts(self, folder: Path) -> Iterator[_Part]:
+        """Row groups of the files of one topic."""
+        try:
+            found = files.names(folder, depth=IN_TOPIC - 1)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise StoreError(f"The tables in {folder} cannot be read: {error}.") from error
+        for name in sorted(found):
+            if not name.endswith(SUFFIX):
+                continue
+            file = ParquetFileReader(folder / name)
+            for group, (rows, *keys) in enumerate(file.about.bounds):
+                first, last = (keys[0], keys[1]), (keys[2], keys[3])
+                yield _Part(file, group, 0, rows, first, last)
+
+    def _small_parts(self, path: Path, topic: str) -> Iterator[_Part]:
+        """Rows of a topic in a file of several."""
+        file = self._small_file(path)
+        begin = 0
+        for name, rows in file.about.topics.items():
+            if name == topic:
+                break
+            begin += rows
+        else:
+            return
+        end, before = begin + rows, 0
+        for group, (count, *_) in enumerate(file.about.bounds):
+            low, high = max(begin, before), min(end, before + count)
+            if low < high:
+                yield _Part(file, group, low - before, high - low, _FIRST, _LAST)
+            before += count
+
+    def _small_file(self, path: Path) -> ParquetFileReader:
+        with self._lock:
+            if path in self._small:
+                return self._small[path]
+        file = ParquetFileReader(path)
+        with self._lock:
+            self._small[path] = file
+            while len(self._small) > _OPEN_FILES:
+                self._small.popitem(last=False)
+        return file
+
+
+def _confirm(file: ParquetFileReader, recording: RecordingEntry, topic: str, schema: str) -> None:
+    """Hold what a file says of itself against the catalog.
+
+    Raises:
+        StoreError: They differ.
+    """
+    about = file.about
+    if about.recording != recording.id or topic not in about.topics or about.schema != schema:
+        raise StoreError(f"The table {file.path} is of something else.")
+    if not about.segments.items() <= recording.digests.items():
+        raise StoreError(f"The table {file.path} is of segments that are not there any more.")
+
+
+def _runs(parts: Sequence[_Part]) -> Iterator[list[_Part]]:
+    """Row groups in as few sequences as possible, each of which is in order."""
+    if all(part.first == _FIRST for part in parts):
+        yield list(parts)  # of a file in which the topic's rows are in order
+        return
+    runs: list[list[_Part]] = []
+    for part in sorted(parts, key=lambda part: part.first):
+        for run in runs:
+            if run[-1].last < part.first:
+                run.append(part)
+                break
+        else:
+            runs.append([part])
+    yield from runs
+
+
+def _merged(streams: Sequence[Iterator[TableRows]]) -> Iterator[TableRows]:
+    """Rows of several sequences, each of which is in order, in order."""
+    heads: list[tuple[TableRows, Iterator[TableRows]]] = []
+    for stream in streams:
+        head = next(stream, None)
+        if head is not None:
+            heads.append((head, stream))
+    while heads:
+        key = min((int(rows.t[-1]), int(rows.seq[-1])) for rows, _ in heads)
+        ready, left = [], []
+        for rows, stream in heads:
+            end = rows.behind(key)
+            if end:
+                ready.append(rows.slice(0, end))
+            rest = rows.slice(end, len(rows)) if end < len(rows) else next(stream, None)
+            if rest is not None:
+                left.append((rest, stream))
+        heads = left
+        yield _in_order(ready)
+
+
+def _in_order(parts: Sequence[TableRows]) -> TableRows:
+    if len(parts) == 1:
+        return parts[0]
+    own = {name: pa.concat_arrays([part.own[name] for part in parts]) for name in parts[0].own}
+    t, seq = np.concatenate([p.t for p in parts]), np.concatenate([p.seq for p in parts])
+    rows = TableRows(t, seq, own, pa.concat_arrays([part.records for part in parts]))
+    return rows.take(np.lexsort((seq, t)))
+
+
+def _leaves(schema: Any) -> Iterator[_Leaf]:
+    for top in schema:
+        is_own = top.name in _OWN
+        for names, _ in leaves_of(pa.schema([_renamed(top)])):
+            yield _Leaf(top.name, is_own, names)
+
+
+def _renamed(field: Any) -> Any:
+    """A column under the name of its field, and so are all inside it."""
+    kind = field.type
+    if pa.types.is_struct(kind):
+        kind = pa.struct([_renamed(kind.field(number)) for number in range(kind.num_fields)])
+    elif pa.types.is_list(kind) or pa.types.is_large_list(kind):
+        kind = pa.list_(_renamed(kind.value_field))
+    elif pa.types.is_fixed_size_list(kind):
+        kind = pa.list_(_renamed(kind.value_field), kind.list_size)
+    return pa.field(original_name(field), kind)
+
+
+def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: str) -> Any | None:
+    """A column with those parts alone that are chosen; None without any."""
+    names = (*above, original_name(field))
+    kind = field.type
+    if pa.types.is_struct(kind):
+        inner = [_only(kind.field(n), chosen, names, top) for n in range(kind.num_fields)]
+        kept = [part for part in inner if part is not None]
+        return field.with_type(pa.struct(kept)) if kept else None
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        # The elements have no name of their own.
+        element = kind.value_field.with_metadata({ORIGINAL: names[-1]})
+        value = _only(element, chosen, above, top)
+        if value is None:
+            return None
+        value = kind.value_field.with_type(value.type)
+        if pa.types.is_fixed_size_list(kind):
+            return field.with_type(pa.list_(value, kind.list_size))
+        large = pa.types.is_large_list(kind)
+        return field.with_type(pa.large_list(value) if large else pa.list_(value))
+    return field if _Leaf(top, False, names) in chosen else None
+
+
+def _records(columns: list[Any], named: Sequence[Any], rows: int) -> Any:
+    """Columns as fields of messages, under their own names."""
+    if not columns:
+        return pa.array([{}] * rows, pa.struct([]))
+    fields = [field.with_type(column.type) for field, column in zip(named, columns, strict=True)]
+    return records_of(pa.StructArray.from_arrays(columns, fields=fields))
+
+
+def _names(path: str) -> tuple[str, ...]:
+    return tuple(path.replace("[]", "").split("."))
+
+
+def _is_wanted(names: tuple[str, ...], wanted: Sequence[tuple[str, ...]] | None) -> bool:
+    return wanted is None or any(names[: len(path)] == path for path in wanted)

@@ -1,0 +1,830 @@
+"""Writes the tables of a recording while it is indexed.
+
+Payloads of small messages are put together and decoded by columns, 8 MiB at a time. Rows
+wait in memory until their segment is sealed, or there are too many of them: then they
+become row groups of an unfinished file. A file gets its name once the segment is sealed and
+all of its messages are in.
+
+Tables are derived. Whatever fails, the recording goes on, and a topic has no table.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from hybridlog.indexing import rows_by_channel
+from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.tables.layout import (
+    IN_TOPIC,
+    OWN_FILE_ROWS,
+    SMALL,
+    STATES,
+    SUFFIX,
+    TOPIC_COLUMN,
+    About,
+    parts_folder,
+    recording_folder,
+    small_file,
+    table_schema_of,
+    topic_file,
+    topic_folder,
+)
+from hybridlog_storage import files
+from hybridlog_storage.buffers import buffers
+from hybridlog_storage.messages import REDUCED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.tables.fields import FieldShape
+    from hybridlog.tables.parquet_file import ParquetFileWriter
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.messages import Channel
+
+GROUP_ROWS: Final = 131_072
+"""Most rows of a row group."""
+GROUP_BYTES: Final = 32 << 20
+"""Most bytes of its columns in memory."""
+_ARENA = 8 << 20  # bytes of payloads that are put together: each topic's part costs a millisecond
+_ENOUGH = 4 << 20  # a chunk of so many is decoded where it is
+_ROWS = 1 << 18  # messages that are put together
+_PENDING = 48 << 20  # bytes of rows that wait in memory
+_LEFT = _PENDING // 4  # of the smallest topics, which go on waiting until there is more of them
+_ROW = 64  # bytes that a row takes besides its fields
+_RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
+_OPEN_FILES = 128  # unfinished files at a time
+_WHOLE, _REDUCED, _UNREADABLE = 0, 1, 2  # places in `STATES`
+_READABLE: Final = frozenset({"ros1", "cdr"})
+_log = logging.getLogger(__name__)
+
+
+class _Messages(NamedTuple):
+    """Messages by columns: where their payloads lie in memory, and what the table says of them.
+
+    Attributes:
+        at: int64[n], where each payload starts in the buffer that holds it now.
+        length: int64[n], bytes of each payload.
+        channel: int32[n], ids of channels.
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers.
+        publish_time: int64[n], ns.
+        chunk: int32[n], number of the chunk in its segment.
+        offset: int64[n], where each payload starts in the chunk.
+    """
+
+    at: NDArray[np.int64]
+    length: NDArray[np.int64]
+    channel: NDArray[np.int32]
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    chunk: NDArray[np.int32]
+    offset: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, chunk: StoredChunk, begin: int) -> _Messages:
+        """Those of a chunk, of which the payloads are copied to a place `-begin` bytes on."""
+        batch = chunk.batch
+        number = np.full(len(batch), chunk.number, np.int32)
+        return cls(
+            batch.offset - begin,
+            batch.length.copy(),
+            batch.channel.copy(),
+            batch.log_time.copy(),
+            chunk.seq.copy(),
+            batch.publish_time.copy(),
+            number,
+            batch.offset.copy(),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Messages]) -> _Messages:
+        """Several, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def take(self, rows: NDArray[np.intp]) -> _Messages:
+        return _Messages._make(column[rows] for column in self)
+
+
+@dataclass(slots=True)
+class _Piece:
+    """Rows of a topic in one segment, in the order of the file.
+
+    Attributes:
+        segment: Number of the segment.
+        messages: The messages.
+        fields: Their columns, a struct each; None if there are none.
+        errors: Rows that are unreadable, and why.
+        state: Place of the state of all other rows in `STATES`.
+    """
+
+    segment: int
+    messages: _Messages
+    fields: Any
+    errors: list[tuple[NDArray[np.intp], str]] = field(default_factory=list)
+    state: int = _WHOLE
+
+    @property
+    def rows(self) -> int:
+        return len(self.messages.seq)
+
+    @property
+    def size(self) -> int:
+        """Bytes in memory."""
+        return self.rows * _ROW + (0 if self.fields is None else int(self.fields.nbytes))
+
+
+class _Topic:
+    """Messages of one topic and schema.
+
+    Args:
+        channel: One of its channels.
+        schema: See `table_schema`.
+    """
+
+    def __init__(self, channel: Channel, schema: str) -> None:
+        from hybridlog.tables.fields import FieldShape
+
+        self.name = channel.topic
+        self.schema = schema
+        self.type = channel.schema.name if channel.schema is not None else ""
+        self.shape: FieldShape = FieldShape()
+        self.is_wanted = True
+        self.rows = 0
+        self.pieces: list[_Piece] = []
+        """Rows in memory."""
+        self.size = 0
+        """Bytes of these."""
+        self.files: dict[int, list[_File]] = {}
+        """Unfinished files of segments that are not cut yet."""
+        self.finished: Counter[int] = Counter()
+        """Number of files that were finished, by the segments that they are named after."""
+        self.has_failed = False
+
+    def add(self, piece: _Piece) -> None:
+        self.pieces.append(piece)
+        self.rows += piece.rows
+        self.size += piece.size
+
+    def take(self, segments: Collection[int]) -> list[_Piece]:
+        """The rows in memory that are of some segments; they are not held any more."""
+        found = [piece for piece in self.pieces if piece.segment in segments]
+        self.pieces = [piece for piece in self.pieces if piece.segment not in segments]
+        self.size = sum(piece.size for piece in self.pieces)
+        return found
+
+    def give_up(self) -> None:
+        """Have no table of it."""
+        self.has_failed = self.is_wanted
+        self.is_wanted = False
+        self.pieces.clear()
+        self.size = 0
+        for unfinished in self.files.values():
+            for file in unfinished:
+                file.discard()
+        self.files.clear()
+
+
+class _File:
+    """An unfinished file of one topic, or of several of one type."""
+
+    def __init__(self, path: Path, has_publish_time: Mapping[int, bool]) -> None:
+        self.path = path
+        self.segments: set[int] = set()
+        self.topics: dict[str, int] = {}
+        self.bounds: list[tuple[int, int, int, int, int]] = []
+        self.unreadable = 0
+        self.reduced = 0
+        self._has_publish_time = has_publish_time
+        self._writer: ParquetFileWriter | None = None
+        self._schema: Any = None
+
+    def write(self, topic: str, pieces: list[_Piece]) -> None:
+        """Write rows of a topic, in order of log time and arrival, as row groups.
+
+        Raises:
+            OSError: They cannot be written.
+            UnfitError: Their fields have another type than those that are in the file.
+        """
+        table = self._table(topic, pieces)
+        if self._schema is not None and table.schema != self._schema:
+            table = self._fitting(table)
+        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
+        for begin, end in self._write(table):
+            first, last = ((int(time[row]), int(seq[row])) for row in (begin, end - 1))
+            self.bounds.append((end - begin, *first, *last))
+
+    def write_together(self, topics: Mapping[str, list[_Piece]]) -> None:
+        """Write the rows of several topics, one topic after the other.
+
+        Raises:
+            OSError: They cannot be written.
+            UnfitError: Their fields have no common type.
+        """
+        import pyarrow as pa
+
+        from hybridlog.tables.fields import alike
+
+        with_fields = [p for pieces in topics.values() for p in pieces if p.fields is not None]
+        for piece, fields in zip(with_fields, alike([p.fields for p in with_fields]), strict=True):
+            piece.fields = fields
+        kind = with_fields[0].fields.type if with_fields else None
+        tables = [
+            self._table(name, pieces, kind, with_topic=True) for name, pieces in topics.items()
+        ]
+        for begin, end in self._write(pa.concat_tables(tables)):
+            self.bounds.append((end - begin, 0, 0, 0, 0))
+
+    def _write(self, table: Any) -> Iterator[tuple[int, int]]:
+        """Write row groups; yields first rows, and those behind the last."""
+        from hybridlog.tables.parquet_file import ParquetFileWriter
+
+        if self._writer is None:
+            self._writer = ParquetFileWriter(self.path, table, depth=files.IN_RECORDING)
+            self._schema = table.schema
+        step = _rows_of_group(table)
+        for begin in range(0, table.num_rows, step):
+            end = min(begin + step, table.num_rows)
+            self._writer.write(table.slice(begin, end - begin))
+            yield begin, end
+
+    def _table(
+        self, topic: str, pieces: list[_Piece], kind: Any = None, *, with_topic: bool = False
+    ) -> Any:
+        """Rows of a topic in order.
+
+        Args:
+            topic: The topic.
+            pieces: Its rows.
+            kind: Type of their fields, if there is one; else that which they have in common.
+            with_topic: Whether the topic is a column.
+        """
+        import pyarrow as pa
+
+        from hybridlog.tables.fields import joined
+
+        self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
+        self.segments.update(piece.segment for piece in pieces)
+        for piece in pieces:
+            self.reduced += piece.rows if piece.state == _REDUCED else 0
+            self.unreadable += sum(len(rows) for rows, _ in piece.errors)
+        messages = _Messages.joined([piece.messages for piece in pieces])
+        segment = np.repeat(
+            np.array([piece.segment for piece in pieces], np.int32),
+            [piece.rows for piece in pieces],
+        )
+        with_fields = [piece.fields for piece in pieces if piece.fields is not None]
+        fields = None
+        if kind is None and with_fields:
+            kind = with_fields[0].type
+        if kind is not None:
+            fields = joined(
+                [
+                    pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
+                    for piece in pieces
+                ]
+            )
+        columns = _own_columns(pieces, messages, segment, fields, self._has_publish_time)
+        if with_topic:
+            columns[TOPIC_COLUMN] = pa.repeat(pa.scalar(topic), len(segment))
+        known = list(map(pa.field, columns, [column.type for column in columns.values()]))
+        arrays = list(columns.values())
+        if fields is not None:
+            known += [fields.type.field(number) for number in range(fields.type.num_fields)]
+            arrays += fields.flatten()
+        table = pa.Table.from_arrays(arrays, schema=pa.schema(known))
+        order = _order(messages.log_time, messages.seq)
+        return table if order is None else table.take(pa.array(order))
+
+    def _fitting(self, table: Any) -> Any:
+        """Rows with the columns that the file has."""
+        import pyarrow as pa
+
+        from hybridlog.tables.fields import UnfitError, joined
+
+        kind = pa.struct(list(self._schema))
+        fitting = joined([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
+        if fitting.type != kind:
+            raise UnfitError("the file has other columns")
+        return pa.Table.from_struct_array(fitting).cast(self._schema)
+
+    def close(self, about: About) -> None:
+        """Finish it."""
+        assert self._writer is not None
+        self._writer.close(about)
+
+    def discard(self) -> None:
+        """Leave nothing of it."""
+        if self._writer is not None:
+            self._writer.discard()
+
+
+class TableWriter:
+    """Writes the tables of one recording, which this process holds for writing.
+
+    Args:
+        root: The store.
+        recording: Id of the recording.
+        topics: Those wanted; None for all.
+        is_new: Whether the recording has no tables yet. A file of a new one gets its name as
+            soon as its segment is cut; else all files of a topic are exchanged at the end.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        recording: str,
+        *,
+        topics: Collection[str] | None = None,
+        is_new: bool = True,
+    ) -> None:
+        self._root = root
+        self._recording = recording
+        self._wanted = topics
+        self._is_new = is_new
+        self._parts = parts_folder(root, recording)
+        self._has_parts = False
+        self._numbers = 0
+        self._has_ended = False
+        self._arena: NDArray[np.uint8] | None = None
+        self._filled = 0
+        self._held: list[_Messages] = []
+        self._held_rows = 0
+        self._held_segment = -1
+        self._channels: dict[int, Channel] = {}
+        self._topics: dict[tuple[str, str], _Topic] = {}
+        self._of_channel: dict[int, tuple[_Topic, Codec, bool]] = {}
+        self._has_publish_time: dict[int, bool] = {}
+        self._seen: Counter[int] = Counter()  # messages of each segment
+        self._sealed: dict[int, tuple[str, int]] = {}  # digest and messages
+        self._cut: dict[int, str] = {}  # segments that are cut, and their digests
+        self._finished: dict[str, list[tuple[Path, str]]] = {}  # by folder, until the end
+        self._lock = threading.Lock()  # of what is sealed
+
+    @property
+    def rows_in_memory(self) -> int:
+        """Rows that wait to be written."""
+        return self._held_rows + sum(
+            piece.rows for topic in self._topics.values() for piece in topic.pieces
+        )
+
+    def seal(self, segment: int, digest: str, messages: int) -> None:
+        """A segment is sealed. Thread safe.
+
+        Args:
+            segment: Its number.
+            digest: As the catalog has it.
+            messages: Number of its messages.
+        """
+        with self._lock:
+            self._sealed[segment] = digest, messages
+
+    def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
+        """Take what is in a chunk; its buffer is not needed any more afterwards."""
+        if self._has_ended:
+            return
+        with self._harmless():
+            self._channels.update(channels)
+            self._collect(chunk)
+            self._seen[chunk.segment] += len(chunk.batch)
+            self._spill()
+            self._cut_sealed()
+
+    def cut(self, segment: int, digest: str) -> None:
+        """No more messages of a segment come.
+
+        Args:
+            segment: Its number.
+            digest: As the catalog has it.
+        """
+        if not self._has_ended:
+            with self._harmless():
+                self._decode()
+                self._cut_segment(segment, digest)
+
+    def close(self, entry: RecordingEntry) -> None:
+        """Finish all tables.
+
+        Args:
+            entry: The whole recording; topics of which it has more or fewer messages get none.
+        """
+        if not self._has_ended:
+            with self._harmless():
+                self._close(entry)
+        self.discard()
+
+    def discard(self) -> None:
+        """Write no more, and leave nothing unfinished."""
+        self._has_ended = True
+        for topic in self._topics.values():
+            topic.give_up()
+        self._topics.clear()
+        self._of_channel.clear()
+        self._held.clear()
+        self._held_rows = 0
+        self._arena = None
+        if self._has_parts:
+            with suppress(OSError):
+                files.remove_tree(self._parts, depth=files.IN_FOLDER)
+        self._has_parts = False
+
+    @contextmanager
+    def _harmless(self) -> Iterator[None]:
+        """Whatever fails here, the recording goes on without tables."""
+        try:
+            yield
+        except Exception as error:
+            _log.warning("no tables of %s: %s", self._recording, error or repr(error))
+            self.discard()
+
+    # From chunks to rows in memory.
+
+    def _collect(self, chunk: StoredChunk) -> None:
+        batch = chunk.batch
+        begin, rows = int(batch.offset.min()), len(batch)
+        size = int((batch.offset + batch.length).max()) - begin
+        is_full = self._filled + size > _ARENA or self._held_rows + rows > _ROWS
+        is_enough = size >= min(_ENOUGH, _ARENA)
+        if is_enough or is_full or chunk.segment != self._held_segment:
+            self._decode()
+        self._held_segment = chunk.segment
+        data = np.frombuffer(batch.buffer, np.uint8, size, begin)
+        self._held.append(_Messages.of(chunk, begin - self._filled))
+        self._held_rows += rows
+        if is_enough:
+            self._decode(data)
+            return
+        if self._arena is None:
+            self._arena = buffers.take(_ARENA)
+        self._arena[self._filled : self._filled + size] = data
+        self._filled += size
+
+    def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
+        """Make rows of what was collected."""
+        if not self._held:
+            return
+        if data is None:
+            assert self._arena is not None
+            data = self._arena[: self._filled]
+        messages = _Messages.joined(self._held)
+        self._held.clear()
+        self._filled = self._held_rows = 0
+        for topic, codec, is_reduced, part in self._by_topic(messages):
+            if topic.is_wanted:
+                with self._only(topic):
+                    topic.add(self._piece(topic, codec, part, data, is_reduced=is_reduced))
+
+    def _by_topic(self, messages: _Messages) -> Iterator[tuple[_Topic, Codec, bool, _Messages]]:
+        """Messages, those of each topic and encoding by themselves."""
+        numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
+        found = {number: self._topic_of(number) for number in numbers}
+        kinds = list(dict.fromkeys((topic, codec, r) for topic, codec, r in found.values()))
+        if len(kinds) == 1:
+            yield *kinds[0], messages
+            return
+        table = np.zeros(numbers[-1] + 1, np.int32)
+        table[numbers] = [kinds.index(kind) for kind in found.values()]
+        for number, rows in rows_by_channel(table[messages.channel]):
+            if kinds[number][0].is_wanted:
+                yield *kinds[number], messages.take(rows)
+
+    def _topic_of(self, number: int) -> tuple[_Topic, Codec, bool]:
+        found = self._of_channel.get(number)
+        if found is None:
+            channel = self._channels[number]
+            schema = table_schema_of(channel)
+            topic = self._topics.get((channel.topic, schema))
+            if topic is None:
+                topic = self._topics[channel.topic, schema] = _Topic(channel, schema)
+                topic.is_wanted = self._wanted is None or channel.topic in self._wanted
+            is_reduced = channel.message_encoding == REDUCED
+            found = self._of_channel[number] = topic, codec_for(channel), is_reduced
+            self._has_publish_time[number] = channel.has_publish_time
+        return found
+
+    def _piece(
+        self,
+        topic: _Topic,
+        codec: Codec,
+        messages: _Messages,
+        data: NDArray[np.uint8],
+        *,
+        is_reduced: bool,
+    ) -> _Piece:
+        state = _REDUCED if is_reduced else _WHOLE
+        piece = _Piece(self._held_segment, messages, None, state=state)
+        if codec.indexed and not is_reduced:
+            self._add_fields(piece, topic, codec, data)
+        return piece
+
+    def _add_fields(
+        self, piece: _Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
+    ) -> None:
+        from hybridlog.tables.fields import detached, without
+
+        decoded = codec.arrow(data.data, piece.messages.at, piece.messages.length, None)
+        for bad in decoded.unreadable:
+            reason = f"the payload does not fit {topic.type}: {bad.reason}"
+            piece.errors.append((bad.rows, reason))
+        if not len(decoded.rows):
+            return
+        columns = topic.shape.columns(decoded.records)
+        begin = data.ctypes.data
+        columns = detached(columns, begin, begin + data.nbytes)
+        piece.fields = without(columns, decoded.rows, piece.rows)
+
+    @contextmanager
+    def _only(self, topic: _Topic) -> Iterator[None]:
+        """What fails of one topic costs this topic its table; a full disk costs all."""
+        try:
+            yield
+        except (OSError, MemoryError):
+            raise
+        except Exception as error:
+            _log.warning("no table of %s: %s", topic.name, error or repr(error))
+            topic.give_up()
+
+    # From rows in memory to files.
+
+    @property
+    def _pending(self) -> int:
+        return sum(topic.size for topic in self._topics.values())
+
+    def _spill(self) -> None:
+        """Write rows of the largest topics, if too many wait in memory."""
+        if self._pending < _PENDING:
+            return
+        self._decode()
+        left = self._pending
+        opened = sum(len(f) for topic in self._topics.values() for f in topic.files.values())
+        for topic in sorted(self._topics.values(), key=lambda topic: -topic.size):
+            if left <= _LEFT:
+                return
+            left -= topic.size
+            if opened >= _OPEN_FILES and not topic.files:
+                topic.give_up()
+                continue
+            for segment in sorted({piece.segment for piece in topic.pieces}):
+                with self._only(topic):
+                    # What waits of segments that are cut has no file to go to.
+                    place = segment if segment not in self._cut else max(self._seen)
+                    opened += self._write(topic, place, topic.take({segment}))
+
+    def _write(self, topic: _Topic, segment: int, pieces: list[_Piece]) -> int:
+        """Write rows to the unfinished file of a segment; returns how many files were begun."""
+        from hybridlog.tables.fields import UnfitError
+
+        if not pieces:
+            return 0
+        self._check_room()
+        unfinished = topic.files.setdefault(segment, [])
+        if unfinished:
+            try:
+                unfinished[-1].write(topic.name, pieces)
+            except UnfitError:
+                pass
+            else:
+                return 0
+        file = _File(self._new_part(), self._has_publish_time)
+        unfinished.append(file)
+        file.write(topic.name, pieces)
+        return 1
+
+    def _new_part(self) -> Path:
+        if not self._has_parts:
+            with suppress(FileNotFoundError):
+                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # of a crash
+            files.make_folders(self._parts, depth=files.IN_FOLDER)
+            self._has_parts = True
+        self._numbers += 1
+        return self._parts / f"{self._numbers}{SUFFIX}"
+
+    def _check_room(self) -> None:
+        if shutil.disk_usage(self._root).free < _RESERVE:
+            raise OSError(errno.ENOSPC, "the disk is nearly full")
+
+    def _cut_sealed(self) -> None:
+        """Finish files of segments that are sealed, and of which all messages have come."""
+        if not self._sealed:
+            return
+        with self._lock:
+            ready = [
+                segment
+                for segment, (_, messages) in self._sealed.items()
+                if self._seen[segment] == messages
+            ]
+        for segment in sorted(ready):
+            if self._held_segment == segment:
+                self._decode()
+            with self._lock:
+                digest, _ = self._sealed.pop(segment)
+            self._cut_segment(segment, digest)
+
+    def _cut_segment(self, segment: int, digest: str) -> None:
+        """Finish the files of a segment; topics of few rows wait for the next one."""
+        self._cut[segment] = digest
+        for topic in self._topics.values():
+            with self._only(topic):
+                rows = sum(piece.rows for piece in topic.pieces if piece.segment in self._cut)
+                if rows >= OWN_FILE_ROWS or segment in topic.files:
+                    self._write(topic, segment, topic.take(self._cut))
+                self._finish(topic)
+
+    def _finish(self, topic: _Topic) -> None:
+        """Finish a topic's files of segments that are cut."""
+        for segment in sorted(topic.files.keys() & self._cut.keys()):
+            for file in topic.files.pop(segment):
+                name = topic_file(topic.schema, segment, topic.finished[segment])
+                self._end(file, topic.schema, topic.type)
+                topic.finished[segment] += 1
+                self._publish(topic_folder(topic.name), file.path, name)
+
+    def _end(self, file: _File, schema: str, type_name: str) -> None:
+        file.close(
+            About(
+                self._recording,
+                schema,
+                type_name,
+                {str(segment): self._cut[segment] for segment in sorted(file.segments)},
+                file.topics,
+                tuple(file.bounds),
+                file.unreadable,
+                file.reduced,
+            )
+        )
+
+    def _publish(self, folder: str, path: Path, name: str) -> None:
+        """Give a finished file its name now, or remember which one it gets."""
+        if not self._is_new:
+            self._finished.setdefault(folder, []).append((path, name))
+            return
+        place = recording_folder(self._root, self._recording) / folder
+        files.make_folders(place, depth=IN_TOPIC - 1)
+        files.rename(path, place / name, depth=files.IN_RECORDING, new_depth=IN_TOPIC)
+
+    def _close(self, entry: RecordingEntry) -> None:
+        self._decode()
+        for number in sorted(self._seen.keys() - self._cut.keys()):
+            digest = entry.digests.get(str(number))
+            if digest is not None:
+                self._cut_segment(number, digest)
+        incomplete = self._incomplete(entry)
+        for topic in self._topics.values():
+            if topic.name in incomplete:
+                topic.give_up()
+            elif topic.finished and topic.pieces:
+                with self._only(topic):
+                    self._write(topic, max(self._cut), topic.take(self._cut))
+                    self._finish(topic)
+        self._write_small()
+        folder = recording_folder(self._root, self._recording)
+        for name in incomplete:
+            files.remove_tree(folder / topic_folder(name), depth=IN_TOPIC - 1)
+        for name, finished in self._finished.items():
+            self._exchange(folder / name, finished)
+
+    def _incomplete(self, entry: RecordingEntry) -> set[str]:
+        """Topics that can have no table."""
+        rows: Counter[str] = Counter()
+        failed = set()
+        for topic in self._topics.values():
+            if topic.is_wanted:
+                rows[topic.name] += topic.rows
+            elif topic.has_failed:
+                failed.add(topic.name)
+        return failed | {name for name in rows if rows[name] != entry.messages_of(name)}
+
+    def _write_small(self) -> None:
+        """Topics of few rows, those of one type in one file."""
+        by_schema: dict[str, list[_Topic]] = {}
+        for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
+            if topic.pieces:
+                by_schema.setdefault(topic.schema, []).append(topic)
+        for schema, topics in by_schema.items():
+            self._check_room()
+            file = _File(self._new_part(), self._has_publish_time)
+            try:
+                file.write_together({topic.name: topic.take(self._cut) for topic in topics})
+            except (OSError, MemoryError):
+                raise
+            except Exception as error:
+                _log.warning("no table of %s: %s", topics[0].type, error or repr(error))
+                file.discard()
+                continue
+            self._end(file, schema, topics[0].type)
+            self._publish(SMALL, file.path, small_file(topics[0].type, schema))
+
+    def _exchange(self, place: Path, finished: list[tuple[Path, str]]) -> None:
+        """Put finished files in the place of those that are there."""
+        files.make_folders(place, depth=IN_TOPIC - 1)
+        target = place
+        if place.name != SMALL:
+            self._numbers += 1
+            target = self._parts / f"new-{self._numbers}"
+            files.make_folder(target, depth=files.IN_RECORDING)
+        for path, name in finished:
+            files.rename(path, target / name, depth=files.IN_RECORDING, new_depth=IN_TOPIC)
+        if target != place:
+            old = self._parts / f"old-{self._numbers}"
+            files.rename(place, old, depth=IN_TOPIC - 1, new_depth=files.IN_RECORDING)
+            files.rename(target, place, depth=files.IN_RECORDING, new_depth=IN_TOPIC - 1)
+
+
+def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.intp] | None:
+    """Rows by log time and arrival; None if they are in this order already."""
+    later = log_time[1:] > log_time[:-1]
+    if not later.all():
+        same = log_time[1:] == log_time[:-1]
+        if not (later | (same & (seq[1:] > seq[:-1]))).all():
+            return np.lexsort((seq, log_time))
+    return None
+
+
+def _rows_of_group(table: Any) -> int:
+    rows = max(int(table.num_rows), 1)
+    return max(min(GROUP_ROWS, rows * GROUP_BYTES // max(int(table.nbytes), 1)), 1)
+
+
+def _own_columns(
+    pieces: Sequence[_Piece],
+    messages: _Messages,
+    segment: NDArray[np.int32],
+    fields: Any,
+    has_publish_time: Mapping[int, bool],
+) -> dict[str, Any]:
+    """The columns that every table has, by name."""
+    import pyarrow as pa
+
+    states = np.concatenate([np.full(piece.rows, piece.state, np.int8) for piece in pieces])
+    errors = _errors(pieces, states)
+    ids = np.flatnonzero(np.bincount(messages.channel)).tolist()
+    silent = [number for number in ids if not has_publish_time[number]]
+    no_publish = np.isin(messages.channel, silent) if silent else None
+    micros = messages.log_time // 1000
+    return {
+        "log_time": pa.array(micros).view(pa.timestamp("us", "UTC")),
+        "t": pa.array(messages.log_time),
+        "seq": pa.array(messages.seq),
+        "pub": pa.array(messages.publish_time, mask=no_publish),
+        "stamp": _stamps(fields, len(segment)),
+        "channel": pa.array(messages.channel),
+        "state": pa.array(STATES).take(pa.array(states)),
+        "error": errors,
+        "ref": pa.StructArray.from_arrays(
+            [
+                pa.array(segment),
+                pa.array(messages.chunk),
+                pa.array(messages.offset),
+                pa.array(messages.length.astype(np.int32)),
+            ],
+            names=["seg", "chunk", "off", "len"],
+        ),
+    }
+
+
+def _errors(pieces: Sequence[_Piece], states: NDArray[np.int8]) -> Any:
+    """Why messages are unreadable; their states are set."""
+    import pyarrow as pa
+
+    if not any(piece.errors for piece in pieces):
+        return pa.nulls(len(states), pa.string())
+    found: list[str | None] = [None] * len(states)
+    before = 0
+    for piece in pieces:
+        for rows, reason in piece.errors:
+            for row in rows.tolist():
+                found[before + row] = reason
+                states[before + row] = _UNREADABLE
+        before += piece.rows
+    return pa.array(found, pa.string())
+
+
+def _stamps(fields: Any, rows: int) -> Any:
+    """Header stamps, ns."""
+    import pyarrow as pa
+
+    if fields is not None and fields.type.get_field_index("header") >= 0:
+        header = fields.field("header")
+        if pa.types.is_struct(header.type) and header.type.get_field_index("stamp") >= 0:
+            (stamp,) = [
+                part
+                for part, inner in zip(header.flatten(), header.type, strict=True)
+                if inner.name == "stamp"
+            ]
+            if pa.types.is_timestamp(stamp.type):
+                return stamp.view(pa.int64())
+    return pa.nulls(rows, pa.int64())

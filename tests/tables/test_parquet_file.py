@@ -1,0 +1,213 @@
+"""Files of tables: every byte is held against a checksum, and others read them."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import hybridlog as hl
+from hybridlog.tables import parquet_file
+from hybridlog.tables.layout import About, column_names, small_file, topic_file
+from hybridlog.tables.parquet_file import ParquetFileReader, ParquetFileWriter, leaves_of
+from hybridlog_storage.errors import StoreError
+
+ROWS = 20_000
+
+
+@pytest.fixture(scope="module")
+def table() -> pa.Table:
+    dice = np.random.default_rng(3)
+    point = pa.StructArray.from_arrays(
+        [pa.array(dice.random(ROWS)), pa.array([[n % 7, 2] for n in range(ROWS)])],
+        names=["x", "list"],
+    )
+    return pa.table(
+        {"t": np.arange(ROWS), "x": dice.random(ROWS), "point": point, "text": ["a"] * ROWS}
+    )
+
+
+def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> About:
+    rows = table.num_rows
+    writer = ParquetFileWriter(path, table, depth=1)
+    for _ in range(groups):
+        writer.write(table)
+    said = About(
+        "id",
+        about.get("schema", "schema"),
+        "type",
+        {"0": "digest"},
+        {"/a": rows * groups},
+        ((rows, 0, 0, rows - 1, 1),) * groups,
+    )
+    writer.close(said)
+    return said
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    place = tmp_path / "1" / "2" / "3"
+    place.mkdir(parents=True)
+    return place / "a.parquet"
+
+
+def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
+    said = write(path, table)
+    reader = ParquetFileReader(path)
+    assert reader.about.topics == said.topics
+    assert reader.groups == 2
+    names = [names for names, _ in leaves_of(reader.schema)]
+    assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",)]
+    assert reader.read(1, [0, 1, 2, 3, 4]).equals(table)
+    some = reader.read(0, [1, 3])
+    assert some.column("x").equals(table.column("x"))
+    assert some.schema.field("point").type.num_fields == 1
+    assert reader.size(0, [0]) < reader.size(0, [0, 1])
+    reader.check()
+    assert pq.read_table(path).num_rows == 2 * ROWS
+
+
+def test_every_flipped_bit_is_found(path: Path, table: pa.Table) -> None:
+    write(path, table.slice(0, 3000))
+    good = path.read_bytes()
+    footer = len(good) - int.from_bytes(good[-8:-4], "little") - 8
+    dice = random.Random(4)
+    places = [dice.randrange(footer) for _ in range(150)]
+    places += [dice.randrange(footer, len(good)) for _ in range(150)]
+    places += [0, 1, 3, 4, footer - 1, footer, len(good) - 1, len(good) - 5, len(good) - 8]
+    for place in places:
+        bad = bytearray(good)
+        bad[place] ^= 1 << dice.randrange(8)
+        path.write_bytes(bad)
+        with pytest.raises(StoreError, match="damaged"):
+            ParquetFileReader(path).check()
+
+
+@pytest.mark.parametrize("length", [0, 1, 8, 12, 100, 5000, -1, -8, -300])
+def test_a_file_that_was_cut(path: Path, table: pa.Table, length: int) -> None:
+    write(path, table)
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(StoreError, match="damaged"):
+        ParquetFileReader(path).check()
+
+
+def test_a_file_that_is_cut_while_it_is_open(path: Path, table: pa.Table) -> None:
+    write(path, table)
+    reader = ParquetFileReader(path)
+    with path.open("r+b") as file:
+        file.truncate(1000)
+    with pytest.raises(StoreError, match="it was cut"):
+        reader.read(1, [1])
+
+
+def test_parts_of_a_damaged_file_that_are_whole_are_read(path: Path, table: pa.Table) -> None:
+    write(path, table)
+    content = bytearray(path.read_bytes())
+    content[-len(content) // 3] ^= 1
+    path.write_bytes(content)
+    reader = ParquetFileReader(path)
+    assert reader.read(0, [0]).equals(table.select(["t"]))
+    with pytest.raises(StoreError):
+        reader.check()
+
+
+def test_a_foreign_file_is_no_table(path: Path, table: pa.Table) -> None:
+    pq.write_table(table, path)
+    with pytest.raises(StoreError, match="no checksum"):
+        ParquetFileReader(path)
+    with pytest.raises(FileNotFoundError):
+        ParquetFileReader(path.with_name("other.parquet"))
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(StoreError):
+        ParquetFileReader(path)
+
+
+def test_text_that_looks_like_a_checksum_makes_no_file(path: Path, table: pa.Table) -> None:
+    with pytest.raises(StoreError, match="looks like"):
+        write(path, table, schema="hybridlog-footer:00000000")
+    assert not path.exists()
+
+
+def test_no_float_has_statistics(path: Path, table: pa.Table) -> None:
+    """DuckDB answers wrongly from those of columns with NaN."""
+    write(path, table)
+    group = pq.read_metadata(path).row_group(0)
+    columns = [group.column(n) for n in range(group.num_columns)]
+    has = {column.path_in_schema: column.is_stats_set for column in columns}
+    assert has == {
+        "t": True,
+        "x": False,
+        "point.x": False,
+        "point.list.list.element": True,
+        "text": True,
+    }
+
+
+def test_no_float_of_any_table_has_statistics(recorded: hl.Store) -> None:
+    seen = 0
+    for path in (recorded.directory.path / "tables").glob("*/*/*.parquet"):
+        metadata = pq.read_metadata(path)
+        for number in range(metadata.num_row_groups):
+            for leaf in range(metadata.num_columns):
+                column = metadata.row_group(number).column(leaf)
+                is_float = column.physical_type in {"FLOAT", "DOUBLE"}
+                assert not (is_float and column.is_stats_set)
+                seen += is_float
+    assert seen >= 10
+
+
+def test_encodings(recorded: hl.Store) -> None:
+    (path,) = (recorded.directory.path / "tables").glob("*/topic=large/*.parquet")
+    group = pq.read_metadata(path).row_group(0)
+    found = {c.path_in_schema: c for c in map(group.column, range(group.num_columns))}
+    for name in ("t", "log_time", "seq", "pub", "stamp", "header.seq", "header.stamp", "ref.off"):
+        assert "DELTA_BINARY_PACKED" in found[name].encodings, name
+    for name in ("state", "channel", "header.frame_id", "i8"):
+        assert "RLE_DICTIONARY" in found[name].encodings, name
+    assert {column.compression for column in found.values()} == {"ZSTD"}
+
+
+def test_bytes_that_share_a_checksum_may_be_of_any_number(
+    path: Path, table: pa.Table, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parquet_file, "BLOCK", 100)
+    monkeypatch.setattr(parquet_file, "_WRITTEN", 7)
+    write(path, table)
+    ParquetFileReader(path).check()
+
+
+@pytest.mark.parametrize(
+    ("names", "columns"),
+    [
+        (["a", "b"], ["a", "b"]),
+        (["a", "A", "a_2"], ["a", "A_3", "a_2"]),
+        (["t", "T", "t_"], ["t_2", "T_3", "t_"]),
+        (["Seq", "topic", "recording", "error"], ["Seq_", "topic_", "recording_", "error_"]),
+        (["log_time", "LOG_TIME"], ["log_time_", "LOG_TIME_2"]),
+        (["straße", "STRASSE"], ["straße", "STRASSE_2"]),
+    ],
+)
+def test_names_of_columns(names: list[str], columns: list[str]) -> None:
+    assert [column for _, column in column_names(names)] == columns
+    assert [name for name, _ in column_names(names)] == names
+
+
+def test_names_of_files() -> None:
+    assert topic_file("0123456789", 7) == "01234567-000007.parquet"
+    assert topic_file("0123456789", 7, 2) == "01234567-000007-2.parquet"
+    assert small_file("std_msgs/msg/String", "abcdef0123") == "std_msgs_msg_String~abcdef01.parquet"
+    assert small_file("../../x", "abcdef0123") == "______x~abcdef01.parquet"
+    assert small_file("", "abcdef0123") == "untyped~abcdef01.parquet"
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"{}", b"[]", b"null", b'{"version": 2}', b'{"version": 1}', b"\xff"]
+)
+def test_descriptions_that_are_none(text: bytes) -> None:
+    with pytest.raises(StoreError):
+        About.from_json(text)

@@ -1,0 +1,475 @@
+"""Tables are what the messages say, whatever way the messages came."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import hybridlog as hl
+from hybridlog.tables import writer as writing
+from hybridlog.tables.layout import OWN_COLUMNS, PARTS, TABLES, recording_folder
+from hybridlog.tables.reader import TableRows, Tables
+from hybridlog.tables.writer import TableWriter
+from hybridlog_storage import files
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.messages import Schema
+from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.data import DATA, needs_data
+from tests.tables.conftest import SMALL_CHUNKS
+from tests.tables.logs import (
+    BASE,
+    Decoded,
+    channel,
+    decoded,
+    payload,
+    same,
+    varied,
+    write_log,
+)
+
+REAL = [
+    "auv_ros2.mcap",
+    "compressed_image.bag",
+    "leg_tracker_stationary.bag",
+    "ouster.mcap",
+    "robot_localization_test1.bag",
+    "sick_laser_radar.bag",
+    "tilt_laser.bag",
+]
+INT32 = Schema("std_msgs/Int32", "ros1msg", b"int32 data")
+
+
+def tables_of(store: hl.Store) -> Path:
+    return store.directory.path / TABLES
+
+
+def topics_of(entry: RecordingEntry) -> list[str]:
+    return sorted({c.topic for c in entry.channels if c.stats.messages})
+
+
+def cells(records: Any) -> list[dict[str, Any]]:
+    """Rows of a table as Python has them, times as nanoseconds."""
+    found: list[dict[str, Any]] = _plain(records).to_pylist()
+    return found
+
+
+def _plain(array: Any) -> Any:
+    kind = array.type
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        return array.view(pa.int64())
+    if pa.types.is_struct(kind) and kind.num_fields:
+        names = [kind.field(n).name for n in range(kind.num_fields)]
+        inner = [_plain(array.field(n)) for n in range(kind.num_fields)]
+        return pa.StructArray.from_arrays(inner, names=names, mask=array.is_null())
+    if pa.types.is_list(kind):
+        array = array.take(pa.array(np.arange(len(array))))  # offsets from 0
+        return pa.ListArray.from_arrays(array.offsets, _plain(array.values), mask=array.is_null())
+    return array
+
+
+def compare(store: hl.Store, recording: str | None = None) -> int:
+    """Every row of every table with the message itself; returns how many rows there are."""
+    tables = Tables(store.directory.path)
+    compared = 0
+    for entry in store.recordings() if recording is None else [store.entry(recording)]:
+        for topic in topics_of(entry):
+            table = tables.of(entry, topic)
+            assert table is not None, topic
+            own = [name for name in OWN_COLUMNS if name not in {"t", "seq"}]
+            blocks = list(table.scan(None, own=own))
+            messages = iter(decoded(store, entry.id, topic))
+            for block in blocks:
+                compare_rows(block, [next(messages) for _ in range(len(block))])
+            assert next(messages, None) is None
+            compared += table.rows
+    return compared
+
+
+def compare_rows(block: TableRows, messages: list[Decoded]) -> None:
+    assert block.t.tolist() == [message.t for message in messages]
+    assert block.seq.tolist() == [message.seq for message in messages]
+    assert block.own["pub"].to_pylist() == [message.pub for message in messages]
+    assert block.own["ref"].field("len").to_pylist() == [len(m.raw) for m in messages]
+    micros = block.own["log_time"].view(pa.int64()).to_pylist()
+    assert micros == [message.t // 1000 for message in messages]
+    rows = zip(cells(block.records), block.own["state"].to_pylist(), messages, strict=True)
+    for cell, state, message in rows:
+        if message.value is None:
+            assert state == "unreadable"
+            assert not any(value is not None for value in cell.values())
+            continue
+        assert state == "whole"
+        for name, value in cell.items():
+            assert same(value, getattr(message.value, name)), name
+
+
+def references(block: TableRows) -> list[tuple[int, int, int, int]]:
+    return [(r["seg"], r["chunk"], r["off"], r["len"]) for r in block.own["ref"].to_pylist()]
+
+
+@needs_data
+@pytest.mark.parametrize("name", REAL)
+def test_tables_of_real_logs_are_what_the_messages_say(store: hl.Store, name: str) -> None:
+    store.record(DATA / "real" / name, name="log")
+    (entry,) = store.recordings()
+    assert compare(store) == entry.messages
+    assert store.verify().findings == []
+
+
+@pytest.mark.parametrize(
+    ("arena", "enough", "rows", "pending"),
+    [
+        (8 << 20, 4 << 20, 1 << 18, 48 << 20),
+        (3000, 2000, 1 << 18, 48 << 20),
+        (3000, 2000, 5, 20_000),
+        (1, 1, 1, 1),
+    ],
+)
+def test_tables_are_what_the_messages_say(
+    store: hl.Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arena: int,
+    enough: int,
+    rows: int,
+    pending: int,
+) -> None:
+    monkeypatch.setattr(writing, "_ARENA", arena)
+    monkeypatch.setattr(writing, "_ENOUGH", enough)
+    monkeypatch.setattr(writing, "_ROWS", rows)
+    monkeypatch.setattr(writing, "_PENDING", pending)
+    monkeypatch.setattr(writing, "_LEFT", pending // 4)
+    said = [(BASE + n * 7 % 41, f"/{'abc'[n % 3]}", varied(n)) for n in range(300)]
+    write_log(tmp_path / "log.mcap", said)
+    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+    assert compare(store) == 300
+
+
+def test_where_a_message_lies(recorded: hl.Store) -> None:
+    (entry,) = recorded.recordings()
+    table = Tables(recorded.directory.path).of(entry, "/large")
+    assert table is not None
+    want = [
+        (r["seg"], r["chunk"], r["off"], r["len"])
+        for r in (d["_meta"]["ref"] for d in recorded.query(["/large"]).documents())
+    ]
+    assert [r for block in table.scan(own=["ref"]) for r in references(block)] == want
+
+
+def test_topics_of_few_rows_share_a_file_a_type(recorded: hl.Store) -> None:
+    folder = recording_folder(recorded.directory.path, recorded.recordings()[0].id)
+    assert len(list(folder.glob("topic=large/*.parquet"))) == 1
+    (small,) = folder.glob("small/*.parquet")
+    assert small.name.startswith("test_State~")
+    topics = pq.read_table(small).column("topic").to_pylist()
+    assert topics == ["/small/one"] * 300 + ["/small/two"] * 300
+    assert {p.name for p in folder.iterdir()} == {"small", "topic=large"}
+    assert not (recorded.directory.path / PARTS / f"r{recorded.recordings()[0].id}").exists()
+
+
+def test_names_of_ours_and_twins_get_other_names(recorded: hl.Store) -> None:
+    (path,) = tables_of(recorded).glob("*/topic=large/*.parquet")
+    schema = pq.read_schema(path)
+    assert {"t", "t_", "state", "state_", "name", "Name_2"} <= set(schema.names)
+    assert schema.field("t_").metadata[b"hybridlog.name"] == b"t"
+    assert schema.field("Name_2").metadata[b"hybridlog.name"] == b"Name"
+    inner = schema.field("points").type.value_type
+    assert [inner.field(n).name for n in range(3)] == ["x", "X_2", "data"]
+    assert schema.field("nothing").type == pa.bool_()
+    assert schema.field("u64").type == pa.uint64()
+
+
+def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store) -> None:
+    settings = SegmentSettings(chunk_size=4096, segment_size=300_000)
+    with store.start("live", settings=settings, flush_interval_s=0.01) as recording:
+        folder = recording_folder(store.directory.path, recording.id)
+        own = channel("/state")
+        for n in itertools.count():
+            recording.write(own, varied(n), log_time=BASE + n)
+            if len(list(folder.glob("topic=state/*.parquet"))) >= 2:
+                break
+            assert n < 200_000
+    compared = compare(store)
+    assert compared == n + 1
+    (entry,) = store.recordings()
+    assert len(list(folder.glob("topic=state/*.parquet"))) == entry.segments
+    assert store.verify().findings == []
+
+
+def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path) -> None:
+    """A topic of one message a second has no file a segment."""
+    said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(12_000)]
+    write_log(tmp_path / "log.mcap", said)
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 18)
+    store.record(tmp_path / "log.mcap", name="log", settings=settings)
+    (entry,) = store.recordings()
+    assert entry.segments >= 4
+    folder = recording_folder(store.directory.path, entry.id)
+    assert len(list(folder.glob("topic=fast/*.parquet"))) == entry.segments
+    assert len(list(folder.glob("small/*.parquet"))) == 1
+    assert compare(store) == 12_000
+
+
+def test_a_topic_with_a_file_gets_another_for_its_last_rows(
+    store: hl.Store, tmp_path: Path
+) -> None:
+    said = [(BASE + n, "/a" if n < 1100 else "/b", varied(n)) for n in range(3000)]
+    said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
+    write_log(tmp_path / "log.mcap", said)
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
+    store.record(tmp_path / "log.mcap", name="log", settings=settings)
+    assert compare(store) == 3005
+    assert len(list(tables_of(store).glob("*/topic=a/*.parquet"))) >= 2
+    assert not list(tables_of(store).glob("*/small/*"))
+
+
+def test_an_array_that_becomes_long(store: hl.Store, tmp_path: Path) -> None:
+    """Whole where it is short; once it was too long, a summary in all rows."""
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
+    said = [
+        (BASE + n, "/a", payload(n, many=[1.0, float(n)] * (1 if n < 2500 else 20)))
+        for n in range(5000)
+    ]
+    write_log(tmp_path / "log.mcap", said)
+    store.record(tmp_path / "log.mcap", name="log", settings=settings)
+    assert compare(store) == 5000
+    kinds = {
+        str(pq.read_schema(path).field("many").type)[:4]
+        for path in tables_of(store).glob("*/topic=a/*.parquet")
+    }
+    assert kinds == {"list", "stru"}
+
+
+@pytest.mark.parametrize("count", [40, 1200])
+def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int) -> None:
+    said = [
+        (BASE + n, "/a", varied(n) + b"more" if n % 3 == 1 else varied(n)) for n in range(count)
+    ]
+    write_log(tmp_path / "log.mcap", said)
+    store.record(tmp_path / "log.mcap", name="log")
+    assert compare(store) == count
+    (entry,) = store.recordings()
+    table = Tables(store.directory.path).of(entry, "/a")
+    assert table is not None
+    want = [d["_meta"].get("error") for d in store.query(["/a"]).documents()]
+    have = [e for block in table.scan(own=["error"]) for e in block.own["error"].to_pylist()]
+    assert have == want
+    assert table.unreadable == sum(error is not None for error in want) > 0
+
+
+def test_messages_that_nobody_can_read(store: hl.Store, tmp_path: Path) -> None:
+    said = [(BASE + n, "/a", b"x" * n) for n in range(20)]
+    schemas = {"/a": ("secret", Schema("x/Secret", "secret", b"?"))}
+    write_log(tmp_path / "log.mcap", said, schemas)
+    store.record(tmp_path / "log.mcap", name="log")
+    (entry,) = store.recordings()
+    table = Tables(store.directory.path).of(entry, "/a")
+    assert table is not None
+    (block,) = table.scan(None, own=["ref", "state"])
+    assert block.own["ref"].field("len").to_pylist() == list(range(20))
+    assert set(block.own["state"].to_pylist()) == {"whole"}
+    assert block.records.type.num_fields == 0
+
+
+def test_a_topic_of_two_types_has_two_files_and_no_answer(
+    store: hl.Store,
+) -> None:
+    with store.start("live") as recording:
+        recording.write(channel("/a"), varied(1), log_time=BASE)
+        recording.write(channel("/a", INT32), b"\1\0\0\0", log_time=BASE + 1)
+    folder = recording_folder(store.directory.path, recording.id)
+    assert len(list(folder.glob("small/*.parquet"))) == 2
+    (entry,) = store.recordings()
+    assert Tables(store.directory.path).of(entry, "/a") is None
+
+
+def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
+    found = []
+    for number, path in store.directory.segments(entry.label):
+        with SegmentReader(path, number) as reader:
+            summary = reader.summary()
+            found += [(reader.read_chunk(place), summary.channels) for place in summary.chunks]
+    return found
+
+
+def test_memory_does_not_grow_with_the_recording(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_PENDING", 200_000)
+    monkeypatch.setattr(writing, "_LEFT", 50_000)
+    monkeypatch.setattr(writing, "_ARENA", 20_000)
+    most = []
+    for count in (2000, 8000):
+        said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
+        path = write_log(tmp_path / f"{count}.mcap", said)
+        entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
+        writer = TableWriter(store.directory.path, entry.id, is_new=False)
+        held = []
+        for chunk, channels in chunks_of(store, entry):
+            writer.add(chunk, channels)
+            held.append(writer.rows_in_memory)
+        writer.close(entry)
+        most.append(max(held))
+        assert writer.rows_in_memory == 0
+    assert most[0] < 1000
+    assert most[1] <= most[0] + 50
+    assert compare(store) == 10_000
+
+
+def test_chunks_that_come_late_are_put_in_their_place(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_PENDING", 100_000)
+    monkeypatch.setattr(writing, "_LEFT", 20_000)
+    monkeypatch.setattr(writing, "_ARENA", 20_000)
+    said = [(BASE + n, "/a" if n % 9 else "/b", varied(n)) for n in range(4000)]
+    write_log(tmp_path / "log.mcap", said)
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
+    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
+    assert entry.segments > 1
+    chunks = chunks_of(store, entry)
+    files.remove_tree(recording_folder(store.directory.path, entry.id), depth=2)
+    writer = TableWriter(store.directory.path, entry.id)
+    late = chunks[3::5]
+    counts = Counter(number for c, _ in chunks for number in [c.segment] * len(c.batch))
+    for chunk, channels in [c for c in chunks if not any(c is other for other in late)]:
+        writer.add(chunk, channels)
+    for number, messages in counts.items():
+        writer.seal(number, entry.digests[str(number)], messages)
+    for chunk, channels in late:
+        writer.add(chunk, channels)
+    writer.close(entry)
+    assert compare(store) == 4000
+    tables = Tables(store.directory.path)
+    table = tables.of(entry, "/a")
+    assert table is not None
+    assert len(table._runs) > 1  # so that they are merged when they are read
+    bounds = [BASE + 100, BASE + 350, BASE + 2000]
+    spans = [(bounds[0], bounds[1]), (bounds[2], bounds[2] + 1)]
+    found = np.concatenate([block.t for block in table.scan(spans=spans)])
+    want = [t for t, topic, _ in said if topic == "/a" and any(a <= t < b for a, b in spans)]
+    assert found.tolist() == want
+
+
+def test_the_last_room_is_the_segments_alone(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_RESERVE", 1 << 62)
+    write_log(tmp_path / "log.mcap", [(BASE, "/state", varied(1))])
+    assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
+    assert not list(store.directory.path.glob("**/*.parquet"))
+    assert store.topic("/state").count() == 1
+
+
+ERRORS = [MemoryError(), ValueError("odd"), OSError(errno.EIO, "no"), OSError(errno.ENOSPC, "full")]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda e: f"{type(e).__name__} {e}")
+@pytest.mark.parametrize("place", ["add", "write", "close", "publish"])
+def test_whatever_fails_the_recording_goes_on(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: Exception
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    if place == "add":
+        monkeypatch.setattr(TableWriter, "_collect", fail)
+    elif place == "publish":
+        monkeypatch.setattr(TableWriter, "_publish", fail)
+    else:
+        from hybridlog.tables.parquet_file import ParquetFileWriter
+
+        monkeypatch.setattr(ParquetFileWriter, place, fail)
+    said = [(BASE + n, "/large" if n % 50 else "/small", varied(n)) for n in range(1500)]
+    write_log(tmp_path / "log.mcap", said)
+    assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
+    monkeypatch.undo()
+    assert not list(store.directory.path.glob("**/*.parquet"))
+    assert not list((store.directory.path / TABLES).glob("*/*/*"))
+    assert store.topic("/large").count() == 1470
+    assert store.verify().findings == []
+
+
+class FullDisk(files.System):
+    """Has room for so many bytes of tables."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+
+    def writev(self, fd: int, parts: Any) -> int:
+        if Path(f"/proc/self/fd/{fd}").readlink().suffix == ".parquet":
+            self.room -= sum(map(len, parts))
+            if self.room < 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+        return super().writev(fd, parts)
+
+
+@pytest.mark.parametrize("room", [0, 10_000, 60_000, 90_000])
+def test_a_disk_that_fills_up(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    monkeypatch.setattr(files, "system", FullDisk(room))
+    monkeypatch.setattr(writing, "_PENDING", 200_000)
+    monkeypatch.setattr(writing, "_LEFT", 50_000)
+    said = [(BASE + n, f"/{n % 4}", varied(n)) for n in range(6000)]
+    write_log(tmp_path / "log.mcap", said)
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
+    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
+    assert entry.status == "complete"
+    assert entry.messages == 6000
+    assert not list((store.directory.path / PARTS).glob("*/*"))
+    tables = Tables(store.directory.path)
+    assert all(tables.of(entry, topic) is None for topic in topics_of(entry))
+    monkeypatch.undo()
+    store.reindex()
+    assert compare(store) == 6000
+
+
+def test_too_many_topics_for_the_files_of_a_process(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_PENDING", 1)
+    monkeypatch.setattr(writing, "_LEFT", 0)
+    monkeypatch.setattr(writing, "_OPEN_FILES", 3)
+    monkeypatch.setattr(writing, "_ARENA", 1)
+    said = [(BASE + n, f"/{n % 10}", varied(n)) for n in range(200)]
+    write_log(tmp_path / "log.mcap", said)
+    entry = store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS).entry
+    assert entry.status == "complete"
+    tables = Tables(store.directory.path)
+    assert 0 < sum(tables.of(entry, topic) is not None for topic in topics_of(entry)) < 10
+
+
+def test_what_is_written_goes_through_the_seam(store: hl.Store, tmp_path: Path) -> None:
+    """So that tests of faults see every step."""
+    seen = []
+    system = files.system
+
+    class Seen(files.System):
+        def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+            seen.append(new)
+            super().rename(old, new, folder=folder, new_folder=new_folder)
+
+    files.system = Seen()
+    try:
+        write_log(tmp_path / "log.mcap", [(BASE, "/state", varied(1))])
+        store.record(tmp_path / "log.mcap", name="log")
+    finally:
+        files.system = system
+    assert sum(name.endswith(".parquet") for name in seen) == 1
+
+
+def test_messages_of_one_time_are_by_arrival(store: hl.Store, tmp_path: Path) -> None:
+    said = [(BASE + n % 2, "/a", payload(n)) for n in range(2400)]
+    write_log(tmp_path / "log.mcap", said)
+    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+    assert compare(store) == 2400
