@@ -105,8 +105,8 @@ def _parts(records: Records) -> Iterator[pa.StructArray]:
 def _mask(root: Node, types: FieldTypes, records: pa.StructArray) -> Mask | None:
     try:
         found = _Columns(types, records).node(root)
-    except _UnfitError:
-        return None
+    except (_UnfitError, pa.ArrowNotImplementedError):
+        return None  # Arrow has no functions for lists of JSON text either
     if found.possible is found.certain or bool((found.possible == found.certain).all()):
         return found.certain
     return None
@@ -293,8 +293,6 @@ class _Columns:
         part = parts[0]
         elements = _flattened(values, rows)
         inside = elements.values.type
-        if isinstance(inside, pa.BaseExtensionType):
-            raise _UnfitError  # JSON text, of values of several types
         named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
         if isinstance(part, int):
             if named:
