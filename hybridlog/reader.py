@@ -83,12 +83,6 @@ _HANDFUL = 50  # messages for which nothing is read ahead
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
 
 
-_NUMBERS = {
-    "bool", "byte", "char", "float32", "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Query:
     """A question about some topics of a store. Immutable: each step gives a new one."""
@@ -806,10 +800,6 @@ class Query:
         """
         return self.store.index_for(purpose, self._recordings())
 
-    def empty_plan(self) -> Plan:
-        """The channels of the question, and nothing to read."""
-        return Plan(self.lanes(), [])
-
     def pieces(self, plan: Plan) -> Iterator[Piece]:
         """The plan's messages, thinned out and limited."""
         if self._limit == 0:
@@ -1093,17 +1083,6 @@ def _is_field(path: str, known: Mapping[str, str]) -> bool:
     if is_summary(path, known):
         return True
     return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
-
-
-def summary_type(path: str, known: Mapping[str, str]) -> str | None:
-    """Type of a summary of an array of numbers (`ranges.min`), None if a path is none."""
-    array, _, what = path.rpartition(".")
-    element, bracket, _ = known.get(array, "").partition("[")
-    if not bracket or what not in {"n", "min", "max", "mean"} or element not in _NUMBERS:
-        return None
-    if what == "n" or (what != "mean" and not element.startswith("float")):
-        return "int64"
-    return "float64"
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:

@@ -22,13 +22,13 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog import tables
 from hybridlog.columns import answers as column_answers
 from hybridlog.columns import kept as kept_columns
 from hybridlog.columns import stored
 from hybridlog.columns.judged import Judged
 from hybridlog.columns.kept import MOST_BYTES
 from hybridlog.columns.topic import TopicColumns
+from hybridlog.frames import answer as tables
 from hybridlog.query.column_filter import ColumnFilter, column_filter
 from hybridlog.reader import Query
 from hybridlog_storage.catalog import RecordingEntry
