@@ -148,7 +148,7 @@ def test_summaries_beside_their_arrays(store: hl.Store, robot: Truth) -> None:
 
 def test_summaries_over_several_topics(store: hl.Store, robot: Truth) -> None:
     topics = ("/base/scan", "/odom")
-    frame = store.topics(*topics).in_recording("robot").fields("ranges.max", "header.seq")
+    frame = store.query(topics).in_recording("robot").fields("ranges.max", "header.seq")
     table = frame.to_pandas()
     assert list(table.columns) == ["topic", "ranges.max", "header.seq"]
     scans = table[table["topic"] == "/base/scan"]

@@ -48,23 +48,27 @@ def free_name(path: str, taken: Collection[str]) -> str:
 
 
 def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
-    """Column names in the order in which their fields were asked for."""
+    """Column names in the order in which their fields were asked for.
+
+    What was not asked for comes first: log time, topic, recording.
+    """
     if fields is None:
         return list(names)
+    asked = [path.replace("[]", "") for path in fields]
 
     def place(name: str) -> int:
-        field = name.rstrip("_") if name.rstrip("_") in (*RESERVED, *OPTIONAL) else name
-        for number, path in enumerate(fields):
-            plain = path.replace("[]", "")
-            if (
-                plain in {name, field}
-                or name.startswith(f"{plain}.")
-                or plain.startswith(f"{name}.")
-            ):
-                return number
-        return -1  # what was not asked for comes first: log time, topic
+        # A field that is called as a column of ours has an underscore more.
+        same = {name, name.rstrip("_")} if is_own(name.rstrip("_")) else {name}
+        exact = (number for number, path in enumerate(asked) if path in same)
+        near = (number for number, path in enumerate(asked) if _is_part(name, path))
+        return next(exact, next(near, -1))
 
     return sorted(names, key=place)
+
+
+def _is_part(name: str, path: str) -> bool:
+    """Whether one of two paths is a part of the other."""
+    return name.startswith(f"{path}.") or path.startswith(f"{name}.")
 
 
 def summary_of(path: str) -> tuple[str, str] | None:
