@@ -737,6 +737,8 @@ class TableWriter:
             target = self._parts / f"new-{self._numbers}"
             files.make_folder(target, depth=files.IN_RECORDING)
         for path, name in finished:
+            if target == place:
+                files.remove_tree(target / name, depth=IN_TOPIC)
             files.rename(path, target / name, depth=files.IN_RECORDING, new_depth=IN_TOPIC)
         if target != place:
             old = self._parts / f"old-{self._numbers}"

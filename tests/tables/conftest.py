@@ -36,5 +36,5 @@ def recorded(store: hl.Store, tmp_path: Path) -> hl.Store:
     topics = ["/large", "/large", "/large", "/small/one", "/large", "/small/two"]
     said = [(BASE + n * 11 // 3, topics[n % 6], varied(n)) for n in range(1800)]
     log = write_log(tmp_path / "log.mcap", said)
-    store.record(log, name="log", settings=SMALL_CHUNKS)
+    store.record(log, name="log", settings=SegmentSettings(chunk_size=32 << 10))
     return store

@@ -149,9 +149,18 @@ class Decoded:
             self.value = None
 
 
+_DECODED: dict[tuple[str, str], list[Decoded]] = {}
+
+
 def decoded(store: hl.Store, recording: str, topic: str) -> list[Decoded]:
-    """All messages of a topic, in order, decoded one by one."""
-    return [Decoded(message) for message in store.query([topic], [recording])]
+    """All messages of a topic, in order, decoded one by one; each only once."""
+    (entry,) = store.select([recording])
+    key = entry.id, topic
+    if key not in _DECODED:
+        if len(_DECODED) > 50:
+            _DECODED.clear()
+        _DECODED[key] = [Decoded(message) for message in store.query([topic], [entry.id])]
+    return _DECODED[key]
 
 
 def same(cell: Any, value: Any) -> bool:

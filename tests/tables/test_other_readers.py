@@ -152,9 +152,8 @@ def test_several_recordings_are_one_table(recorded: hl.Store, tmp_path: Path) ->
     said = [(BASE + SECOND + n, "/large", varied(n)) for n in range(1000)]
     recorded.record(write_log(tmp_path / "more.mcap", said), name="more")
     query = "select count(*) from read_parquet(?) where i8 = 1"
-    want = sum(
-        m.value.i8 == 1 for name in ("log", "more") for m in decoded(recorded, name, "/large")
-    )
+    messages = [m for name in ("log", "more") for m in decoded(recorded, name, "/large")]
+    want = sum(m.value.i8 == 1 for m in messages)
     assert duckdb.execute(query, [glob_of(recorded)]).fetchone() == (want,)
     assert ds.dataset(recorded.directory.path / "tables").count_rows() == 2800
 
