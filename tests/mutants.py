@@ -173,30 +173,30 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/live_sources/foxglove_session.py",
+        "hybridlog/live/sources/foxglove/session.py",
         (
             "gaps-are-dropped-when-a-server-leaves",
             "                numbers.finish()\n",
             "                pass\n",
-            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+            "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
     ),
     *_of(
-        "hybridlog/live_sources/foxglove_numbers.py",
+        "hybridlog/live/sources/sequence_gaps.py",
         (
             "a-gap-of-a-server-begins-at-its-end",
             "self._first = self._time",
             "self._first = received",
-            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+            "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
     ),
     *_of(
-        "hybridlog/live_sources/ros1_stream.py",
+        "hybridlog/live/sources/ros1/stream.py",
         (
             "a-gap-of-a-publisher-begins-at-its-end",
             "                count,\n                first=self._last,\n",
             "                count,\n                first=now,\n",
-            "tests/live_sources/test_ros1_parts.py::test_dropped_messages_are_counted",
+            "tests/live/sources/test_ros1_parts.py::test_dropped_messages_are_counted",
         ),
     ),
     *_of(

@@ -30,7 +30,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
-    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.live.sources.base import LiveSource
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordReport
     from hybridlog.store import Store

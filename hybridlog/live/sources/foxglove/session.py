@@ -1,0 +1,328 @@
+"""What one connection to a Foxglove server has been told, and what became of it."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from hybridlog.live.sources.base import Cause, Sink
+from hybridlog.live.sources.foxglove.protocol import (
+    Advertised,
+    PeerError,
+    parse_channel,
+    parse_text,
+    subscribe,
+    unsubscribe,
+)
+from hybridlog.live.sources.sequence_gaps import HeaderNumbers, is_numbered
+from hybridlog.live.sources.text import one_line
+from hybridlog_storage.messages import Channel
+
+_MOST_CHANNELS: Final = 1 << 16
+_MOST_RETIRED: Final = 1 << 12
+_MOST_NS: Final = 1 << 63
+_MOST_QUOTED: Final = 100
+_NO_CHANNEL = re.compile(
+    r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
+)
+_MOST_REFUSALS: Final = 20
+_AGAIN_S: Final = 0.02
+
+
+class Voice:
+    """Says things about one server, in one clear line each.
+
+    Args:
+        sink: Who is told.
+        name: The server, as people know it.
+    """
+
+    def __init__(self, sink: Sink, name: str) -> None:
+        self._sink = sink
+        self._name = name
+        self._quoted = 0
+
+    def say(self, text: str) -> None:
+        """Say something that may hold words of the server."""
+        self._sink.say(f"{self._name}: {one_line(text)}")
+
+    def complain(self, text: str) -> None:
+        """Say what the server may give reason for as often as it likes: not too often."""
+        self._quoted += 1
+        if self._quoted <= _MOST_QUOTED:
+            self.say(text)
+        elif self._quoted == _MOST_QUOTED + 1:
+            self.say(f"has given {_MOST_QUOTED} reasons to complain; further ones are not shown")
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """A subscription that the server may have refused some times.
+
+    Attributes:
+        number: Ours.
+        offer: What it is to.
+        refusals: How often the server said that there is no such channel.
+    """
+
+    number: int
+    offer: Advertised
+    refusals: int = 0
+
+
+class Session:
+    """The channels and subscriptions of one connection.
+
+    Args:
+        sink: Takes the messages.
+        voice: Says what is wrong.
+        send: Sends a JSON message.
+        missed: Topics that were recorded before, and since when they are not: ns since
+            the epoch. Topics that are there again are taken out.
+    """
+
+    def __init__(
+        self,
+        sink: Sink,
+        voice: Voice,
+        send: Callable[[str], None],
+        missed: dict[str, int],
+    ) -> None:
+        self._sink = sink
+        self._take = sink.take
+        self._voice = voice
+        self._send = send
+        self._missed = missed
+        self._next = 0
+        self._routes: dict[int, tuple[Channel, HeaderNumbers | None]] = {}
+        self._subscriptions: dict[int, _Subscription] = {}
+        self._topics: dict[str, int] = {}
+        self._retired: deque[int] = deque()
+        self._is_full = False
+        self._again: set[int] = set()
+        self._again_at = 0.0
+
+    # Messages.
+
+    def data(self, subscription: int, log_time: int, payload: bytes) -> None:
+        """Take a message."""
+        route = self._routes.get(subscription)
+        if route is None:
+            self._left_out("of a subscription that we do not have")
+            self._voice.complain(
+                "sends messages of a subscription that we do not have; they are left out"
+            )
+            return
+        channel, numbers = route
+        received = time.time_ns()
+        if log_time >= _MOST_NS:
+            self._voice.complain(
+                f"gives {channel.topic!r} a time after the year 2262; the time of receiving "
+                "stands for it"
+            )
+            log_time = received
+        self._take(channel, payload, received=received, sent=log_time)
+        if numbers is not None:
+            numbers.see(payload, received)
+
+    def too_large(self, subscription: int, size: int) -> None:
+        """A message over the limit was passed over."""
+        topic = self._topic_of(subscription)
+        if topic is None:
+            return
+        now = time.time_ns()
+        detail = f"a message of {size} bytes is over the limit of this source"
+        self._sink.lost(topic, Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
+        self._voice.complain(
+            f"{topic!r} has messages over the limit of this source; they are left out"
+        )
+
+    def cut(self, subscription: int) -> None:
+        """The connection broke in the middle of a message."""
+        topic = self._topic_of(subscription)
+        if topic is not None:
+            now = time.time_ns()
+            detail = "the connection broke in the middle of a message"
+            self._sink.lost(topic, Cause.CONNECTION, 1, first=now, last=now, detail=detail)
+
+    def broken(self, reason: str) -> None:
+        """A binary message that cannot be what it says."""
+        self._left_out("too short to be a message")
+        self._voice.complain(f"sends {reason}; it is left out")
+
+    def _left_out(self, detail: str) -> None:
+        """A message of nobody knows which topic is a row as well."""
+        now = time.time_ns()
+        self._sink.lost("", Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
+
+    def _topic_of(self, subscription: int) -> str | None:
+        route = self._routes.get(subscription)
+        return None if route is None else route[0].topic
+
+    # What the server says of itself.
+
+    def text(self, data: bytes) -> None:
+        """Act on a JSON message; those that mean nothing to a recorder are passed over."""
+        try:
+            message = parse_text(data)
+        except PeerError as error:
+            self._voice.complain(str(error))
+            return
+        match message["op"]:
+            case "advertise":
+                self._advertise(message.get("channels"))
+            case "unadvertise":
+                self._unadvertise(message.get("channelIds"))
+            case "status":
+                self._status(str(message.get("message")))
+
+    def _advertise(self, channels: object) -> None:
+        if not isinstance(channels, list):
+            self._voice.complain("advertises no list of channels; it is left out")
+            return
+        wanted: dict[int, int] = {}
+        for entry in channels:
+            try:
+                offer = parse_channel(entry)
+            except PeerError as error:
+                self._voice.complain(str(error))
+                continue
+            number = self._offered(offer)
+            if number is not None:
+                wanted[number] = offer.id
+        if wanted:
+            self._send(subscribe(wanted))
+
+    def _offered(self, offer: Advertised) -> int | None:
+        """The number of a new subscription to a channel, None when there is none to make."""
+        topic = offer.channel.topic
+        known = self._subscriptions.get(offer.id)
+        if known is not None:
+            if _alike(known.offer.channel, offer.channel):
+                return None
+            self._send(unsubscribe(known.number))
+            self._retire(offer.id)
+        if not self._sink.wants(topic, offer.type_name):
+            return None
+        if len(self._subscriptions) >= _MOST_CHANNELS:
+            if not self._is_full:
+                self._voice.say(f"has more than {_MOST_CHANNELS} channels; the rest is left out")
+            self._is_full = True
+            return None
+        if offer.problem:
+            self._voice.complain(
+                f"the definition of {topic!r} {offer.problem}; its messages are kept, their "
+                "fields cannot be searched"
+            )
+        numbers = None
+        if is_numbered(offer.channel):
+            numbers = HeaderNumbers(partial(self._missing, topic))
+        number = self._next
+        self._next += 1
+        self._subscriptions[offer.id] = _Subscription(number, offer)
+        self._routes[number] = (offer.channel, numbers)
+        self._topics[topic] = self._topics.get(topic, 0) + 1
+        self._sink.topic_came(topic, offer.type_name, self._topics[topic])
+        self._sink.expect(offer.channel)
+        since = self._missed.pop(topic, None)
+        if since is not None:
+            self._sink.lost(
+                topic,
+                Cause.CONNECTION,
+                None,
+                first=since,
+                last=time.time_ns(),
+                detail="there was no connection; what was sent meanwhile is not known",
+            )
+        return number
+
+    def _unadvertise(self, channels: object) -> None:
+        if not isinstance(channels, list):
+            self._voice.complain("takes back no list of channels; it is left out")
+            return
+        for number in channels:
+            if type(number) is int and number in self._subscriptions:
+                self._retire(number)
+
+    def _retire(self, channel_id: int) -> None:
+        """Forget a channel. Messages of it may have been overtaken, and still count."""
+        gone = self._subscriptions.pop(channel_id)
+        self._is_full = False
+        self._retired.append(gone.number)
+        if len(self._retired) > _MOST_RETIRED:
+            self._routes.pop(self._retired.popleft(), None)
+        topic = gone.offer.channel.topic
+        self._topics[topic] -= 1
+        if self._topics[topic]:
+            self._sink.topic_came(topic, gone.offer.type_name, self._topics[topic])
+        else:
+            del self._topics[topic]
+            self._sink.topic_gone(topic)
+
+    def _status(self, text: str) -> None:
+        """Act on what the server has to say, or pass it on.
+
+        A server may advertise a channel a moment before it lets anybody subscribe to it.
+        """
+        found = _NO_CHANNEL.search(text)
+        refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
+        if refused is None:
+            self._voice.complain(f"says: {text}")
+            return
+        refused.refusals += 1
+        if refused.refusals > _MOST_REFUSALS:
+            topic = refused.offer.channel.topic
+            self._voice.complain(f"offers {topic!r}, but does not send it ({text})")
+            return
+        self._again.add(refused.offer.id)
+        self._again_at = time.monotonic() + _AGAIN_S * (refused.refusals - 1)
+        self.look()
+
+    def look(self) -> None:
+        """Ask again for what was refused, when it is time."""
+        if not self._again or time.monotonic() < self._again_at:
+            return
+        wanted = {
+            self._subscriptions[number].number: number
+            for number in self._again
+            if number in self._subscriptions
+        }
+        self._again.clear()
+        if wanted:
+            self._send(subscribe(wanted))
+
+    def _missing(self, topic: str, count: int, first: int, last: int, seen: str) -> None:
+        self._sink.lost(topic, Cause.TRANSPORT, count, first=first, last=last, detail=seen)
+
+    def end(self, *, is_stopped: bool) -> None:
+        """The connection is over.
+
+        Args:
+            is_stopped: Because the user wants it so.
+        """
+        now = time.time_ns()
+        for _, numbers in self._routes.values():
+            if numbers is not None:
+                numbers.finish()
+        for topic in self._topics:
+            if not is_stopped and len(self._missed) < _MOST_CHANNELS:
+                self._missed[topic] = now
+            self._sink.topic_gone(topic)
+        self._topics.clear()
+        self._subscriptions.clear()
+        self._routes.clear()
+
+
+def _alike(one: Channel, other: Channel) -> bool:
+    """Whether two channels cannot be told apart."""
+    return (one.topic, one.message_encoding, one.schema, one.metadata) == (
+        other.topic,
+        other.message_encoding,
+        other.schema,
+        other.metadata,
+    )

@@ -1,0 +1,277 @@
+"""One TCPROS connection after its handshake: cuts messages out of what the socket gives.
+
+Small messages are cut out of blocks, many from one read. A large one is read by itself,
+behind its length, so that its bytes are copied once, from the kernel into the object
+that is handed over; the kernel is asked to wake us when all of it has come. When more
+waits than that, because other threads kept us from reading, large ones too are cut out
+of blocks: each read may cost a turn of the interpreter, which is dearer than a copy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import socket
+import struct
+import termios
+import time
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.ros1.wire import u32
+from hybridlog.live.sources.sequence_gaps import Counting, is_numbered
+from hybridlog.live.sources.text import one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hybridlog.live.sources.base import Sink
+    from hybridlog_storage.messages import Channel
+
+_BLOCK: Final = 256 << 10
+_LARGE: Final = 64 << 10
+_PIECE: Final = 4 << 20
+_WAKE: Final = 1 << 20
+_NOTHING: Final = bytes(struct.calcsize("i"))
+
+
+class Stream:
+    """Reads one connection. All methods are called by one thread.
+
+    Attributes:
+        socket: Connected, not blocking; closed by `close`.
+        closed: Called once by `close`, with what went wrong, empty for an orderly end.
+        failure: What was wrong when `read` said that this is the end.
+    """
+
+    def __init__(
+        self,
+        connected: socket.socket,
+        channel: Channel,
+        sink: Sink,
+        max_message_bytes: int,
+        closed: Callable[[str], None],
+    ) -> None:
+        self.socket = connected
+        self.closed = closed
+        self.failure = ""
+        self._channel = channel
+        self._sink = sink
+        self._limit = max_message_bytes
+        self._block = self._shortest = min(_BLOCK, max_message_bytes + 4)
+        self._longest = min(_PIECE, max_message_bytes + 4)
+        self._counting = Counting() if is_numbered(channel) else None
+        self._publisher = f"publisher {one_line(channel.metadata.get('callerid', '') or 'unknown')}"
+        # Of the message that is not whole yet: its first bytes and how many are missing;
+        # without a length yet, what there is of the length.
+        self._parts: list[bytes] = []
+        self._missing = 0
+        self._prefix = b""
+        self._large = 0
+        self._wakes_at = 1
+        self._since = self._last = time.time_ns()
+        # Linux makes room for what it is asked to collect: what comes while we are kept
+        # from reading then waits here, not in the publisher's short queue.
+        self._wake_at(_PIECE)
+        self._wake_at(1)
+
+    def read(self) -> bool:
+        """Reads once and hands over every message that is whole.
+
+        Returns:
+            Whether there may be more; if not, `failure` says why unless the publisher
+            just closed.
+        """
+        want = min(self._missing, _PIECE)
+        if want < _LARGE:
+            want = self._block if want or not self._large else self._next_large()
+            want -= len(self._prefix)
+        try:
+            data = self.socket.recv(want)
+        except BlockingIOError:
+            return True
+        except OSError as error:
+            self.failure = f"the connection broke: {error.strerror or error}"
+            # What was under way is discarded by the kernel, and nobody knows how much.
+            self._sink.lost(
+                self._channel.topic,
+                Cause.CONNECTION,
+                None,
+                first=self._last,
+                last=time.time_ns(),
+                detail=f"{self._publisher}: {self.failure}",
+            )
+            return False
+        now = time.time_ns()
+        if not data:
+            self._cut_off(now)
+            return False
+        if len(data) == self._block:
+            self._block = min(2 * self._block, self._longest)
+        elif len(data) < self._block // 4:
+            self._block = max(self._block // 2, self._shortest)
+        alive = self._split(data, now)
+        self._last = now
+        return alive
+
+    def close(self) -> None:
+        """Closes the socket and tells whoever waits for it."""
+        self.socket.close()
+        self.closed(self.failure)
+
+    def _split(self, data: bytes, now: int) -> bool:
+        """Takes what a read gave; False when the stream makes no sense."""
+        pos = 0
+        if self._missing:
+            pos = self._missing
+            if len(data) < pos:
+                self._parts.append(data)
+                self._missing -= len(data)
+                self._wake_at(min(self._missing, _WAKE))
+                return True
+            self._finish(data if len(data) == pos else data[:pos], now)
+        if self._prefix:
+            data = self._prefix + data
+            self._prefix = b""
+        pos = (
+            self._cut(data, pos, now)
+            if self._counting is None
+            else self._cut_numbered(data, pos, now, self._counting)
+        )
+        return pos == len(data) or self._begin(data, pos, now)
+
+    def _finish(self, rest: bytes, now: int) -> None:
+        """Hands over the message that was not whole until now."""
+        if self._parts:
+            self._parts.append(rest)
+            rest = b"".join(self._parts)
+            self._parts = []
+        self._missing = 0
+        self._wake_at(1)
+        self._large = len(rest) if len(rest) >= _LARGE else 0
+        if self._counting is None or len(rest) < 4:
+            self._sink.take(self._channel, rest, received=now)
+            return
+        number = u32(rest, 0)[0]
+        if number != self._counting.expected:
+            self._gap(self._counting.jump(number), now)
+        else:
+            self._counting.expected = number + 1 & 0xFFFFFFFF
+        self._sink.take(self._channel, rest, received=now, sequence=number)
+
+    def _cut(self, data: bytes, pos: int, now: int) -> int:
+        """Hands over all whole messages from `pos` on.
+
+        Returns:
+            Where the first one begins that is not whole.
+        """
+        take, channel, length = self._sink.take, self._channel, u32
+        last = len(data) - 4
+        while pos <= last:
+            start = pos + 4
+            end = start + length(data, pos)[0]
+            if end > last + 4:
+                break
+            take(channel, data[start:end], received=now)
+            pos = end
+        return pos
+
+    def _cut_numbered(self, data: bytes, pos: int, now: int, counting: Counting) -> int:
+        """Like `_cut`, for messages that begin with the publisher's count."""
+        take, channel, length = self._sink.take, self._channel, u32
+        last = len(data) - 4
+        lost = 0
+        while pos <= last:
+            start = pos + 4
+            end = start + length(data, pos)[0]
+            if end > last + 4:
+                break
+            if end - start < 4:
+                take(channel, data[start:end], received=now)
+            else:
+                number = length(data, start)[0]
+                if number != counting.expected:
+                    lost += counting.jump(number)
+                else:
+                    counting.expected = number + 1 & 0xFFFFFFFF
+                take(channel, data[start:end], received=now, sequence=number)
+            pos = end
+        self._gap(lost, now)
+        return pos
+
+    def _begin(self, data: bytes, pos: int, now: int) -> bool:
+        """Keeps the beginning of a message; False when it cannot be one."""
+        self._since = now
+        if len(data) - pos < 4:
+            self._prefix = data[pos:]
+            return True
+        size = u32(data, pos)[0]
+        if size > self._limit:
+            self.failure = (
+                f"it announced a message of {size} bytes; more than {self._limit} are not taken"
+            )
+            self._sink.lost(
+                self._channel.topic,
+                Cause.UNREADABLE,
+                1,
+                first=now,
+                last=now,
+                detail=f"{self._publisher}: {self.failure}",
+            )
+            return False
+        begun = data[pos + 4 :]
+        self._parts = [begun] if begun else []
+        self._missing = size - len(begun)
+        self._large = size if size >= _LARGE else 0
+        self._wake_at(min(self._missing, _WAKE))
+        return True
+
+    def _next_large(self) -> int:
+        """How much to read behind a large message.
+
+        Just the next length, as a rule: the next large message then begins an object of
+        its own. But if more than one waits already, all that waits.
+        """
+        answer = fcntl.ioctl(self.socket, termios.FIONREAD, _NOTHING)
+        waiting = int(struct.unpack("i", answer)[0])
+        return 4 if waiting <= self._large + 8 else min(waiting, self._longest)
+
+    def _gap(self, count: int, now: int) -> None:
+        """Notes messages that the publisher counted and that never came."""
+        if count:
+            self._sink.lost(
+                self._channel.topic,
+                Cause.TRANSPORT,
+                count,
+                first=self._last,
+                last=now,
+                detail=f"{self._publisher}: dropped in its queue",
+            )
+
+    def _cut_off(self, now: int) -> None:
+        """The publisher has closed: in the middle of a message, that one is lost."""
+        have = sum(map(len, self._parts)) + len(self._prefix)
+        if not have and not self._missing:
+            return
+        of = f" of {have + self._missing}" if self._missing else ""
+        self.failure = f"it closed in the middle of a message, after {have}{of} bytes"
+        self._sink.lost(
+            self._channel.topic,
+            Cause.CONNECTION,
+            1,
+            first=self._since,
+            last=now,
+            detail=f"{self._publisher}: {self.failure}",
+        )
+
+    def _wake_at(self, count: int) -> None:
+        """Asks the kernel to report the socket only when so many bytes are there.
+
+        It also does so at the end of the stream, and when it has no room for as many.
+        """
+        count = count if count >= _LARGE else 1
+        if count != self._wakes_at:
+            self._wakes_at = count
+            # Where a system does not know the option, it wakes us more often.
+            with contextlib.suppress(OSError):
+                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, count)

@@ -1,0 +1,267 @@
+"""The child process: which Python it runs under, how it is started and ended.
+
+rclpy belongs to the Python of a ROS environment, which may be another version than ours,
+and the wheels of rclpy start Python anew each time. So it lives in a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from contextlib import suppress
+from json import dumps
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.live.sources.ros2.child.wire import (
+    EVENT,
+    HEADER,
+    WireError,
+    check_frame,
+    parse_object,
+)
+from hybridlog.live.sources.text import one_line
+from hybridlog_storage.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import IO
+
+PYTHON_VARIABLE = "HYBRIDLOG_ROS2_PYTHON"
+
+START = Path(__file__).with_name("child") / "__main__.py"
+
+HELLO_S = 30.0
+"""How long a child may take to load rclpy and to greet."""
+
+SOCKET_BYTES = 4 << 20
+"""What the socket is asked to hold; the kernel may give less."""
+
+_GLANCE_S = 0.2
+_WORDS = 30
+_WORD = 300
+_MAX_HELLO = 1 << 16
+
+_CURE = (
+    "on a robot, source the set-up file of ROS first (source /opt/ros/DISTRO/setup.bash); "
+    "elsewhere install the wheels into a virtual environment of their own (python3 -m venv ros2; "
+    "ros2/bin/pip install ros-rclpy ros-rmw-fastrtps-cpp ros-std-msgs ros-sensor-msgs "
+    f"ros-geometry-msgs) and name its Python: {PYTHON_VARIABLE}=ros2/bin/python"
+)
+
+
+class ChildError(Exception):
+    """A child that did not come up; the message is one line that says why."""
+
+
+class ChildMissingError(ChildError):
+    """A Python that is none, or that has no rclpy."""
+
+
+class Process:
+    """A child that has greeted.
+
+    Args:
+        python: The interpreter.
+        settings: What it needs to know first.
+        environment: Its environment.
+        cancelled: Set when nobody wants it any more, even before it has greeted.
+
+    Attributes:
+        hello: What it said of itself.
+        peer: The socket to it.
+
+    Raises:
+        ChildMissingError: No such Python, or no rclpy in it.
+        ChildError: It failed otherwise.
+    """
+
+    def __init__(
+        self,
+        python: str,
+        settings: Mapping[str, Any],
+        environment: Mapping[str, str],
+        cancelled: Event,
+    ) -> None:
+        self.peer, theirs = socket.socketpair()
+        self._cancelled = cancelled
+        self._words: deque[str] = deque(maxlen=_WORDS)
+        for end, option in ((self.peer, socket.SO_RCVBUF), (theirs, socket.SO_SNDBUF)):
+            end.setsockopt(socket.SOL_SOCKET, option, SOCKET_BYTES)
+        try:
+            with theirs:
+                self._process = subprocess.Popen(  # noqa: S603
+                    [python, "-u", str(START), str(theirs.fileno())],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    pass_fds=[theirs.fileno()],
+                    env=dict(environment),
+                    # Ctrl-C is for the recorder, which ends its child in good order.
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self.peer.close()
+            raise ChildMissingError(f"{python} cannot be started: {error.strerror}") from error
+        assert self._process.stdout is not None
+        self._listener = Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
+        self._listener.start()
+        self.pid = self._process.pid
+        try:
+            self.hello = self._greet(python, settings)
+        except BaseException:
+            self.end()
+            raise
+
+    def _listen(self, output: IO[bytes]) -> None:
+        """Keeps the last lines that it prints; they may say why it died."""
+        with output:
+            while line := output.readline(1 << 12):
+                self._words.append(line.decode(errors="replace").strip()[:_WORD])
+
+    def _greet(self, python: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+        deadline = time.monotonic() + HELLO_S
+        self.peer.settimeout(_GLANCE_S)
+        try:
+            self.peer.sendall(dumps(settings).encode("ascii") + b"\n")
+            kind, length = HEADER.unpack(self._receive(HEADER.size, deadline))
+            check_frame(kind, length)
+            if kind != EVENT or length > _MAX_HELLO:
+                raise WireError("something else than a greeting")
+            hello = parse_object(self._receive(length, deadline))
+        except TimeoutError as error:
+            raise ChildError(f"{python} did not load rclpy within {HELLO_S:.0f} s") from error
+        except OSError as error:
+            raise ChildMissingError(f"{python} ended: {self.last_words()}") from error
+        except WireError as error:
+            raise ChildError(f"{python}: {error}") from error
+        self.peer.settimeout(None)
+        if hello.get("event") == "hello":
+            return hello
+        why = f"{python}: {one_line(str(hello.get('why')))}"
+        raise ChildMissingError(why) if hello.get("missing") else ChildError(why)
+
+    def _receive(self, size: int, deadline: float) -> bytes:
+        """So many bytes, until a time of the monotonic clock.
+
+        Raises:
+            OSError: There will be no more, or they take too long.
+        """
+        parts = b""
+        while len(parts) < size:
+            if self._cancelled.is_set() or time.monotonic() > deadline:
+                raise TimeoutError
+            try:
+                part = self.peer.recv(size - len(parts))
+            except TimeoutError:
+                continue
+            if not part:
+                raise ConnectionResetError
+            parts += part
+        return parts
+
+    def last_words(self) -> str:
+        """What it printed last, and how it ended if it has; one line."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self._listener.join(1.0)
+        code = self._process.returncode
+        if code is None:
+            how = "it still runs"
+        elif code < 0:
+            with suppress(ValueError):
+                code = signal.Signals(-code).name
+            how = f"killed by {code}"
+        else:
+            how = f"exit code {code}"
+        words = [line for line in self._words if line]
+        return one_line(f"{how}: {words[-1]}" if words else how)
+
+    def no_more_orders(self) -> None:
+        """Asks it to hand over what it has, and to end."""
+        with suppress(OSError):
+            self.peer.shutdown(socket.SHUT_WR)
+
+    def terminate(self) -> None:
+        """Asks it less gently."""
+        self._process.terminate()
+
+    def kill(self) -> None:
+        """Ends it, and whoever reads from it."""
+        self._process.kill()
+        with suppress(OSError):
+            self.peer.shutdown(socket.SHUT_RDWR)
+
+    def end(self) -> None:
+        """Makes sure that nothing is left of it. Takes two seconds at most."""
+        self.no_more_orders()
+        for harder, seconds in ((self._process.terminate, 1.0), (self._process.kill, None)):
+            if self._process.poll() is not None:
+                break
+            harder()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(seconds)
+        self._process.wait()
+        self._listener.join(1.0)
+        self.peer.close()
+
+
+def launch(
+    python: str | None, settings: Mapping[str, Any], domain_id: int | None, cancelled: Event
+) -> tuple[Process, str]:
+    """Starts a child under the first Python that has rclpy.
+
+    Args:
+        python: The only one to try; None for those that `candidates` names.
+        settings: What the child needs to know first.
+        domain_id: ROS domain, None for that of the environment.
+        cancelled: Set when nobody wants it any more.
+
+    Returns:
+        The child, and its Python.
+
+    Raises:
+        MissingDependencyError: None has.
+        ChildError: rclpy is there, and does not come up.
+    """
+    tried = []
+    for name in [python] if python else candidates(os.environ):
+        try:
+            environment = environment_for(name, domain_id)
+            return Process(name, settings, environment, cancelled), name
+        except ChildMissingError as error:
+            tried.append(str(error))
+    raise MissingDependencyError(
+        f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_CURE}"
+    )
+
+
+def candidates(environment: Mapping[str, str]) -> Sequence[str]:
+    """Interpreters that may have rclpy, the likeliest first; at least one."""
+    named = environment.get(PYTHON_VARIABLE)
+    if named:
+        return [named]
+    found = []
+    if environment.get("ROS_DISTRO") or environment.get("AMENT_PREFIX_PATH"):
+        # Ours may be the first on the PATH; a robot's ROS is built for the system's.
+        on_path = shutil.which("python3", path=environment.get("PATH"))
+        found = [path for path in (on_path, "/usr/bin/python3") if path and Path(path).exists()]
+    return list(dict.fromkeys([*found, sys.executable]))
+
+
+def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
+    """The environment of a child."""
+    found = dict(os.environ)
+    if python != sys.executable:
+        # The wheels look for their libraries once; ours may not be those of the child.
+        found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    if domain_id is not None:
+        found["ROS_DOMAIN_ID"] = str(domain_id)
+    return found
