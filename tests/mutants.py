@@ -176,7 +176,7 @@ MUTANTS = [
         "hybridlog/live/sources/foxglove/session.py",
         (
             "gaps-are-dropped-when-a-server-leaves",
-            "                numbers.finish()\n",
+            "                self._report(channel.topic, gaps.finish())\n",
             "                pass\n",
             "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
@@ -185,8 +185,8 @@ MUTANTS = [
         "hybridlog/live/sources/sequence_gaps.py",
         (
             "a-gap-of-a-server-begins-at-its-end",
-            "self._first = self._time",
-            "self._first = received",
+            "self.jump(number, self._received, received)",
+            "self.jump(number, received, received)",
             "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
     ),
@@ -194,8 +194,8 @@ MUTANTS = [
         "hybridlog/live/sources/ros1/stream.py",
         (
             "a-gap-of-a-publisher-begins-at-its-end",
-            "                count,\n                first=self._last,\n",
-            "                count,\n                first=now,\n",
+            "                    gaps.jump(number, self._last, now)\n",
+            "                    gaps.jump(number, now, now)\n",
             "tests/live/sources/test_ros1_parts.py::test_dropped_messages_are_counted",
         ),
     ),

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from hybridlog.live.sources.foxglove import protocol as foxglove_protocol
 from hybridlog.live.sources.foxglove import session as foxglove_session
 from hybridlog.live.sources.foxglove.protocol import PeerError, parse_channel
 from hybridlog.live.sources.foxglove.source import FoxgloveSource
-from hybridlog.live.sources.sequence_gaps import HeaderNumbers
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
 from tests.live.sources.heard import DEADLINE_S, Heard
@@ -332,47 +331,6 @@ def test_a_broken_definition_leaves_a_channel_without(
     found = parse_channel(channel(encoding=encoding, schema=schema))
     assert found.channel.schema == Schema("T", "", b"")
     assert problem in found.problem
-
-
-def numbers_lost(numbers: Sequence[int]) -> list[tuple[int, int, int, str]]:
-    rows: list[tuple[int, int, int, str]] = []
-    follower = HeaderNumbers(lambda *row: rows.append(row))
-    for at, number in enumerate(numbers):
-        follower.see(struct.pack("<I", number & 0xFFFFFFFF) + b"rest", at)
-    follower.finish()
-    return rows
-
-
-def test_gaps_in_a_trusted_count_are_losses() -> None:
-    assert numbers_lost(range(1000)) == []
-    gap = [*range(100), *range(110, 200)]
-    assert numbers_lost(gap) == [(10, 99, 100, "header.seq went from 99 to 110")]
-    # Under load gaps come close together: all of them count, in few rows.
-    many = [*range(100), *range(100, 400, 3)]
-    assert sum(row[0] for row in numbers_lost(many)) == 2 * 99
-    assert len(numbers_lost(many)) < 20
-    around = [*range(-100, -1), *range(5, 100)]
-    assert [row[0] for row in numbers_lost(around)] == [6]
-
-
-@pytest.mark.parametrize(
-    "numbers",
-    [
-        range(0, 10000, 10),  # throttled
-        [0] * 1000,  # nobody counts
-        [n for pair in zip(range(500), range(90000, 90500), strict=True) for n in pair],
-        [*range(100), *range(5000, 5004), *range(100, 200)],  # another publisher for a moment
-        [*range(100), *range(50)],  # begins anew
-        [*range(100), *range(1 << 20, (1 << 20) + 100)],
-        [*range(10), *range(20, 100)],  # too early to know
-    ],
-)
-def test_counts_that_are_none_are_no_losses(numbers: Sequence[int]) -> None:
-    assert numbers_lost(numbers) == []
-
-
-def test_a_payload_without_room_for_a_number_is_passed_over() -> None:
-    HeaderNumbers(lambda *_: pytest.fail("nothing is lost")).see(b"abc", 1)
 
 
 # With a server that sends what a test wants.

@@ -23,7 +23,7 @@ from hybridlog.live.sources.ros1.wire import (
     decode_header,
     encode_header,
 )
-from hybridlog.live.sources.sequence_gaps import Counting, is_numbered
+from hybridlog.live.sources.sequence_gaps import has_sequence_numbers
 from hybridlog.live.sources.text import one_line
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.sources.ros1_peers import Collector, framed
@@ -111,10 +111,10 @@ def test_a_type_without_definition_and_none_at_all() -> None:
 )
 def test_types_that_publishers_number(definition: str, numbered: bool) -> None:
     fields = {"type": "a/B", "message_definition": definition}
-    assert is_numbered(channel_of("/t", fields)) is numbered
-    assert not is_numbered(channel_of("/t", {**fields, "latching": "1"}))
+    assert has_sequence_numbers(channel_of("/t", fields)) is numbered
+    assert not has_sequence_numbers(channel_of("/t", {**fields, "latching": "1"}))
     ros2 = Schema("a/B", "ros2msg", definition.encode())
-    assert not is_numbered(Channel("/t", "cdr", ros2))
+    assert not has_sequence_numbers(Channel("/t", "cdr", ros2))
 
 
 @pytest.mark.parametrize("text", ["\x1b[2J", "a\nb", "\x9b1m", "\u202eabc", "x" * 5000, "\ud800"])
@@ -192,40 +192,6 @@ def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None
         warnings.simplefilter("always")
         asyncio.run(stopped_after_turns())
     assert [str(warning.message) for warning in told] == []
-
-
-# Counting
-
-
-def _missing(numbers: list[int]) -> int:
-    counting = Counting()
-    lost = 0
-    for number in numbers:
-        if number == counting.expected:
-            counting.expected = number + 1 & 0xFFFFFFFF
-        else:
-            lost += counting.jump(number)
-    return lost
-
-
-@pytest.mark.parametrize(
-    ("numbers", "lost"),
-    [
-        ([*range(9), 12], 3),
-        ([*range(8), 12], 0),  # not long enough to be believed
-        ([*range(9), 12, 13, 15, 17], 5),  # once believed, it stays so
-        ([*range(2**32 - 10, 2**32), 0, 1, 3], 1),  # it wraps
-        ([0] * 50, 0),
-        ([*range(20), 5, 9, 30], 0),  # back: no longer believed
-        ([*range(20), 19, 25], 0),  # again the same
-        ([*range(20), 5, *range(6, 14), 16], 2),  # earned anew
-        (list(range(0, 200, 3)), 0),  # throttled by somebody
-        ([*range(20), 20 + 2_000_000, 2_000_025], 0),  # too far to be a loss
-        ([7, 1, 9, 2, 8], 0),
-    ],
-)
-def test_gaps(numbers: list[int], lost: int) -> None:
-    assert _missing(numbers) == lost
 
 
 # Cutting

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from struct import Struct
 from typing import Final
 
 from hybridlog.live.sources.base import Cause, Sink
@@ -19,7 +19,12 @@ from hybridlog.live.sources.foxglove.protocol import (
     subscribe,
     unsubscribe,
 )
-from hybridlog.live.sources.sequence_gaps import HeaderNumbers, is_numbered
+from hybridlog.live.sources.sequence_gaps import (
+    SequenceGap,
+    SequenceGapDetector,
+    has_sequence_numbers,
+    joined_gap,
+)
 from hybridlog.live.sources.text import one_line
 from hybridlog_storage.messages import Channel
 
@@ -32,6 +37,7 @@ _NO_CHANNEL = re.compile(
 )
 _MOST_REFUSALS: Final = 20
 _AGAIN_S: Final = 0.02
+_NUMBER: Final = Struct("<I").unpack_from
 
 
 class Voice:
@@ -99,7 +105,7 @@ class Session:
         self._send = send
         self._missed = missed
         self._next = 0
-        self._routes: dict[int, tuple[Channel, HeaderNumbers | None]] = {}
+        self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
         self._subscriptions: dict[int, _Subscription] = {}
         self._topics: dict[str, int] = {}
         self._retired: deque[int] = deque()
@@ -118,7 +124,7 @@ class Session:
                 "sends messages of a subscription that we do not have; they are left out"
             )
             return
-        channel, numbers = route
+        channel, gaps = route
         received = time.time_ns()
         if log_time >= _MOST_NS:
             self._voice.complain(
@@ -127,8 +133,10 @@ class Session:
             )
             log_time = received
         self._take(channel, payload, received=received, sent=log_time)
-        if numbers is not None:
-            numbers.see(payload, received)
+        if gaps is not None and len(payload) >= 4:
+            gaps.see(_NUMBER(payload)[0], received)
+            if gaps.waiting:
+                self._report(channel.topic, gaps.confirmed())
 
     def too_large(self, subscription: int, size: int) -> None:
         """A message over the limit was passed over."""
@@ -219,13 +227,11 @@ class Session:
                 f"the definition of {topic!r} {offer.problem}; its messages are kept, their "
                 "fields cannot be searched"
             )
-        numbers = None
-        if is_numbered(offer.channel):
-            numbers = HeaderNumbers(partial(self._missing, topic))
+        gaps = SequenceGapDetector() if has_sequence_numbers(offer.channel) else None
         number = self._next
         self._next += 1
         self._subscriptions[offer.id] = _Subscription(number, offer)
-        self._routes[number] = (offer.channel, numbers)
+        self._routes[number] = (offer.channel, gaps)
         self._topics[topic] = self._topics.get(topic, 0) + 1
         self._sink.topic_came(topic, offer.type_name, self._topics[topic])
         self._sink.expect(offer.channel)
@@ -296,8 +302,18 @@ class Session:
         if wanted:
             self._send(subscribe(wanted))
 
-    def _missing(self, topic: str, count: int, first: int, last: int, seen: str) -> None:
-        self._sink.lost(topic, Cause.TRANSPORT, count, first=first, last=last, detail=seen)
+    def _report(self, topic: str, gaps: list[SequenceGap]) -> None:
+        """Notes messages that a publisher counted and that never came, in one row."""
+        if gaps:
+            gap = joined_gap(gaps)
+            self._sink.lost(
+                topic,
+                Cause.TRANSPORT,
+                gap.missing,
+                first=gap.first,
+                last=gap.last,
+                detail=f"header.seq went from {gap.before} to {gap.after}",
+            )
 
     def end(self, *, is_stopped: bool) -> None:
         """The connection is over.
@@ -306,9 +322,9 @@ class Session:
             is_stopped: Because the user wants it so.
         """
         now = time.time_ns()
-        for _, numbers in self._routes.values():
-            if numbers is not None:
-                numbers.finish()
+        for channel, gaps in self._routes.values():
+            if gaps is not None:
+                self._report(channel.topic, gaps.finish())
         for topic in self._topics:
             if not is_stopped and len(self._missed) < _MOST_CHANNELS:
                 self._missed[topic] = now

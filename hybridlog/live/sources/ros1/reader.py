@@ -106,7 +106,7 @@ class Reader:
             self._stopping = True
         for key in list(self._selector.get_map().values()):
             if key.data is not None:
-                key.data.socket.close()
+                key.data.finish()
         for stream in self._new:
             stream.socket.close()
         self._selector.close()

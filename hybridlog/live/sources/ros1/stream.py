@@ -19,11 +19,15 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros1.wire import u32
-from hybridlog.live.sources.sequence_gaps import Counting, is_numbered
+from hybridlog.live.sources.sequence_gaps import (
+    SequenceGap,
+    SequenceGapDetector,
+    has_sequence_numbers,
+)
 from hybridlog.live.sources.text import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from hybridlog.live.sources.base import Sink
     from hybridlog_storage.messages import Channel
@@ -60,7 +64,7 @@ class Stream:
         self._limit = max_message_bytes
         self._block = self._shortest = min(_BLOCK, max_message_bytes + 4)
         self._longest = min(_PIECE, max_message_bytes + 4)
-        self._counting = Counting() if is_numbered(channel) else None
+        self._gaps = SequenceGapDetector() if has_sequence_numbers(channel) else None
         self._publisher = f"publisher {one_line(channel.metadata.get('callerid', '') or 'unknown')}"
         # Of the message that is not whole yet: its first bytes and how many are missing;
         # without a length yet, what there is of the length.
@@ -114,9 +118,15 @@ class Stream:
         self._last = now
         return alive
 
-    def close(self) -> None:
-        """Closes the socket and tells whoever waits for it."""
+    def finish(self) -> None:
+        """Closes the socket, and reports the losses that are still unconfirmed."""
         self.socket.close()
+        if self._gaps is not None:
+            self._report(self._gaps.finish())
+
+    def close(self) -> None:
+        """Finishes, and calls `closed`."""
+        self.finish()
         self.closed(self.failure)
 
     def _split(self, data: bytes, now: int) -> bool:
@@ -135,8 +145,8 @@ class Stream:
             self._prefix = b""
         pos = (
             self._cut(data, pos, now)
-            if self._counting is None
-            else self._cut_numbered(data, pos, now, self._counting)
+            if self._gaps is None
+            else self._cut_numbered(data, pos, now, self._gaps)
         )
         return pos == len(data) or self._begin(data, pos, now)
 
@@ -149,14 +159,14 @@ class Stream:
         self._missing = 0
         self._wake_at(1)
         self._large = len(rest) if len(rest) >= _LARGE else 0
-        if self._counting is None or len(rest) < 4:
+        if self._gaps is None or len(rest) < 4:
             self._sink.take(self._channel, rest, received=now)
             return
         number = u32(rest, 0)[0]
-        if number != self._counting.expected:
-            self._gap(self._counting.jump(number), now)
+        if number == self._gaps.expected:
+            self._gaps.expected = number + 1 & 0xFFFFFFFF
         else:
-            self._counting.expected = number + 1 & 0xFFFFFFFF
+            self._gaps.jump(number, self._last, now)
         self._sink.take(self._channel, rest, received=now, sequence=number)
 
     def _cut(self, data: bytes, pos: int, now: int) -> int:
@@ -176,11 +186,10 @@ class Stream:
             pos = end
         return pos
 
-    def _cut_numbered(self, data: bytes, pos: int, now: int, counting: Counting) -> int:
+    def _cut_numbered(self, data: bytes, pos: int, now: int, gaps: SequenceGapDetector) -> int:
         """Like `_cut`, for messages that begin with the publisher's count."""
         take, channel, length = self._sink.take, self._channel, u32
         last = len(data) - 4
-        lost = 0
         while pos <= last:
             start = pos + 4
             end = start + length(data, pos)[0]
@@ -190,13 +199,14 @@ class Stream:
                 take(channel, data[start:end], received=now)
             else:
                 number = length(data, start)[0]
-                if number != counting.expected:
-                    lost += counting.jump(number)
+                if number == gaps.expected:
+                    gaps.expected = number + 1 & 0xFFFFFFFF
                 else:
-                    counting.expected = number + 1 & 0xFFFFFFFF
+                    gaps.jump(number, self._last, now)
                 take(channel, data[start:end], received=now, sequence=number)
             pos = end
-        self._gap(lost, now)
+        if gaps.waiting:
+            self._report(gaps.confirmed())
         return pos
 
     def _begin(self, data: bytes, pos: int, now: int) -> bool:
@@ -236,15 +246,15 @@ class Stream:
         waiting = int(struct.unpack("i", answer)[0])
         return 4 if waiting <= self._large + 8 else min(waiting, self._longest)
 
-    def _gap(self, count: int, now: int) -> None:
+    def _report(self, gaps: Sequence[SequenceGap]) -> None:
         """Notes messages that the publisher counted and that never came."""
-        if count:
+        for gap in gaps:
             self._sink.lost(
                 self._channel.topic,
                 Cause.TRANSPORT,
-                count,
-                first=self._last,
-                last=now,
+                gap.missing,
+                first=gap.first,
+                last=gap.last,
                 detail=f"{self._publisher}: dropped in its queue",
             )
 
