@@ -145,7 +145,7 @@ MUTANTS = [
         "hybridlog/live/recording.py",
         (
             "chunks-flushed-three-intervals-late",
-            "flush_older(interval * _FLUSHED - 2 * tick)",
+            "flush_older(interval * _FLUSH_AT - 2 * tick)",
             "flush_older(3 * interval)",
             "tests/live/test_recording.py::test_chunks_are_flushed_within_the_interval",
         ),

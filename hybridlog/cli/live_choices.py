@@ -114,7 +114,7 @@ def recorder_options(
         UsageError: An option that makes no sense.
         TopicError: A pattern that is malformed.
     """
-    from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
+    from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
@@ -137,9 +137,9 @@ def recorder_options(
         max_messages=live.max_messages,
         max_bytes=None if live.max_size is None else _size("--max-size", live.max_size, 1),
         reserve_bytes=_size("--reserve", live.reserve),
-        budget_bytes=usual_budget()
+        budget_bytes=default_budget()
         if live.budget is None
-        else _size("--budget", live.budget, LEAST_ASKED_FOR),
+        else _size("--budget", live.budget, MIN_USER_BUDGET),
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(live),

@@ -548,7 +548,7 @@ def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> 
 
 
 def test_channels_without_end_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foxglove_session, "_MOST_CHANNELS", 10)
+    monkeypatch.setattr(foxglove_session, "_MAX_CHANNELS", 10)
 
     def script(peer: Peer) -> None:
         found = peer.offer(*(channel(at, f"/{at}") for at in range(50)))
@@ -730,7 +730,7 @@ def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
             connection = foxglove_connection.Connection(opened, 1 << 20, lambda: False)
             heard = Heard()
             session = foxglove_session.Session(
-                heard, foxglove_session.Voice(heard, "x"), connection.send, {}
+                heard, foxglove_session.Notifier(heard, "x"), connection.send, {}
             )
             with suppress(PeerError):
                 assert "closed" in connection.read(session)

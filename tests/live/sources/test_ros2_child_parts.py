@@ -20,9 +20,9 @@ from hybridlog.live.sources.ros2.child.definitions import (
     UnknownTypeError,
     parse_type,
 )
-from hybridlog.live.sources.ros2.child.event_sender import Teller
+from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Offer
-from hybridlog.live.sources.ros2.child.middleware_losses import Told
+from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live.sources.ros2.child.publication_gaps import (
@@ -30,7 +30,7 @@ from hybridlog.live.sources.ros2.child.publication_gaps import (
     SUSPICIOUS_NS,
     WELL,
     Loss,
-    Numbers,
+    PublicationGapDetector,
 )
 from hybridlog.live.sources.ros2.child.qos import (
     BEST_EFFORT,
@@ -59,15 +59,15 @@ FOLDER = ROOT.joinpath(*CHILD.split("."))
 A, B = b"a" * 16, b"b" * 16
 
 
-# Numbers.
+# PublicationGapDetector.
 
 
-def seen(numbers: Numbers, *sent: int, publisher: bytes = A) -> list[bool]:
+def seen(numbers: PublicationGapDetector, *sent: int, publisher: bytes = A) -> list[bool]:
     return [numbers.see(publisher, number, 100 * number) for number in sent]
 
 
 def test_a_gap_is_told_at_the_second_look() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 5, 6, 9, 10)
     assert numbers.losses() == []
     assert numbers.losses() == [Loss(A, 2, 600, 900)]
@@ -75,13 +75,13 @@ def test_a_gap_is_told_at_the_second_look() -> None:
 
 
 def test_the_last_look_does_not_wait() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 4)
     assert numbers.losses(final=True) == [Loss(A, 2, 100, 400)]
 
 
 def test_publishers_are_told_apart() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     for number in range(1, 6):
         seen(numbers, number)
         seen(numbers, number + 1000, publisher=B)
@@ -91,20 +91,20 @@ def test_publishers_are_told_apart() -> None:
 
 @pytest.mark.parametrize("late", [2, 3, 4])
 def test_a_late_message_fills_its_gap(late: int) -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     assert all(seen(numbers, 1, 5, late, 6))
     numbers.losses()
     assert [loss.missing for loss in numbers.losses()] == [2]
 
 
 def test_numbers_that_begin_anew_are_no_loss() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     assert all(seen(numbers, 500, 501, 1, 2, 3))
     assert numbers.losses(final=True) == []
 
 
 def test_what_comes_twice_is_taken_once_while_two_subscriptions_run() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     assert all(seen(numbers, 1, 2, 3))
     numbers.is_doubled = True
     assert seen(numbers, 2, 3, 4, 4, 6, 5) == [False, False, True, False, True, True]
@@ -112,13 +112,13 @@ def test_what_comes_twice_is_taken_once_while_two_subscriptions_run() -> None:
 
 
 def test_a_jump_that_no_robot_makes_is_no_count() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 2**60)
     assert numbers.losses() == [Loss(A, None, 100, 100 * 2**60)]
 
 
 def test_gaps_that_wait_are_bounded_and_none_is_forgotten() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, *range(0, 6 * MAX_GAPS, 2))
     assert len(numbers._gaps) <= MAX_GAPS
     lost = sum(loss.missing or 0 for loss in numbers.losses(final=True))
@@ -126,21 +126,21 @@ def test_gaps_that_wait_are_bounded_and_none_is_forgotten() -> None:
 
 
 def test_unsure_gaps_are_dropped_when_numbers_begin_anew() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 5)
-    numbers.begin_anew()
+    numbers.reset()
     assert numbers.losses(final=True) == []
 
 
 def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     numbers.see(A, 1, 500)
     numbers.see(A, 4, 300)
     assert numbers.losses(final=True) == [Loss(A, 2, 300, 500)]
 
 
 def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 5, 6)
     seen(numbers, 1, 2, publisher=B)
     loss = numbers.suspect(A, 10_000)
@@ -152,7 +152,7 @@ def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
 
 
 def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 5, *range(6, 6 + WELL))
     assert numbers.suspect(A, 10_000) is None
     numbers.see(B, 1, 0)
@@ -164,7 +164,7 @@ def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
 
 
 def test_who_speaks_out_of_order_is_not_suspected() -> None:
-    numbers = Numbers()
+    numbers = PublicationGapDetector()
     seen(numbers, 1, 3, 2)
     assert numbers.suspect(A, 10_000) is None
 
@@ -173,41 +173,41 @@ def test_who_speaks_out_of_order_is_not_suspected() -> None:
 
 
 def test_what_the_middleware_says_of_gaps_is_not_told_twice() -> None:
-    told = Told()
-    told.hear(5)
-    assert told.beyond(5, final=False) == 0
-    assert told.gap(5) == 5
-    assert [told.beyond(0, final=False) for _ in range(9)] == [0] * 9
-    assert told.beyond(0, final=True) == 0
+    told = MiddlewareLossCounter()
+    told.add(5)
+    assert told.unexplained(5, final=False) == 0
+    assert told.unreported(5) == 5
+    assert [told.unexplained(0, final=False) for _ in range(9)] == [0] * 9
+    assert told.unexplained(0, final=True) == 0
 
 
 def test_losses_before_the_first_message_are_told() -> None:
-    told = Told()
-    told.hear(3)
-    assert told.head(2) == 2
-    assert told.beyond(0, final=True) == 1
-    told = Told()
-    told.hear(3)
-    assert told.head(100) == 3
-    assert told.beyond(0, final=True) == 0
+    told = MiddlewareLossCounter()
+    told.add(3)
+    assert told.before_first(2) == 2
+    assert told.unexplained(0, final=True) == 1
+    told = MiddlewareLossCounter()
+    told.add(3)
+    assert told.before_first(100) == 3
+    assert told.unexplained(0, final=True) == 0
 
 
 def test_losses_after_the_last_message_are_told_after_a_while_and_once() -> None:
-    told = Told()
-    told.hear(2)
-    assert [told.beyond(0, final=False) for _ in range(8)] == [0, 0, 0, 2, 0, 0, 0, 0]
+    told = MiddlewareLossCounter()
+    told.add(2)
+    assert [told.unexplained(0, final=False) for _ in range(8)] == [0, 0, 0, 2, 0, 0, 0, 0]
     # Now one comes, and shows the gap.
-    told.hear(1)
-    assert told.gap(3) == 1
-    assert told.beyond(0, final=True) == 0
+    told.add(1)
+    assert told.unreported(3) == 1
+    assert told.unexplained(0, final=True) == 0
 
 
 def test_gaps_that_the_middleware_does_not_know_of_excuse_no_later_loss() -> None:
-    told = Told()
-    assert told.gap(10) == 10
-    assert told.beyond(0, final=False) == 0
-    told.hear(4)
-    assert told.beyond(0, final=True) == 4
+    told = MiddlewareLossCounter()
+    assert told.unreported(10) == 10
+    assert told.unexplained(0, final=False) == 0
+    told.add(4)
+    assert told.unexplained(0, final=True) == 4
 
 
 # The profile.
@@ -459,14 +459,14 @@ def test_what_finds_no_room_is_counted() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         outbox = Outbox(theirs, budget=1 << 20)
-        teller = Teller(outbox)
+        events = EventSender(outbox)
         outbox.event(channel_event(0, "/x"))
-        teller._channels.append("/x")
+        events._channels.append("/x")
         for at in range(100):
             outbox.message(0, bytes(50_000), 10 + at, 0, -1)
             outbox.send()
         assert outbox.waiting <= 1 << 20
-        teller.refusals()
+        events.refusals()
         memory = drained(ours, outbox)
     [loss] = memory.losses
     assert (loss.topic, loss.cause, loss.last) == ("/x", "queue", 109)
@@ -561,7 +561,7 @@ class Rig:
                 pass
 
         self.box: Any = Box()
-        self.teller = Teller(self.box)
+        self.events = EventSender(self.box)
         found = packages(
             folder,
             {
@@ -571,8 +571,8 @@ class Rig:
                 "a/msg/Bad.msg": "",
             },
         )
-        self.topics = Topics(self.ros, self.teller, found, overrides or {})
-        self.child = Child(self.ros, self.topics, self.box, self.teller)
+        self.topics = Topics(self.ros, self.events, found, overrides or {})
+        self.child = Child(self.ros, self.topics, self.box, self.events)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.events if event["event"] == kind]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.foxglove.session import Session, Voice
+from hybridlog.live.sources.foxglove.session import Notifier, Session
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector, joined_gap
 from hybridlog_storage.messages import Channel, Schema
@@ -75,7 +75,7 @@ def by_ros1_at_once(numbers: Sequence[int]) -> int:
 
 def by_foxglove(numbers: Sequence[int]) -> int:
     heard = Heard()
-    session = Session(heard, Voice(heard, "server"), lambda _: None, {})
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
     session._advertise(
         [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
     )
@@ -182,7 +182,7 @@ def test_joined_gaps_span_all() -> None:
 
 def test_foxglove_puts_close_gaps_into_few_rows() -> None:
     heard = Heard()
-    session = Session(heard, Voice(heard, "server"), lambda _: None, {})
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
     session._advertise(
         [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
     )
@@ -196,7 +196,7 @@ def test_foxglove_puts_close_gaps_into_few_rows() -> None:
 @pytest.mark.parametrize("data", [b"", b"abc"])
 def test_a_payload_without_room_for_a_number_is_ignored(data: bytes) -> None:
     heard = Heard()
-    session = Session(heard, Voice(heard, "server"), lambda _: None, {})
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
     session._advertise(
         [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
     )

@@ -11,7 +11,7 @@ from hybridlog.live.sources.base import Sink
 from hybridlog.live.sources.foxglove.connection import Connection
 from hybridlog.live.sources.foxglove.handshake import StoppedError, open_websocket, websocket_uri
 from hybridlog.live.sources.foxglove.protocol import Address, PeerError
-from hybridlog.live.sources.foxglove.session import Session, Voice
+from hybridlog.live.sources.foxglove.session import Notifier, Session
 
 _PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0)
 _GOOD_S: Final = 10.0  # a connection that held so long begins with short pauses again
@@ -41,7 +41,7 @@ class Client:
     ) -> None:
         websocket_uri(address)
         self._sink = sink
-        self._voice = Voice(sink, address.shown)
+        self._notifier = Notifier(sink, address.shown)
         self._address = address
         self._limit = max_message_bytes
         self._stop = stop
@@ -64,7 +64,7 @@ class Client:
             reason = self._connect()
             if self._stop.is_set():
                 return
-            self._voice.say(f"{reason}; trying again")
+            self._notifier.say(f"{reason}; trying again")
             if time.monotonic() - began > _GOOD_S:
                 failures = 0
             self._stop.wait(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
@@ -81,7 +81,7 @@ class Client:
             with opened.socket:
                 self._reached()
                 connection = Connection(opened, self._limit, self._stop.is_set)
-                session = Session(self._sink, self._voice, connection.send, self._missed)
+                session = Session(self._sink, self._notifier, connection.send, self._missed)
                 try:
                     return connection.read(session)
                 finally:

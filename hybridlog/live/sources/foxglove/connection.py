@@ -29,7 +29,7 @@ _SILENT_S: Final = 20.0  # silence after which it is not
 _READ: Final = 1 << 17
 _LARGE: Final = 1 << 16  # bytes of a frame from which its payload is read to where it stays
 _MAX_CONTROL: Final = 125
-_MOST_SKIPPED: Final = 16 << 30
+_MAX_SKIPPED: Final = 16 << 30
 
 _WHOLE_BINARY: Final = 0x82
 _HEAD: Final = 13  # opcode, subscription, log time
@@ -161,7 +161,7 @@ class Connection:
         if data[body] == MESSAGE_DATA and size <= self._limit:
             self._large = (subscription, log_time, size, have)
             return
-        if length > _MOST_SKIPPED:
+        if length > _MAX_SKIPPED:
             raise PeerError(
                 f"claims a message of {length} bytes, which cannot be; is it a Foxglove server?"
             )

@@ -32,7 +32,7 @@ _SCHEMA_ENCODINGS = {
     "flatbuffer": "flatbuffer",
 }
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
-_MOST_ID = 1 << 64
+_MAX_ID = 1 << 64
 _LONGEST = 200  # characters of an address that are shown
 _PORTS = {"ws": 80, "wss": 443}
 
@@ -189,7 +189,7 @@ def parse_channel(entry: object) -> Advertised:
     if not isinstance(entry, dict):
         raise PeerError("advertised a channel that is no JSON object; it is left out")
     number = entry.get("id")
-    if type(number) is not int or not 0 <= number < _MOST_ID:
+    if type(number) is not int or not 0 <= number < _MAX_ID:
         raise PeerError("advertised a channel without a number ('id'); it is left out")
     topic, encoding = entry.get("topic"), entry.get("encoding")
     if not _is_text(topic) or not topic:

@@ -28,19 +28,19 @@ from hybridlog.live.sources.sequence_gaps import (
 from hybridlog.live.sources.text import one_line
 from hybridlog_storage.messages import Channel
 
-_MOST_CHANNELS: Final = 1 << 16
-_MOST_RETIRED: Final = 1 << 12
-_MOST_NS: Final = 1 << 63
-_MOST_QUOTED: Final = 100
+_MAX_CHANNELS: Final = 1 << 16
+_MAX_RETIRED: Final = 1 << 12
+_MAX_NS: Final = 1 << 63
+_MAX_QUOTED: Final = 100
 _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
-_MOST_REFUSALS: Final = 20
+_MAX_REFUSALS: Final = 20
 _AGAIN_S: Final = 0.02
 _NUMBER: Final = Struct("<I").unpack_from
 
 
-class Voice:
+class Notifier:
     """Says things about one server, in one clear line each.
 
     Args:
@@ -60,10 +60,10 @@ class Voice:
     def complain(self, text: str) -> None:
         """Say what the server may give reason for as often as it likes: not too often."""
         self._quoted += 1
-        if self._quoted <= _MOST_QUOTED:
+        if self._quoted <= _MAX_QUOTED:
             self.say(text)
-        elif self._quoted == _MOST_QUOTED + 1:
-            self.say(f"has given {_MOST_QUOTED} reasons to complain; further ones are not shown")
+        elif self._quoted == _MAX_QUOTED + 1:
+            self.say(f"has given {_MAX_QUOTED} reasons to complain; further ones are not shown")
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ class Session:
 
     Args:
         sink: Takes the messages.
-        voice: Says what is wrong.
+        notifier: Says what is wrong.
         send: Sends a JSON message.
         missed: Topics that were recorded before, and since when they are not: ns since
             the epoch. Topics that are there again are taken out.
@@ -95,13 +95,13 @@ class Session:
     def __init__(
         self,
         sink: Sink,
-        voice: Voice,
+        notifier: Notifier,
         send: Callable[[str], None],
         missed: dict[str, int],
     ) -> None:
         self._sink = sink
         self._take = sink.take
-        self._voice = voice
+        self._notifier = notifier
         self._send = send
         self._missed = missed
         self._next = 0
@@ -120,14 +120,14 @@ class Session:
         route = self._routes.get(subscription)
         if route is None:
             self._left_out("of a subscription that we do not have")
-            self._voice.complain(
+            self._notifier.complain(
                 "sends messages of a subscription that we do not have; they are left out"
             )
             return
         channel, gaps = route
         received = time.time_ns()
-        if log_time >= _MOST_NS:
-            self._voice.complain(
+        if log_time >= _MAX_NS:
+            self._notifier.complain(
                 f"gives {channel.topic!r} a time after the year 2262; the time of receiving "
                 "stands for it"
             )
@@ -146,7 +146,7 @@ class Session:
         now = time.time_ns()
         detail = f"a message of {size} bytes is over the limit of this source"
         self._sink.lost(topic, Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
-        self._voice.complain(
+        self._notifier.complain(
             f"{topic!r} has messages over the limit of this source; they are left out"
         )
 
@@ -161,7 +161,7 @@ class Session:
     def broken(self, reason: str) -> None:
         """A binary message that cannot be what it says."""
         self._left_out("too short to be a message")
-        self._voice.complain(f"sends {reason}; it is left out")
+        self._notifier.complain(f"sends {reason}; it is left out")
 
     def _left_out(self, detail: str) -> None:
         """A message of nobody knows which topic is a row as well."""
@@ -179,7 +179,7 @@ class Session:
         try:
             message = parse_text(data)
         except PeerError as error:
-            self._voice.complain(str(error))
+            self._notifier.complain(str(error))
             return
         match message["op"]:
             case "advertise":
@@ -191,14 +191,14 @@ class Session:
 
     def _advertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._voice.complain("advertises no list of channels; it is left out")
+            self._notifier.complain("advertises no list of channels; it is left out")
             return
         wanted: dict[int, int] = {}
         for entry in channels:
             try:
                 offer = parse_channel(entry)
             except PeerError as error:
-                self._voice.complain(str(error))
+                self._notifier.complain(str(error))
                 continue
             number = self._offered(offer)
             if number is not None:
@@ -217,13 +217,13 @@ class Session:
             self._retire(offer.id)
         if not self._sink.wants(topic, offer.type_name):
             return None
-        if len(self._subscriptions) >= _MOST_CHANNELS:
+        if len(self._subscriptions) >= _MAX_CHANNELS:
             if not self._is_full:
-                self._voice.say(f"has more than {_MOST_CHANNELS} channels; the rest is left out")
+                self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is left out")
             self._is_full = True
             return None
         if offer.problem:
-            self._voice.complain(
+            self._notifier.complain(
                 f"the definition of {topic!r} {offer.problem}; its messages are kept, their "
                 "fields cannot be searched"
             )
@@ -249,7 +249,7 @@ class Session:
 
     def _unadvertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._voice.complain("takes back no list of channels; it is left out")
+            self._notifier.complain("takes back no list of channels; it is left out")
             return
         for number in channels:
             if type(number) is int and number in self._subscriptions:
@@ -260,7 +260,7 @@ class Session:
         gone = self._subscriptions.pop(channel_id)
         self._is_full = False
         self._retired.append(gone.number)
-        if len(self._retired) > _MOST_RETIRED:
+        if len(self._retired) > _MAX_RETIRED:
             self._routes.pop(self._retired.popleft(), None)
         topic = gone.offer.channel.topic
         self._topics[topic] -= 1
@@ -278,12 +278,12 @@ class Session:
         found = _NO_CHANNEL.search(text)
         refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
         if refused is None:
-            self._voice.complain(f"says: {text}")
+            self._notifier.complain(f"says: {text}")
             return
         refused.refusals += 1
-        if refused.refusals > _MOST_REFUSALS:
+        if refused.refusals > _MAX_REFUSALS:
             topic = refused.offer.channel.topic
-            self._voice.complain(f"offers {topic!r}, but does not send it ({text})")
+            self._notifier.complain(f"offers {topic!r}, but does not send it ({text})")
             return
         self._again.add(refused.offer.id)
         self._again_at = time.monotonic() + _AGAIN_S * (refused.refusals - 1)
@@ -326,7 +326,7 @@ class Session:
             if gaps is not None:
                 self._report(channel.topic, gaps.finish())
         for topic in self._topics:
-            if not is_stopped and len(self._missed) < _MOST_CHANNELS:
+            if not is_stopped and len(self._missed) < _MAX_CHANNELS:
                 self._missed[topic] = now
             self._sink.topic_gone(topic)
         self._topics.clear()

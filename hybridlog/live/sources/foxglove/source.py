@@ -28,7 +28,7 @@ from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 _JOIN_S: Final = 5.0
-_LEAST_LIMIT: Final = 1 << 20
+_MIN_LIMIT: Final = 1 << 20
 
 
 class FoxgloveSource(LiveSource):
@@ -50,7 +50,7 @@ class FoxgloveSource(LiveSource):
     kind = "Foxglove"
 
     def __init__(self, url: str, *, max_message_bytes: int = 1 << 30) -> None:
-        if max_message_bytes < _LEAST_LIMIT:
+        if max_message_bytes < _MIN_LIMIT:
             raise UsageError("the largest message must be allowed at least 1 MiB")
         self._url = url
         self.address = without_user(url)

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _QUIET_S = 1.5  # without more news it is told; a busy master delays some topics by a second
-_LONGEST_S: Final = 5.0
+_MAX_S: Final = 5.0
 _NAMED: Final = 3
 _MOST: Final = 10_000
 
 _Key = tuple[str, bool]  # a node's address, and whether it cannot be reached at all
 
 
-class Troubles:
+class ErrorAggregator:
     """Gathers what fails about the topics of a node for a moment, and says it in one line.
 
     What fails again is not told again, however its reason is worded by then.
@@ -36,7 +36,7 @@ class Troubles:
         self._since = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
-    def note(self, uri: str, topic: str, error: Exception) -> None:
+    def add(self, uri: str, topic: str, error: Exception) -> None:
         """A topic cannot be had from a node. Within the event loop."""
         key = uri, isinstance(error, UnreachedError)
         topics = self._known.setdefault(key, set())
@@ -47,10 +47,10 @@ class Troubles:
         self._size += 1
         if is_told:
             return  # a node that is away is so for all of its topics
-        self._tell_soon()
+        self._flush_soon()
         self._new.setdefault(key, (reason_of(error), []))[1].append(topic)
 
-    def over(self, uri: str, topic: str) -> None:
+    def resolve(self, uri: str, topic: str) -> None:
         """A topic was had from a node for a while: what fails from now on is news."""
         away = self._known.pop((uri, True), set())
         self._size -= len(away)
@@ -59,15 +59,15 @@ class Troubles:
             rest.remove(topic)
             self._size -= 1
 
-    def _tell_soon(self) -> None:
+    def _flush_soon(self) -> None:
         loop = asyncio.get_running_loop()
         if self._timer is not None:
             self._timer.cancel()
         if not self._new:
             self._since = loop.time()
-        self._timer = loop.call_at(min(loop.time() + _QUIET_S, self._since + _LONGEST_S), self.tell)
+        self._timer = loop.call_at(min(loop.time() + _QUIET_S, self._since + _MAX_S), self.flush)
 
-    def tell(self) -> None:
+    def flush(self) -> None:
         """Say what has been gathered."""
         new, self._new = self._new, {}
         for (uri, is_away), (reason, topics) in new.items():

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros1.subscription import Context
 
 _FIRST_PAUSE_S: Final = 0.25
-_LONGEST_PAUSE_S: Final = 2.0
+_MAX_PAUSE_S: Final = 2.0
 _AFTER_HINT_S: Final = 0.02
 _CALLS_AT_ONCE: Final = 8
 _FAREWELL_S: Final = 2.0
-_LONGEST_REST_S: Final = 1.0
+_MAX_REST_S: Final = 1.0
 _REST: Final = 4
 
 _Item = TypeVar("_Item")
@@ -84,12 +84,12 @@ class Graph:
                     f"no ROS master at {one_line(self._uri)} ({error}); waiting for it. Start "
                     "roscore, or say with --ros1 or ROS_MASTER_URI where it is"
                 )
-                pause = min(pause * 2, _LONGEST_PAUSE_S)
+                pause = min(pause * 2, _MAX_PAUSE_S)
                 await asyncio.sleep(pause)
                 continue
             pause = _FIRST_PAUSE_S
             # A system so large that looking at it takes long is not looked at all the time.
-            rest = min(max(_AFTER_HINT_S, _REST * (loop.time() - began)), _LONGEST_REST_S)
+            rest = min(max(_AFTER_HINT_S, _REST * (loop.time() - began)), _MAX_REST_S)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._poll_s):
                     await self._hint.wait()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 5.0
 """How long a peer may take for one step: to be found, to accept, to answer."""
 
-_MOST_ADDRESSES = 8
+_MAX_ADDRESSES = 8
 
 
 class PeerError(Exception):
@@ -103,7 +103,7 @@ class Network:
         loop = asyncio.get_running_loop()
         failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
         addresses = await self.addresses_of(endpoint.host)
-        for family, (host, _, *scope) in addresses[:_MOST_ADDRESSES]:
+        for family, (host, _, *scope) in addresses[:_MAX_ADDRESSES]:
             made = socket.socket(family, socket.SOCK_STREAM)
             try:
                 made.setblocking(False)

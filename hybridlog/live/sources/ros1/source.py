@@ -14,7 +14,7 @@ import threading
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import LiveSource
-from hybridlog.live.sources.ros1.error_aggregator import Troubles
+from hybridlog.live.sources.ros1.error_aggregator import ErrorAggregator
 from hybridlog.live.sources.ros1.graph import Graph
 from hybridlog.live.sources.ros1.master import Master
 from hybridlog.live.sources.ros1.network import Endpoint, Network, PeerError, endpoint_of
@@ -175,10 +175,10 @@ class Ros1Source(LiveSource):
         graph = Graph(master, uri, self._poll_s, self._reached)
         server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
         reader = Reader(end)
-        troubles = Troubles(sink.say)
+        errors = ErrorAggregator(sink.say)
         context = Context(
             *(network, self.caller, sink, reader, self._max_message_bytes),
-            *(spawn, graph.hint, troubles),
+            *(spawn, graph.hint, errors),
         )
         reader.start()
         try:
@@ -192,5 +192,5 @@ class Ros1Source(LiveSource):
                 await asyncio.wait(tuple(tasks), timeout=1)
             listening.close()
             reader.stop()
-            troubles.tell()
+            errors.flush()
             await graph.farewell()

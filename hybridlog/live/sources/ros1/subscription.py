@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
     from hybridlog.live.sources.base import Sink
-    from hybridlog.live.sources.ros1.error_aggregator import Troubles
+    from hybridlog.live.sources.ros1.error_aggregator import ErrorAggregator
     from hybridlog.live.sources.ros1.network import Network
     from hybridlog.live.sources.ros1.reader import Reader
     from hybridlog_storage.messages import Channel
 
 _FIRST_PAUSE_S: Final = 0.25
-_LONGEST_PAUSE_S: Final = 10.0
+_MAX_PAUSE_S: Final = 10.0
 _STABLE_S: Final = 10.0
-_MOST_CHANNELS: Final = 64
+_MAX_CHANNELS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Context:
         max_message_bytes: Longest message that is believed.
         spawn: Runs a coroutine until the source stops.
         look_again: Asks the master for the publishers of a topic soon.
-        troubles: Tells of publishers from which nothing can be had.
+        errors: Tells of publishers from which nothing can be had.
     """
 
     network: Network
@@ -51,7 +51,7 @@ class Context:
     max_message_bytes: int
     spawn: Callable[[Coroutine[None, None, None]], None]
     look_again: Callable[[str], None]
-    troubles: Troubles
+    errors: ErrorAggregator
 
 
 class Subscription:
@@ -122,7 +122,7 @@ class Subscription:
             channel = channel_of(self.topic, fields)
             self._context.sink.expect(channel)
         self._channels[key] = channel
-        if len(self._channels) > _MOST_CHANNELS:
+        if len(self._channels) > _MAX_CHANNELS:
             del self._channels[next(iter(self._channels))]
         return channel
 
@@ -140,7 +140,7 @@ class Subscription:
         wanted = self._types.get(type_name)
         if wanted is None:
             wanted = self._context.sink.wants(self.topic, type_name)
-            if len(self._types) < _MOST_CHANNELS:
+            if len(self._types) < _MAX_CHANNELS:
                 self._types[type_name] = wanted
         return wanted
 
@@ -192,7 +192,7 @@ class _Link:
                 # One failure is nothing: nodes that end are listed a little longer than
                 # they live.
                 if self._failures >= 2:
-                    context.troubles.note(self._uri, topic, error)
+                    context.errors.add(self._uri, topic, error)
             else:
                 try:
                     channel = self._subscription.channel(fields)
@@ -227,7 +227,7 @@ class _Link:
         failure = await ended
         if loop.time() - began > _STABLE_S:
             self._failures, self._has_told = 0, False
-            context.troubles.over(self._uri, self._subscription.topic)
+            context.errors.resolve(self._uri, self._subscription.topic)
         else:
             self._failures += 1
         # A publisher that breaks off again and again is told of once; the ledger has all.
@@ -246,7 +246,7 @@ class _Link:
     async def _pause(self) -> None:
         """Waits, the longer the more often it failed, unless the master lists it anew."""
         self._hurry.clear()
-        pause = min(_FIRST_PAUSE_S * 2 ** min(self._failures, 10), _LONGEST_PAUSE_S)
+        pause = min(_FIRST_PAUSE_S * 2 ** min(self._failures, 10), _MAX_PAUSE_S)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._hurry.wait()

@@ -19,7 +19,7 @@ from collections import deque
 from typing import Any
 
 from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
-from hybridlog.live.sources.ros2.child.event_sender import Teller
+from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Middleware
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
@@ -45,16 +45,16 @@ class Child:
         middleware: ROS.
         topics: What we listen to.
         outbox: Where messages and events go.
-        teller: Who puts events there.
+        events: Who puts events there.
     """
 
     def __init__(
-        self, middleware: Middleware, topics: Topics, outbox: Outbox, teller: Teller
+        self, middleware: Middleware, topics: Topics, outbox: Outbox, events: EventSender
     ) -> None:
         self._middleware = middleware
         self._topics = topics
         self._outbox = outbox
-        self._teller = teller
+        self._events = events
         self._orders: deque[dict[str, Any]] = deque()
         self._is_stopping = False
 
@@ -120,8 +120,8 @@ class Child:
                 taken, taken_size = topic.stream.take(self._outbox)
             except Exception as error:
                 # rclpy has errors of many kinds; each of them costs a message.
-                self._teller.lost(topic.name, "unreadable", 1, detail=str(error))
-                self._teller.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
+                self._events.lost(topic.name, "unreadable", 1, detail=str(error))
+                self._events.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
                 continue
             count += taken
             size += taken_size
@@ -141,7 +141,7 @@ class Child:
             if not self._outbox.send():
                 writable.poll(2)
         self._topics.account(final=True)
-        self._teller.bye()
+        self._events.bye()
         deadline = time.monotonic() + _LAST_WORDS_S
         while not self._outbox.send() and time.monotonic() < deadline:
             writable.poll(100)
@@ -162,18 +162,18 @@ def run(number: int) -> int:
     with peer.makefile("rb") as file:
         settings = parse_object(file.readline(MAX_BATCH))
     outbox = Outbox(peer)
-    teller = Teller(outbox)
+    events = EventSender(outbox)
     try:
         middleware = Middleware()
     except Exception as error:
         # Whatever ROS has against coming up, the recorder is to say it.
-        teller.failed(error)
+        events.failed(error)
         outbox.send()
         return 1
     overrides = settings.get("overrides", {})
-    topics = Topics(middleware, teller, Definitions(share_folders()), overrides)
-    child = Child(middleware, topics, outbox, teller)
-    teller.hello(middleware.implementation)
+    topics = Topics(middleware, events, Definitions(share_folders()), overrides)
+    child = Child(middleware, topics, outbox, events)
+    events.hello(middleware.implementation)
     signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())
     threading.Thread(target=_listen, args=(peer, child), daemon=True).start()
     try:

@@ -16,7 +16,7 @@ MAX_SAID = 10_000
 """Different complaints that are told; what has more to say has one reason for all."""
 
 
-class Teller:
+class EventSender:
     """Puts events into the outbox, behind the messages that came before.
 
     Args:

@@ -14,7 +14,7 @@ _LOOKS = 4
 """Looks at the graph during which no gap has explained what the middleware says."""
 
 
-class Told:
+class MiddlewareLossCounter:
     """The count of one subscription."""
 
     def __init__(self) -> None:
@@ -24,11 +24,11 @@ class Told:
         self._open = 0
         self._left = [0] * _LOOKS
 
-    def hear(self, count: int) -> None:
+    def add(self, count: int) -> None:
         """The middleware says that it has lost some more."""
         self._said += count
 
-    def head(self, before: int) -> int:
+    def before_first(self, before: int) -> int:
         """The first message of all has come.
 
         Args:
@@ -41,14 +41,14 @@ class Told:
         self._heads += found
         return found
 
-    def gap(self, missing: int) -> int:
+    def unreported(self, missing: int) -> int:
         """A gap is told of; how many of it have not been told of before."""
         again = min(missing, self._open)
         self._open -= again
         self._gaps += missing
         return missing - again
 
-    def beyond(self, waiting: int, *, final: bool) -> int:
+    def unexplained(self, waiting: int, *, final: bool) -> int:
         """What is to be told of now; to be called at each look, after all gaps.
 
         Args:

@@ -25,7 +25,7 @@ VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _OTHERS = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE")
 _FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
-_MOST_ALLOWED = Path("/proc/sys/net/core/rmem_max")
+_MAX_ALLOWED = Path("/proc/sys/net/core/rmem_max")
 
 BUFFER = 32 << 20
 """Bytes that a socket is asked to hold, where the kernel allows so many."""
@@ -92,7 +92,7 @@ def default_profile(environment: MutableMapping[str, str] = os.environ) -> Itera
         yield False
         return
     try:
-        allowed = _MOST_ALLOWED.read_text(encoding="ascii")
+        allowed = _MAX_ALLOWED.read_text(encoding="ascii")
     except OSError:
         allowed = ""
     try:

@@ -60,7 +60,7 @@ class Loss(NamedTuple):
 
 
 class _Gap:
-    """Numbers `[start, end)` of a publisher that have not come."""
+    """PublicationGapDetector `[start, end)` of a publisher that have not come."""
 
     __slots__ = ("end", "first", "last", "looks", "publisher", "start")
 
@@ -73,7 +73,7 @@ class _Gap:
         self.looks = 0
 
 
-class Numbers:
+class PublicationGapDetector:
     """The numbers of one topic.
 
     Attributes:
@@ -208,7 +208,7 @@ class Numbers:
         self._sure.clear()
         return found
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Forgets all numbers, and the gaps that nobody can be sure of any more."""
         self._last.clear()
         self._jumped.clear()

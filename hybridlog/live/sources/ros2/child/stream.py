@@ -1,4 +1,4 @@
-"""One topic and type that is recorded: its subscription, its channel, its numbers.
+"""One topic and type that is recorded: its subscription, its channel, its gaps.
 
 When a publisher comes that the subscription does not fit, a second one is made that
 fits all; for a while both run, and what both get is taken once.
@@ -12,8 +12,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.middleware import publisher_id
-from hybridlog.live.sources.ros2.child.middleware_losses import Told
-from hybridlog.live.sources.ros2.child.publication_gaps import Loss, Numbers
+from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
+from hybridlog.live.sources.ros2.child.publication_gaps import Loss, PublicationGapDetector
 from hybridlog.live.sources.ros2.child.qos import RELIABLE
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ class Stream:
 
     Attributes:
         named: Messages tell their publisher; True until one does not.
-        numbered: Messages have numbers; True until one does not.
-        alone: The topic has had one and the same publisher since its numbers were begun.
+        numbered: Messages have gaps; True until one does not.
+        alone: The topic has had one and the same publisher since its gaps were begun.
     """
 
     def __init__(self, subscription: Subscription, channel: int, offers: Sequence[Offer]) -> None:
@@ -66,8 +66,8 @@ class Stream:
         self._old: Subscription | None = None
         self._old_until = 0.0
         self._doubt_until = 0.0
-        self._numbers = Numbers()
-        self._told = Told()
+        self._gaps = PublicationGapDetector()
+        self._middleware_losses = MiddlewareLossCounter()
         self._heads: list[Loss] = []
         self._publishers = frozenset(offer.publisher for offer in offers)
         self._reliable = _reliable(offers)
@@ -83,7 +83,7 @@ class Stream:
         Args:
             subscription: The new one, open already.
             seconds: For how long the old one runs beside it. Where messages do not tell
-                who sent them, or have no numbers, nobody can say which of them come
+                who sent them, or have no gaps, nobody can say which of them come
                 twice: there it is closed as soon as it is empty.
         """
         self.close_old()
@@ -91,7 +91,7 @@ class Stream:
         self._old, self.subscription = self.subscription, subscription
         now = time.monotonic()
         tells_twice = self.named and self.numbered
-        self._numbers.is_doubled = tells_twice
+        self._gaps.is_doubled = tells_twice
         self._old_until = now + seconds if tells_twice else now
         self._doubt_until = now + _DOUBT_S
 
@@ -107,7 +107,7 @@ class Stream:
         told = self.subscription.losses()
         # What two subscriptions have lost may have come through the other one.
         if self._old is None and self.subscription.tells_all:
-            self._told.hear(told)
+            self._middleware_losses.add(told)
         return told
 
     def take(self, outbox: Outbox) -> tuple[int, int]:
@@ -128,7 +128,7 @@ class Stream:
         return self._take(self.subscription, outbox)
 
     def _take(self, subscription: Subscription, outbox: Outbox) -> tuple[int, int]:
-        take, put, numbers = subscription.take, outbox.message, self._numbers
+        take, put, gaps = subscription.take, outbox.message, self._gaps
         channel = self.channel
         count = size = 0
         while count < _AT_ONCE and size < _BYTES_AT_ONCE:
@@ -146,9 +146,9 @@ class Stream:
                 publisher, judged = b"", self.alone and number >= 0
             else:
                 publisher, judged = publisher_id(gid["data"]), number >= 0
-            if judged and publisher not in numbers:
+            if judged and publisher not in gaps:
                 self._begin(publisher, number, received)
-            if not judged or numbers.see(publisher, number, received):
+            if not judged or gaps.see(publisher, number, received):
                 sent = info["source_timestamp"]
                 put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
         return count, size
@@ -156,8 +156,8 @@ class Stream:
     def _begin(self, publisher: bytes, number: int, received: int) -> None:
         """Looks for losses before the first message of a publisher."""
         self._hear()
-        if number > 1 and self._numbers.is_empty:
-            lost = self._told.head(number - 1)
+        if number > 1 and self._gaps.is_empty:
+            lost = self._middleware_losses.before_first(number - 1)
             if lost:
                 self._heads.append(Loss(publisher, lost, received, received, _HEAD))
 
@@ -171,7 +171,7 @@ class Stream:
 
     def has_caught_up(self, since: int) -> bool:
         """Whether all publishers that spoke a moment before a time have spoken after it."""
-        return self._numbers.has_caught_up(since)
+        return self._gaps.has_caught_up(since)
 
     def look(self, offers: list[Offer], *, final: int | None = None) -> list[Loss]:
         """What has been lost for sure; to be called with each look at the graph.
@@ -190,17 +190,19 @@ class Stream:
         return losses
 
     def _losses(self, offers: list[Offer], now: int, final: int | None) -> list[Loss]:
-        """What the numbers show, and what the middleware knows besides."""
-        numbers, is_final = self._numbers, final is not None
+        """What the gaps show, and what the middleware knows besides."""
+        gaps, is_final = self._gaps, final is not None
         losses, self._heads = self._heads, []
         losses += self._suspects(offers, now if final is None else final, is_final=is_final)
-        for gap in numbers.losses(final=is_final):
-            missing = None if gap.missing is None else self._told.gap(gap.missing)
+        for gap in gaps.losses(final=is_final):
+            missing = (
+                None if gap.missing is None else self._middleware_losses.unreported(gap.missing)
+            )
             if missing != 0:
                 losses.append(gap._replace(missing=missing))
-        beyond = self._told.beyond(numbers.waiting, final=is_final)
+        beyond = self._middleware_losses.unexplained(gaps.waiting, final=is_final)
         if beyond:
-            first = min(now, numbers.last_received or now)
+            first = min(now, gaps.last_received or now)
             # Gaps are looked for where it is known whose they are.
             place = _BEYOND if self.named or self.alone else _SAYS
             losses.append(Loss(b"", beyond, first, now, place))
@@ -214,7 +216,7 @@ class Stream:
             silent: Since when the others are not heard any more, ns since the epoch.
             is_final: None of them is.
         """
-        numbers = self._numbers
+        gaps = self._gaps
         present = {offer.publisher for offer in offers}
         if not self.named:
             gone = [b""] if self.alone and (is_final or not present) else []
@@ -222,7 +224,7 @@ class Stream:
             gone = list(self._publishers | present if is_final else self._publishers - present)
         found = []
         for publisher in gone:
-            loss = numbers.suspect(publisher, silent)
+            loss = gaps.suspect(publisher, silent)
             repaired = publisher in self._reliable or (not publisher and self._reliable)
             if loss and not (repaired and silent - loss.first > _REPAIR_NS):
                 found.append(loss)
@@ -231,16 +233,16 @@ class Stream:
     def _follow(self, offers: list[Offer]) -> None:
         """Follows a change of publishers."""
         if self._old is None and time.monotonic() >= self._doubt_until:
-            self._numbers.is_doubled = False
+            self._gaps.is_doubled = False
         publishers = frozenset(offer.publisher for offer in offers)
         if not self.named:
             same = len(offers) == 1 and publishers == self._publishers
             if not same:
-                self._numbers.begin_anew()
+                self._gaps.reset()
             self.alone = same
         self._publishers = publishers
         self._reliable = _reliable(offers)
-        self._numbers.keep_only(publishers)
+        self._gaps.keep_only(publishers)
 
     def close(self) -> None:
         """Closes its subscriptions."""

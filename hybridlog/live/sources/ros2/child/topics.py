@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
-    from hybridlog.live.sources.ros2.child.event_sender import Teller
+    from hybridlog.live.sources.ros2.child.event_sender import EventSender
     from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
 
 MAX_TOPICS = 10_000
@@ -67,7 +67,7 @@ class Topics:
 
     Args:
         middleware: ROS.
-        teller: Who tells the recorder.
+        events: Who tells the recorder.
         definitions: Where types are defined.
         overrides: Fields of `Profile` by topic that the user wants otherwise.
 
@@ -79,7 +79,7 @@ class Topics:
     def __init__(
         self,
         middleware: Middleware,
-        teller: Teller,
+        events: EventSender,
         definitions: Definitions,
         overrides: Mapping[str, Mapping[str, Any]],
     ) -> None:
@@ -87,7 +87,7 @@ class Topics:
         self.doubled: list[Topic] = []
         self._live: list[Topic] = []
         self._middleware = middleware
-        self._teller = teller
+        self._events = events
         self._definitions = definitions
         self._overrides = overrides
         self._topics: dict[tuple[str, str], Topic] = {}
@@ -110,15 +110,15 @@ class Topics:
         """Looks at the graph, follows its changes, and tells what has been lost."""
         found = self._middleware.publishers()
         for name, reason in self._middleware.odd.items():
-            self._teller.say(f"{name!r} is left out, ROS cannot subscribe to it: {reason}")
+            self._events.say(f"{name!r} is left out, ROS cannot subscribe to it: {reason}")
         for key, offers in found.items():
             topic = self._topics.get(key)
             if topic is None:
                 if len(self._topics) >= MAX_TOPICS:
-                    self._teller.say(f"more than {MAX_TOPICS} topics; the rest is left out")
+                    self._events.say(f"more than {MAX_TOPICS} topics; the rest is left out")
                     continue
                 topic = self._topics[key] = Topic(*key)
-                self._teller.candidate(*key)
+                self._events.candidate(*key)
             before, topic.offers = topic.offers, offers
             if topic.is_wanted:
                 self._update(topic, before)
@@ -135,12 +135,12 @@ class Topics:
         if had and topic.is_wanted:
             others = (other for other in self._topics.values() if other.name == topic.name)
             if not any(other.offers and other.is_wanted for other in others):
-                self._teller.gone(topic.name)
+                self._events.gone(topic.name)
 
     def _update(self, topic: Topic, before: list[Offer]) -> None:
         """Follows a change of a wanted topic's publishers."""
         if len(before) != len(topic.offers):
-            self._teller.publishers(topic.name, topic.kind, len(topic.offers))
+            self._events.publishers(topic.name, topic.kind, len(topic.offers))
         stream = topic.stream
         if stream is None:
             self._remind(topic)
@@ -164,7 +164,7 @@ class Topics:
         try:
             found = self._middleware.subscribe(topic.name, parse_type(topic.kind), wanted)
         except Exception as error:
-            self._teller.say(f"{topic.name}: new publishers cannot be heard: {error}")
+            self._events.say(f"{topic.name}: new publishers cannot be heard: {error}")
             return
         stream.replace(found, _OVERLAP_S)
         self._list()
@@ -180,13 +180,13 @@ class Topics:
         for offer in topic.offers:
             reasons = conflicts(offer.profile, stream.subscription.profile)
             if reasons and offer.publisher in known:
-                self._teller.say(
+                self._events.say(
                     f"{topic.name}: {offer.node or 'a publisher'} cannot be heard, its "
                     f"{' and '.join(reasons)} is less than the QoS overrides ask for; "
                     "take that out of the file"
                 )
         if len(_hashes(topic)) > 1:
-            self._teller.say(
+            self._events.say(
                 f"{topic.name}: its publishers have different versions of {topic.kind}; "
                 "the definition is the one that is installed here"
             )
@@ -204,7 +204,7 @@ class Topics:
         if topic is None or topic.is_wanted:
             return
         topic.is_wanted = True
-        self._teller.publishers(name, kind, len(topic.offers))
+        self._events.publishers(name, kind, len(topic.offers))
         try:
             topic.definition = self._definitions.find(kind)
             found = self._middleware.subscribe(name, parse_type(kind), self._wanted(topic))
@@ -238,12 +238,12 @@ class Topics:
         hashes = _hashes(topic)
         type_hash = hashes.pop() if len(hashes) == 1 else ""
         offered = offered_text(profiles)
-        return self._teller.channel(topic.name, topic.kind, topic.definition, offered, type_hash)
+        return self._events.channel(topic.name, topic.kind, topic.definition, offered, type_hash)
 
     def _refuse(self, topic: Topic, trouble: str) -> None:
         topic.trouble = trouble
         topic.reminded = -_REMIND_S
-        self._teller.say(f"{topic.name}: {topic.kind} cannot be recorded: {trouble}")
+        self._events.say(f"{topic.name}: {topic.kind} cannot be recorded: {trouble}")
         self._remind(topic)
 
     def _remind(self, topic: Topic) -> None:
@@ -251,7 +251,7 @@ class Topics:
         now = time.monotonic()
         if topic.trouble and now - topic.reminded >= _REMIND_S:
             topic.reminded = now
-            self._teller.lost(topic.name, "unreadable", None, detail=topic.trouble)
+            self._events.lost(topic.name, "unreadable", None, detail=topic.trouble)
 
     def account(self, *, final: bool = False) -> None:
         """Tells what has been lost on the way and at our own door.
@@ -264,7 +264,7 @@ class Topics:
         for topic in self._live:
             assert topic.stream is not None
             self._account(topic, topic.stream, ended)
-        self._teller.refusals()
+        self._events.refusals()
 
     def _account(self, topic: Topic, stream: Stream, ended: int | None) -> None:
         if len(topic.nodes) > MAX_PUBLISHERS:
@@ -276,13 +276,13 @@ class Topics:
                 node = topic.offers[0].node
             times = loss.first, loss.last
             detail = ", ".join(filter(None, (f"from {node}" if node else "", loss.place)))
-            self._teller.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
+            self._events.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
         if not (stream.numbered or stream.subscription.tells_losses):
-            self._teller.say(
+            self._events.say(
                 "this ROS gives messages no numbers, so losses on the way cannot be counted"
             )
         if not stream.named and stream.numbered and len(topic.offers) > 1:
-            self._teller.say(
+            self._events.say(
                 f"{topic.name}: this rclpy does not tell the messages of its publishers apart, so "
                 "losses on the way cannot be counted there; ROS 2 Kilted does"
             )

@@ -1,4 +1,4 @@
-"""Keeping the garbage collector from the objects that a process has."""
+"""Objects of a process are hidden from the garbage collector while it records."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import recording
-from hybridlog.live.collector import SparedObjects
+from hybridlog.live.frozen_objects import FrozenObjects
 
 
 @pytest.fixture(autouse=True)
-def spared(monkeypatch: pytest.MonkeyPatch) -> Iterator[SparedObjects]:
-    """Of this test alone, whatever others have left open."""
-    own = SparedObjects()
-    monkeypatch.setattr(recording, "spared_objects", own)
+def frozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[FrozenObjects]:
+    """A context of this test alone, which other tests cannot hold open."""
+    own = FrozenObjects()
+    monkeypatch.setattr(recording, "frozen_objects", own)
     gc.unfreeze()
     yield own
     assert gc.get_freeze_count() == 0
@@ -31,10 +31,10 @@ class Knot:
         self.itself = self
 
 
-def test_objects_are_spared_until_the_last_has_left(spared: SparedObjects) -> None:
+def test_objects_are_frozen_until_the_last_has_left(frozen: FrozenObjects) -> None:
     knot = weakref.ref(Knot())
-    with spared:
-        with spared:
+    with frozen:
+        with frozen:
             assert gc.get_freeze_count() > 1000
         gc.collect()
         assert knot() is not None
@@ -45,17 +45,17 @@ def test_objects_are_spared_until_the_last_has_left(spared: SparedObjects) -> No
     assert knot() is None
 
 
-def test_what_a_process_has_frozen_itself_stays_frozen(spared: SparedObjects) -> None:
+def test_what_a_process_has_frozen_itself_stays_frozen(frozen: FrozenObjects) -> None:
     gc.freeze()
     try:
-        with spared:
+        with frozen:
             pass
         assert gc.get_freeze_count() > 1000
     finally:
         gc.unfreeze()
 
 
-def test_they_are_spared_as_long_as_something_is_recorded(tmp_path: Path) -> None:
+def test_they_are_frozen_as_long_as_something_is_recorded(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("first"):
             with store.start("second"):

@@ -1,22 +1,22 @@
-"""Some at a time, in the order in which they came."""
+"""A semaphore that admits waiting threads in arrival order."""
 
 from __future__ import annotations
 
 import threading
 import time
 
-from hybridlog.live.turns import Turns
+from hybridlog.live.fair_semaphore import FairSemaphore
 from tests.test_faults import wait_for
 
 
-def test_no_more_than_so_many_at_a_time() -> None:
-    turns, lock = Turns(3), threading.Lock()
+def test_no_more_threads_than_the_limit_are_inside() -> None:
+    semaphore, lock = FairSemaphore(3), threading.Lock()
     inside = most = done = 0
 
     def work() -> None:
         nonlocal inside, most, done
         for _ in range(50):
-            with turns:
+            with semaphore:
                 with lock:
                     inside += 1
                     most = max(most, inside)
@@ -33,31 +33,31 @@ def test_no_more_than_so_many_at_a_time() -> None:
     assert (most, inside, done) == (3, 0, 400)
 
 
-def test_who_has_waited_longest_is_next() -> None:
-    turns = Turns(1)
+def test_the_thread_that_has_waited_longest_is_next() -> None:
+    semaphore = FairSemaphore(1)
     order: list[int] = []
 
     def work(number: int) -> None:
-        with turns:
+        with semaphore:
             order.append(number)
 
     threads = [threading.Thread(target=work, args=(number,)) for number in range(20)]
-    with turns:
+    with semaphore:
         for number, thread in enumerate(threads):
             thread.start()
-            wait_for(lambda number=number: len(turns._waiting) == number + 1)
+            wait_for(lambda number=number: len(semaphore._waiting) == number + 1)
     for thread in threads:
         thread.join()
     assert order == list(range(20))
 
 
-def test_an_error_gives_the_turn_back() -> None:
-    turns = Turns(1)
+def test_an_error_leaves_the_semaphore() -> None:
+    semaphore = FairSemaphore(1)
     for _ in range(3):
         try:
-            with turns:
+            with semaphore:
                 raise ZeroDivisionError
         except ZeroDivisionError:
             pass
-    with turns:
+    with semaphore:
         pass
