@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from hybridlog.sources.base import Damage, Source
     from hybridlog_storage.messages import Channel
 
-_MIN_S: Final = 0.001  # what is due within it goes out together
-_MAX_S: Final = 3600.0
+_MIN_PAUSE_S: Final = 0.001  # what is due within it goes out together
+_MAX_PAUSE_S: Final = 3600.0
 _BETWEEN_S: Final = 0.1  # from the last message of a round to the first one of the next
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
@@ -338,7 +338,7 @@ class _Player:
             pause = self._last_due - time.monotonic()
             if pause <= 0:
                 return
-            self._stop.wait(min(pause, _MAX_S))
+            self._stop.wait(min(pause, _MAX_PAUSE_S))
 
     def _pause(self, pause: float, moment: int) -> bool:
         """Wait for the message of a log time; whether we shall stop."""
@@ -348,7 +348,7 @@ class _Player:
                 f"{self._name}: nothing happens in the log until {moment / 1e9:.3f} s since the "
                 f"epoch; that takes {pause:.0f} s, a higher speed makes it shorter"
             )
-        return self._stop.wait(min(max(pause, _MIN_S), _MAX_S))
+        return self._stop.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
 
     def _check(self, behind: float) -> None:
         if behind > _LATE_S and not self._is_late:

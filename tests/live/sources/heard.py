@@ -12,6 +12,24 @@ from hybridlog_storage.messages import Channel
 DEADLINE_S = 20.0
 
 
+def must_return(call: Callable[[], object]) -> None:
+    """Calls something that must not block, and fails if it does."""
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(DEADLINE_S)
+    assert not thread.is_alive(), f"{call} blocks"
+    if errors:
+        raise errors[0]
+
+
 class Taken(NamedTuple):
     channel: Channel
     payload: bytes

@@ -21,7 +21,7 @@ from hybridlog_storage.errors import SourceError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from tests import independent
 from tests.data import DATA, needs_data
-from tests.live.sources.heard import DEADLINE_S, Heard
+from tests.live.sources.heard import Heard, must_return
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -157,20 +157,47 @@ def test_times_and_numbers_are_those_of_the_log(tmp_path: Path) -> None:
     assert unnumbered.taken[0].sequence is None
 
 
+class Clock(threading.Event):
+    """A clock that advances only while the player waits for it."""
+
+    now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time_ns(self) -> int:
+        return int(self.now * SECOND)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self.now += timeout
+        return self.is_set()
+
+
+def play_by(
+    clock: Clock, path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch, speed: float
+) -> None:
+    with monkeypatch.context() as patch, ReplaySource(path, speed=speed) as source:
+        patch.setattr(replay, "time", clock)
+        source._stop = clock
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+
+
 @pytest.mark.parametrize("speed", [1.0, 2.5])
-def test_nothing_comes_before_its_time(tmp_path: Path, speed: float) -> None:
-    offsets = [0.0, 0.0, 0.05, 0.1, 0.1004, 0.1007, 0.3]
+def test_nothing_comes_before_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: float
+) -> None:
+    offsets = [0.0, 0.0, 0.05, 0.1, 0.1004, 0.1007, 0.3, 5000.0]
     log = [("/a", BEGIN + int(offset * SECOND), b"x") for offset in offsets]
     path = write(tmp_path / "a.mcap", log)
-    times: list[float] = []
-    heard = Heard()
-    take = heard.take
-    heard.take = lambda *given, **named: (times.append(time.monotonic()), take(*given, **named))[1]  # type: ignore[method-assign]
-    began = time.monotonic()
-    play(path, heard, speed=speed)
-    assert len(times) == len(offsets)
-    for moment, offset in zip(times, offsets, strict=True):
-        assert moment >= began + offset / speed - 1e-6
+    clock, heard = Clock(), Heard()
+    began = clock.now
+    play_by(clock, path, heard, monkeypatch, speed)
+    assert len(heard.taken) == len(offsets)
+    for taken, offset in zip(heard.taken, offsets, strict=True):
+        late = taken.received / SECOND - (began + offset / speed)
+        assert -1e-6 <= late <= replay._MIN_PAUSE_S + 1e-6
 
 
 def test_many_small_messages_do_not_cost_a_pause_each(
@@ -310,10 +337,9 @@ def test_a_long_pause_is_said_and_can_be_left(tmp_path: Path) -> None:
     with ReplaySource(path) as source:
         source.start(heard)
         heard.until(lambda h: h.said)
-        began = time.monotonic()
-        source.stop()
-        source.stop()
-        assert time.monotonic() - began < DEADLINE_S / 4
+        must_return(source.stop)
+        must_return(source.stop)
+        assert [t for t in threading.enumerate() if t.name.startswith("hybridlog-replay")] == []
     assert heard.payloads() == [b"1"]
     assert "takes 7200 s" in heard.said[0]
     assert heard.ends == []
@@ -331,14 +357,17 @@ def test_rounds_follow_each_other_until_stopped(tmp_path: Path) -> None:
     assert heard.ends == []
 
 
-def test_what_is_not_wanted_takes_its_time_all_the_same(tmp_path: Path) -> None:
+def test_what_is_not_wanted_takes_its_time_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = [("/a", BEGIN, b"x"), ("/b", BEGIN + SECOND // 5, b"y")]
     path = write(tmp_path / "a.mcap", log)
     for topic in ("/a", "/c"):
         heard = Heard(lambda name, _, topic=topic: name == topic)  # type: ignore[misc]
-        began = time.monotonic()
-        play(path, heard, speed=1.0)
-        assert time.monotonic() - began >= 0.2
+        clock = Clock()
+        began = clock.now
+        play_by(clock, path, heard, monkeypatch, speed=1.0)
+        assert clock.now == pytest.approx(began + 0.2, abs=replay._MIN_PAUSE_S)
         assert heard.ends == [""]
     with ReplaySource(path, loop=True) as source:
         source.start(Heard(lambda *_: False))
