@@ -1,1 +1,1 @@
-"""What a running robot says: ROS 1, ROS 2, Foxglove, or a log played as if it ran."""
+"""Live sources of messages: ROS 1, ROS 2, Foxglove, and the replay of a log."""

@@ -1,9 +1,9 @@
-"""The seam between a robot's middleware and the recorder: one source, one sink.
+"""Interface between a robot's middleware and the recorder: `LiveSource` and `Sink`.
 
-A source runs threads of its own. It tells its sink of the topics that come and go, and
-hands over every message as it was on the wire, at once: who waits with a socket unread
-makes somebody else drop in silence. A sink may be called from any thread, and takes what
-it is given without waiting for a disk or a database.
+A source runs its own threads. It reports topics that appear and disappear to its sink, and
+passes on every message at once, as it was on the wire. A source that leaves a socket unread
+makes a publisher drop messages silently. So a sink may be called from any thread, and never
+waits for a disk or a database.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ __all__ = ["Cause", "LiveSource", "Sink"]
 
 
 class Sink(Protocol):
-    """What a source speaks to. Thread safe; no method waits for disk or database."""
+    """Receiver of a source's messages and events.
+
+    Thread safe; no method waits for disk or database.
+    """
 
     def wants(self, topic: str, type_name: str) -> bool:
-        """Whether messages of a topic are to be taken at all. Costs microseconds.
+        """Tells whether a topic is to be recorded. Costs microseconds.
 
-        Asked when a topic comes; a source subscribes to nothing else.
+        A source asks for each new topic, and subscribes to nothing else.
 
         Args:
             topic: Name as the source spells it.
-            type_name: Type as the source spells it, empty when not known yet.
+            type_name: Type as the source spells it, empty if not known yet.
         """
         ...
 
     def expect(self, channel: Channel) -> None:
-        """Messages of a channel may come from now on: told before the first of them.
-
-        What that would have to wait for is done at once, and takes some milliseconds.
+        """Prepare for a channel, before its first message. Takes some milliseconds.
 
         Args:
-            channel: As `take` will get it.
+            channel: The object that `take` will get.
         """
         ...
 
@@ -55,15 +56,15 @@ class Sink(Protocol):
         sent: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Take a message. Those of one channel come from one thread at a time.
+        """Take a message. Messages of one channel come from one thread at a time.
 
         Args:
             channel: Topic, encoding and definition: the same object for all messages of
                 a connection. `has_publish_time` says whether `sent` is given.
             payload: The serialized message; it must not change afterwards.
-            received: When it was received, ns since the epoch.
-            sent: When it was sent, by the sender's clock, ns since the epoch, if known.
-            sequence: The sender's number, if it has one.
+            received: Receive time, ns since the epoch.
+            sent: Send time by the sender's clock, ns since the epoch, if known.
+            sequence: Sequence number of the sender, if known.
         """
         ...
 
@@ -77,28 +78,28 @@ class Sink(Protocol):
         last: int,
         detail: str = "",
     ) -> None:
-        """Note messages that will never come.
+        """Note messages that are lost.
 
         Args:
-            topic: Whose; empty when nobody knows.
-            cause: Why.
-            count: How many, None when that cannot be known.
-            first: From when on, ns since the epoch, as the recorder's clock was.
-            last: Until when, likewise.
-            detail: For people: a publisher's name, a reason.
+            topic: Their topic; empty if unknown.
+            cause: Cause of the loss.
+            count: Number of messages, None if unknown.
+            first: Begin of the loss by the recorder's clock, ns since the epoch.
+            last: End of the loss, likewise.
+            detail: Text for the user: a publisher's name, a reason.
         """
         ...
 
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
-        """A topic that is wanted has publishers now, or another number of them."""
+        """Note the number of publishers of a wanted topic, at least one."""
         ...
 
     def topic_gone(self, topic: str) -> None:
-        """A topic has no publishers any more."""
+        """Note that a topic has no publishers left."""
         ...
 
     def say(self, text: str) -> None:
-        """Tell the user what is wrong, where, and what to do; recording goes on.
+        """Show the user a problem and its remedy; recording goes on.
 
         Args:
             text: One line. The same text is shown once.
@@ -106,55 +107,55 @@ class Sink(Protocol):
         ...
 
     def ended(self, reason: str = "") -> None:
-        """The source has come to its end by itself.
+        """Note that the source has ended by itself.
 
         Args:
-            reason: Why, when that is no good end; empty when all has been said.
+            reason: The error that ended it; empty after a regular end.
         """
         ...
 
 
 class LiveSource(ABC):
-    """Something that speaks. Start it once; as a context manager it is stopped at the end.
+    """A source of messages. Start it once; as a context manager it stops at the end.
 
     Attributes:
         kind: `ROS 1`, `ROS 2`, `Foxglove`, `replay`.
-        address: What was connected to, as the catalog shows it.
-        was_reached: Whether somebody has answered there so far; always, where nobody has to.
+        address: Address of the peer, as the catalog shows it.
+        was_reached: The peer has answered at least once; always True without a peer.
     """
 
     kind: str
     address: str
     was_reached: bool = True
 
-    def check(self) -> None:  # noqa: B027 - most can say nothing before they start
-        """Refuse what `start` would refuse, before anything is made for a recording.
+    def check(self) -> None:  # noqa: B027 - most sources cannot check anything
+        """Raise the errors of `start` before a recording is created.
 
         Raises:
-            UsageError: An address or another setting that is none.
-            SourceError: It can never work.
-            MissingDependencyError: What it needs is not installed.
+            UsageError: An address or another setting is invalid.
+            SourceError: The source can never work.
+            MissingDependencyError: A required package is not installed.
         """
 
     @abstractmethod
     def start(self, sink: Sink) -> None:
         """Begin to listen.
 
-        What can mend itself (a master that is not there yet, a publisher that dies) does
-        not raise: the source says so, and tries again with growing pauses.
+        Temporary problems (a master that is not up yet, a publisher that dies) do not
+        raise: the source reports them, and retries with growing pauses.
 
         Raises:
-            UsageError: An address or another setting that is none.
-            SourceError: It can never work: a file that is no log.
-            MissingDependencyError: What it needs is not installed.
+            UsageError: An address or another setting is invalid.
+            SourceError: The source can never work, such as a file that is not a log.
+            MissingDependencyError: A required package is not installed.
         """
 
     @abstractmethod
     def stop(self) -> None:
         """Stop listening. May be called more than once.
 
-        What has been received by now is handed over first; the sink is not called after
-        this returned. Takes at most a few seconds, whatever the peers do.
+        Passes on the messages received so far, and does not call the sink after it has
+        returned. Takes at most a few seconds, whatever the peers do.
         """
 
     def __enter__(self) -> Self:

@@ -1,13 +1,11 @@
-"""A log played as if the robot ran: for tests, benchmarks and rehearsals.
+"""Replay of a log in real time, for tests, benchmarks and rehearsals.
 
-One thread reads ahead, another keeps time. A message is due when as much time has gone by
-since the first one as in the log, divided by the speed; all that is due goes out at once,
-so many small messages do not cost a pause each, and the error of one pause is not carried
-into the next.
+One thread reads ahead, another keeps time. A message is due at its time since the first
+message, divided by the speed. All due messages go out at once: many small messages do not
+cost a pause each, and pauses do not accumulate errors.
 
-Messages go out in the order of log time as far as some tens of megabytes of looking ahead
-allow. Of a log whose messages lie farther out of order (parts that were put one behind
-the other) those that turn up late are sent at once.
+Messages go out in the order of log time, within a lookahead of some tens of megabytes.
+Messages that lie farther out of order, as in concatenated logs, are sent when they are read.
 """
 
 from __future__ import annotations
@@ -36,27 +34,27 @@ if TYPE_CHECKING:
     from hybridlog.sources.base import Damage, Source
     from hybridlog_storage.messages import Channel
 
-_MIN_PAUSE_S: Final = 0.001  # what is due within it goes out together
+_MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
-_BETWEEN_S: Final = 0.1  # from the last message of a round to the first one of the next
+_BETWEEN_S: Final = 0.1  # from the last message of a round to the first of the next
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
-_AT_ONCE: Final = 1024  # messages between two looks at the clock
+_AT_ONCE: Final = 1024  # messages between two reads of the clock
 _TICK_S: Final = 0.1
 _JOIN_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What the reading thread hands to the playing one.
+    """Messages that the reading thread passes to the playing one.
 
     Attributes:
-        number: How often the log has been read before.
-        rows: Messages; None when there are none.
-        channels: The log's channels, as far as they are known.
-        damage: What could not be read.
-        end: There is no more.
-        error: Why there is no more, when that is no good end.
+        number: Number of the round, from 0.
+        rows: Messages, or None.
+        channels: Channels of the log, as far as it is read.
+        damage: Unreadable places.
+        end: This is the last step.
+        error: The error that ended reading.
     """
 
     number: int
@@ -70,19 +68,18 @@ class _Step:
 class ReplaySource(LiveSource):
     """Plays any log that hybridlog reads.
 
-    Messages keep their publish time, if their channel has one, and their number; the
-    time of receiving is now. Places of the log that cannot be read are reported as lost,
-    without a topic, because nobody can know whose they were. Attachments and metadata of
-    an MCAP file are not messages, and stay behind.
+    Messages have their original publish time, if the channel has one, and sequence number;
+    the receive time is now. Unreadable places are reported as lost without a topic, since
+    it is unknown. Attachments and metadata of an MCAP file are ignored.
 
     Args:
         path: The log.
-        speed: How many seconds of the log go by in one: positive and finite. When the
-            sink or the disk does not keep up, that is said, once.
-        loop: Begin again at the end, until stopped.
+        speed: Seconds of the log per second: positive and finite. A sink or disk that
+            cannot keep up is reported once.
+        loop: Start again at the end, until stopped.
 
     Raises:
-        UsageError: The speed is none.
+        UsageError: The speed is not positive and finite.
     """
 
     kind = "replay"
@@ -91,7 +88,7 @@ class ReplaySource(LiveSource):
         if not (math.isfinite(speed) and speed > 0):
             raise UsageError(
                 f"a log cannot be played at speed {speed:g}; give a number above zero, 1 for "
-                "the speed of the robot"
+                "real time"
             )
         self.address = str(path)
         self._path = path
@@ -102,10 +99,10 @@ class ReplaySource(LiveSource):
         self._threads: list[threading.Thread] = []
 
     def check(self) -> None:
-        """Refuse what is no log.
+        """Check that the log can be opened.
 
         Raises:
-            SourceError: There is no log that can be read.
+            SourceError: The file is not a readable log.
         """
         open_source(self._path).close()
 
@@ -113,7 +110,7 @@ class ReplaySource(LiveSource):
         """Open the log, and begin to play it.
 
         Raises:
-            SourceError: There is no log that can be read.
+            SourceError: The file is not a readable log.
         """
         source = open_source(self._path)
         player = _Player(sink, self.address, self._speed, self._stop)
@@ -131,14 +128,14 @@ class ReplaySource(LiveSource):
             thread.start()
 
     def stop(self) -> None:
-        """Stop, in the middle of a pause too. What is due by now has been sent."""
+        """Stop, even in a pause. All messages that are due have been sent."""
         self._stop.set()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(_JOIN_S)
 
     def _received(self) -> Iterator[_Step]:
-        """What the reading thread has read, until it ends or shall stop."""
+        """Steps of the reading thread, until it ends or the source is stopped."""
         while not self._stop.is_set():
             try:
                 yield self._steps.get(timeout=_TICK_S)
@@ -146,7 +143,7 @@ class ReplaySource(LiveSource):
                 continue
 
     def _put(self, step: _Step) -> bool:
-        """Hand on; False when nobody wants it any more."""
+        """Pass a step on; False if the source is stopped."""
         while not self._stop.is_set():
             try:
                 self._steps.put(step, timeout=_TICK_S)
@@ -164,7 +161,7 @@ class ReplaySource(LiveSource):
             while self._read_once(source, number) and self._loop:
                 number += 1
                 source = open_source(self._path)
-        except BaseException as caught:  # it is raised again, or told, by the playing thread
+        except BaseException as caught:  # the playing thread raises or reports it
             error = caught
         self._put(_Step(number, None, [], [], end=True, error=error))
 
@@ -172,7 +169,7 @@ class ReplaySource(LiveSource):
         """Read a log to its end.
 
         Returns:
-            Whether there was a message, and the user wants more.
+            True if it had a message and the source is not stopped.
         """
         lookahead = Lookahead()
         known = count = 0
@@ -195,13 +192,13 @@ class ReplaySource(LiveSource):
 
 
 class _Player:
-    """Keeps time, on a thread of its own.
+    """Sends messages when they are due, on its own thread.
 
     Args:
         sink: Takes the messages.
-        name: The log, for people.
-        speed: Seconds of the log in one second.
-        stop: Set when it shall stop.
+        name: Name of the log for messages to the user.
+        speed: Seconds of the log per second.
+        stop: Set to stop playing.
     """
 
     def __init__(self, sink: Sink, name: str, speed: float, stop: threading.Event) -> None:
@@ -221,7 +218,7 @@ class _Player:
         self._start = self._last_due = 0.0
 
     def play(self, steps: Iterator[_Step]) -> None:
-        """Play what is read, until the end."""
+        """Play all steps."""
         try:
             for step in steps:
                 if step.end or step.number != self._number:
@@ -246,20 +243,20 @@ class _Player:
             self._sink.topic_gone(topic)
         self._sink.ended("" if error is None else str(error))
 
-    # What comes with the messages.
+    # Channels and damage.
 
     def _begin(self, step: _Step) -> None:
         if step.number != self._number:
             self._number, self._first = step.number, None
             self._channels, self._nth = [], Counter()
         for channel in step.channels[len(self._channels) :]:
-            self._channels.append(self._meet(channel))
+            self._channels.append(self._add(channel))
         if step.number == 0:
             for damage in step.damage:
-                self._tell(damage)
+                self._report(damage)
 
-    def _meet(self, channel: Channel) -> Channel | None:
-        """The channel that the sink knows; None when it does not want it."""
+    def _add(self, channel: Channel) -> Channel | None:
+        """The channel that the sink knows, None if it does not want the topic."""
         schema = channel.schema
         key: tuple[object, ...] = (
             channel.topic,
@@ -280,7 +277,7 @@ class _Player:
                 self._sink.expect(channel)
         return self._known[key]
 
-    def _tell(self, damage: Damage) -> None:
+    def _report(self, damage: Damage) -> None:
         place = str(damage.file)
         if damage.offset is not None:
             place += f", byte {damage.offset}"
@@ -318,22 +315,22 @@ class _Player:
                 continue
             ready = min(ready, at + _AT_ONCE)
             newest = int(times[ready - 1])
-            # What lies in the wrong place of the log is no fault of ours.
+            # A message in the wrong place of the log is not played late.
             if newest >= self._newest:
                 self._newest = newest
-                self._check(now - float(due[ready - 1]))
+                self._check_lateness(now - float(due[ready - 1]))
             self._send(rows.take(slice(at, ready)))
             at = ready
             if self._stop.is_set():
                 return
 
     def _due(self, rows: Rows) -> NDArray[np.float64]:
-        """When messages are due, by the monotonic clock."""
+        """Times at which messages are due, by the monotonic clock."""
         elapsed = rows.table.log_time - (self._first or 0)
         return self._start + elapsed / (1e9 * self._speed)
 
     def _wait_for_the_end(self) -> None:
-        """Wait until the last message of the round is due, wanted or not."""
+        """Wait until the last message of the round is due, even an unwanted one."""
         while not self._stop.is_set():
             pause = self._last_due - time.monotonic()
             if pause <= 0:
@@ -341,27 +338,26 @@ class _Player:
             self._stop.wait(min(pause, _MAX_PAUSE_S))
 
     def _pause(self, pause: float, moment: int) -> bool:
-        """Wait for the message of a log time; whether we shall stop."""
+        """Wait for the message of a log time; True if the source is stopped."""
         if pause > _LONG_S and moment != self._waited_for:
             self._waited_for = moment
             self._sink.say(
-                f"{self._name}: nothing happens in the log until {moment / 1e9:.3f} s since the "
-                f"epoch; that takes {pause:.0f} s, a higher speed makes it shorter"
+                f"{self._name}: the log has no message until {moment / 1e9:.3f} s since the "
+                f"epoch; that takes {pause:.0f} s, less at a higher speed"
             )
         return self._stop.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
 
-    def _check(self, behind: float) -> None:
+    def _check_lateness(self, behind: float) -> None:
         if behind > _LATE_S and not self._is_late:
             self._is_late = True
             self._sink.say(
-                f"{self._name}: cannot be played at speed {self._speed:g}, messages come late "
-                f"(by now {behind:.1f} s); nothing is left out, but give a lower speed to keep "
-                "the robot's rhythm"
+                f"{self._name}: cannot be played at speed {self._speed:g}, messages are "
+                f"{behind:.1f} s late; none is skipped, but a lower speed keeps their timing"
             )
 
     def _send(self, rows: Rows) -> None:
         table, take, clock = rows.table, self._sink.take, time.time_ns
-        channels = cast("list[Channel]", self._channels)  # what is not wanted is out
+        channels = cast("list[Channel]", self._channels)  # unwanted ones are gone
         columns = (table.channel, table.publish_time, table.sequence)
         for payload, number, publish_time, sequence in zip(
             rows.payloads(), *(column.tolist() for column in columns), strict=True

@@ -1,4 +1,4 @@
-"""Messages of a log in the order of their log times, as far as bounded memory allows."""
+"""Sorts the messages of a log by log time, with a bounded lookahead."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 _WINDOW: Final = 32 << 20
-"""Payload bytes that are looked ahead at most, one larger message excepted."""
+"""Maximum payload bytes of the lookahead, except for a single larger message."""
 _WINDOW_ROWS: Final = 1 << 17
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Messages whose payloads lie in several buffers.
+    """Messages with payloads in several buffers.
 
     Attributes:
-        buffers: Hold the payloads.
-        which: int64[n], in which of them each payload lies.
-        table: The messages, over an empty buffer: offsets count in their own one.
+        buffers: The buffers.
+        which: int64[n], number of each payload's buffer.
+        table: The messages, with an empty buffer; offsets refer to the payload's own buffer.
     """
 
     buffers: list[bytes | memoryview]
@@ -43,15 +43,15 @@ class Rows:
         return Rows(self.buffers, self.which[rows], self.table.take(rows))
 
     def payloads(self) -> Iterator[bytes]:
-        """The payloads in turn."""
+        """The payloads, in order."""
         table, buffers = self.table, self.buffers
         columns = (self.which, table.offset, table.offset + table.length)
         for which, start, end in zip(*(column.tolist() for column in columns), strict=True):
-            # Free for bytes, a copy for a part of something else.
+            # No copy for a whole bytes object, else a copy.
             yield bytes(buffers[which][start:end])
 
     def compact(self) -> Rows:
-        """The same messages without the buffers that none of them needs."""
+        """The same messages without unused buffers."""
         used, which = np.unique(self.which, return_inverse=True)
         buffers = [self.buffers[number] for number in used.tolist()]
         if sum(map(len, buffers)) <= _WINDOW + 2 * self.table.payload_bytes:
@@ -62,10 +62,10 @@ class Rows:
 
 
 class Lookahead:
-    """Takes batches in the order of a file, and gives messages in the order of time.
+    """Takes batches in file order, and returns messages in time order.
 
-    A message that comes so late in the file that younger ones are out already is the
-    first of what comes next.
+    A message that lies so late in the file that newer ones are out already is the first of
+    the next result.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Lookahead:
         """Take a batch.
 
         Returns:
-            The oldest messages, when there are more than shall wait.
+            The oldest messages, if the lookahead is full.
         """
         buffer = batch.buffer if isinstance(batch.buffer, bytes) else memoryview(batch.buffer)
         table = replace(batch, buffer=b"")
@@ -97,7 +97,7 @@ class Lookahead:
         return rows.take(slice(0, cut))
 
     def rest(self) -> Rows | None:
-        """All that still waits; None when nothing does."""
+        """All remaining messages, or None."""
         rows = self._sorted() if self._rows else None
         self._waiting, self._bytes, self._rows = [], 0, 0
         return rows
@@ -111,7 +111,7 @@ class Lookahead:
 
 
 def _join(parts: Sequence[Rows]) -> Rows:
-    """One table of several; no payload is copied."""
+    """Concatenate tables without copying payloads."""
     starts = np.cumsum([0, *(len(part.buffers) for part in parts[:-1])])
     return Rows(
         [buffer for part in parts for buffer in part.buffers],

@@ -1,20 +1,20 @@
-"""What peers say, for people to read. The child in ROS 2's own Python uses it, too."""
+"""Text from peers, made safe to show."""
 
 from __future__ import annotations
 
-_MOST = 400
+_MAX_LENGTH = 400
 
 
-def one_line(text: str | bytes, most: int = _MOST) -> str:
-    """Text from elsewhere as one line: not too long, nothing that a terminal acts on.
+def one_line(text: str | bytes, limit: int = _MAX_LENGTH) -> str:
+    """Text from a peer as one line: bounded, and without control characters.
 
     Args:
-        text: Bytes are taken for UTF-8, as far as they are.
-        most: Characters that are shown.
+        text: Text, or bytes that should be UTF-8.
+        limit: Number of characters; the rest becomes `...`.
     """
     if isinstance(text, bytes):
-        text = text[: most * 4].decode(errors="replace")
-    # What is far longer than a line is not looked at to its end.
-    words = " ".join(text[: most * 4].split())
-    line = words if len(words) <= most else f"{words[:most]}..."
+        text = text[: limit * 4].decode(errors="replace")
+    # The end of a far longer text is not read.
+    words = " ".join(text[: limit * 4].split())
+    line = words if len(words) <= limit else f"{words[:limit]}..."
     return "".join(char if char.isprintable() else "?" for char in line)

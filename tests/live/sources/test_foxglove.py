@@ -214,14 +214,14 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         ("ws://", "names no host"),
         ("ws://:8765", "names no host"),
         ("ws://robot:0", "port 0"),
-        ("ws://robot:99999", "no address"),
-        ("ws://robot:port", "no address"),
-        ("ws://[::1:8765", "no address"),
+        ("ws://robot:99999", "not the address"),
+        ("ws://robot:port", "not the address"),
+        ("ws://[::1:8765", "not the address"),
         ("ws://robot:8765/#x", "'#'"),
-        ("ws://ro bot:8765", "no address"),
-        ("ws://robot\x1b[31m:8765", "no address"),
+        ("ws://ro bot:8765", "not the address"),
+        ("ws://robot\x1b[31m:8765", "not the address"),
         ("ws://me@robot:8765", "without a password"),
-        ("ws://" + "a" * 80 + ".\u00e9:8765", "no address"),
+        ("ws://" + "a" * 80 + ".\u00e9:8765", "not the address"),
         ("", "does not begin"),
     ],
 )
@@ -297,8 +297,8 @@ def test_definitions_become_schemas(entry: dict[str, object], expected: Schema |
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        (5, "no JSON object"),
-        (None, "no JSON object"),
+        (5, "not a JSON object"),
+        (None, "not a JSON object"),
         ({}, "'id'"),
         ({**channel(), "id": True}, "'id'"),
         ({**channel(), "id": -1}, "'id'"),
@@ -321,8 +321,8 @@ def test_a_channel_that_is_none_is_refused(entry: object, words: str) -> None:
         ("protobuf", "!!!!", "base64"),
         ("protobuf", "abc", "base64"),
         ("protobuf", "\u00e9", "base64"),
-        ("json", {"type": "object"}, "no text"),
-        ("json", "\ud800", "no text"),
+        ("json", {"type": "object"}, "not text"),
+        ("json", "\ud800", "not text"),
     ],
 )
 def test_a_broken_definition_leaves_a_channel_without(
@@ -473,7 +473,7 @@ def test_a_channel_that_is_offered_too_soon_is_asked_for_again(words: str) -> No
 
 
 def test_a_channel_that_is_offered_and_never_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foxglove_session, "_AGAIN_S", 0.0)
+    monkeypatch.setattr(foxglove_session, "_RETRY_S", 0.0)
 
     def script(peer: Peer) -> None:
         peer.offer(channel(7))
@@ -495,20 +495,20 @@ def test_a_channel_that_is_offered_and_never_sent_is_told(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("sent", "words"),
     [
-        (frame(Opcode.TEXT, b"{"), "no JSON"),
-        (frame(Opcode.TEXT, b"\xff\xfe"), "no JSON"),
-        (frame(Opcode.TEXT, b"[" * 100_000), "no JSON"),
-        (frame(Opcode.TEXT, b"9" * 10_000), "no JSON"),
+        (frame(Opcode.TEXT, b"{"), "not JSON"),
+        (frame(Opcode.TEXT, b"\xff\xfe"), "not JSON"),
+        (frame(Opcode.TEXT, b"[" * 100_000), "not JSON"),
+        (frame(Opcode.TEXT, b"9" * 10_000), "not JSON"),
         (text([1]), "without an operation"),
         (text({"op": 5}), "without an operation"),
-        (text({"op": "advertise"}), "no list of channels"),
-        (text({"op": "unadvertise", "channelIds": 5}), "no list of channels"),
+        (text({"op": "advertise"}), "something else than a list of channels"),
+        (text({"op": "unadvertise", "channelIds": 5}), "something else than a list of channels"),
         (advertise(5, channel(2, "")), "without a topic"),
         (text({"op": "status", "level": 2, "message": "\x1b[31mbad\nnews"}), "says: ?[31mbad news"),
-        (message(4711, 0, b"x"), "subscription that we do not have"),
+        (message(4711, 0, b"x"), "unknown subscription"),
         (frame(Opcode.BINARY, b""), "empty binary message"),
         (frame(Opcode.BINARY, b"\x01abc"), "shorter than its header"),
-        (advertise(channel(2, "/p", encoding="protobuf", schema="!")), "is no base64"),
+        (advertise(channel(2, "/p", encoding="protobuf", schema="!")), "is not base64"),
     ],
 )
 def test_nonsense_is_told_in_a_line_and_the_rest_goes_on(sent: bytes, words: str) -> None:
@@ -592,19 +592,19 @@ def test_a_message_over_the_limit_is_passed_over_and_counted() -> None:
     (lost,) = heard.losses
     assert lost[:3] == ("/a", Cause.UNREADABLE, 1)
     assert str((1 << 20) + 1) in lost.detail
-    assert heard.said_of("over the limit")
+    assert heard.said_of("exceed the limit")
 
 
 BREAKS = [
-    (frame(2, body(0, 0, b"x"), length=1 << 62), "claims a message"),
+    (frame(2, body(0, 0, b"x"), length=1 << 62), "announces a message"),
     (frame(1, b"{", length=1 << 40), "sends a JSON message of more than"),
     (frame(2, b"\x01", is_last=False, length=1 << 40), "sends a message in pieces of more than"),
     (frame(9, b"x", length=1 << 40), "control frame is too long"),
-    (b"\x82\x85abcd12345", "breaks the websocket protocol"),
-    (b"\x83\x01x", "breaks the websocket protocol"),
-    (b"\xc2\x01x", "breaks the websocket protocol"),
-    (frame(0, b"x"), "breaks the websocket protocol"),
-    (frame(2, b"", is_last=False) + frame(2, b"x"), "breaks the websocket protocol"),
+    (b"\x82\x85abcd12345", "violates the websocket protocol"),
+    (b"\x83\x01x", "violates the websocket protocol"),
+    (b"\xc2\x01x", "violates the websocket protocol"),
+    (frame(0, b"x"), "violates the websocket protocol"),
+    (frame(2, b"", is_last=False) + frame(2, b"x"), "violates the websocket protocol"),
     (frame(8, b"\x03\xe9going"), "closed the connection (going)"),
     (frame(8, b"\x03\xe9\x1b[2J"), "closed the connection (?[2J)"),
     (frame(8, b""), "closed the connection;"),
@@ -696,7 +696,7 @@ def test_a_server_that_falls_silent_is_asked_and_then_left(
         source.start(heard)
         heard.until(lambda h: h.taken)
     assert asked == [Opcode.PING]
-    assert [line for line in heard.said if "has not been heard of" in line] == heard.said
+    assert [line for line in heard.said if "has been silent for" in line] == heard.said
     assert len(heard.said) == 1
 
 
@@ -784,12 +784,12 @@ def other_subprotocol(peer: Peer) -> None:
         (answer(b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nhello"), "answers HTTP 404"),
         (answer(b"HTTP/1.1 401 Who\r\n\r\n"), "USER:PASSWORD"),
         (answer(b"HTTP/1.1 200 \x1b[31m\r\n\r\n"), "answers HTTP 200"),
-        (answer(b"SSH-2.0-OpenSSH\r\n\r\n"), "no websocket server"),
-        (answer(b"\x00" * 100_000), "no websocket server"),
+        (answer(b"SSH-2.0-OpenSSH\r\n\r\n"), "not a websocket server"),
+        (answer(b"\x00" * 100_000), "not a websocket server"),
         (answer(b"HTTP/1.1 101 Yes\r\n\r\n"), "handshake failed"),
         (answer(b"HTTP/1.1 101 Yes\r\n" + b"a: b\r\n" * 5000 + b"\r\n"), "handshake failed"),
-        (other_subprotocol, "none that speaks Foxglove"),
-        (lambda peer: None, "the connection broke|no websocket server"),
+        (other_subprotocol, "does not speak Foxglove"),
+        (lambda peer: None, "the connection broke|not a websocket server"),
     ],
 )  # fmt: skip
 def test_somebody_elses_server_is_told_and_tried_again(script: Script, words: str) -> None:
@@ -812,7 +812,7 @@ def test_a_server_that_comes_late_is_waited_for() -> None:
     heard = Heard()
     with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
         source.start(heard)
-        heard.until(lambda h: h.said_of("nobody listens there"))
+        heard.until(lambda h: h.said_of("refuses connections"))
         with Server(script, port=port):
             heard.until(lambda h: h.taken)
             source.stop()
@@ -822,7 +822,7 @@ def test_a_host_that_is_not_known() -> None:
     heard = Heard()
     with FoxgloveSource("ws://no-such-host.invalid:8765") as source:
         source.start(heard)
-        heard.until(lambda h: h.said_of("is not known"))
+        heard.until(lambda h: h.said_of("is unknown"))
 
 
 # Stopping.

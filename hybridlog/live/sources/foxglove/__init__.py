@@ -1,1 +1,1 @@
-"""Foxglove: a client of a WebSocket server."""
+"""Foxglove: a client of a Foxglove WebSocket server."""

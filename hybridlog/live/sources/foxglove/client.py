@@ -1,4 +1,4 @@
-"""Stays with a Foxglove server: connects, reads to the end, and connects again."""
+"""Connects to a Foxglove server, reads until the connection ends, and reconnects."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from hybridlog.live.sources.foxglove.protocol import Address, PeerError
 from hybridlog.live.sources.foxglove.session import Notifier, Session
 
 _PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0)
-_GOOD_S: Final = 10.0  # a connection that held so long begins with short pauses again
+_STABLE_S: Final = 10.0  # after a connection of this length the pauses are short again
 
 
 class Client:
-    """What the thread of a Foxglove source does.
+    """The client, which runs in the thread of a Foxglove source.
 
     Args:
         sink: Takes the messages.
         address: The server.
-        max_message_bytes: Largest payload that is taken.
-        stop: Set when it shall stop.
-        reached: Called each time the server has let us in.
+        max_message_bytes: Largest payload.
+        stop: Set to stop the client.
+        reached: Called after each handshake.
 
     Raises:
-        UsageError: The address is none.
+        UsageError: The address is invalid.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Client:
         self._missed: dict[str, int] = {}
 
     def run(self) -> None:
-        """Connect and read, again and again, until stopped."""
+        """Connect, read and reconnect until stopped."""
         try:
             self._run()
         except BaseException as error:
@@ -65,7 +65,7 @@ class Client:
             if self._stop.is_set():
                 return
             self._notifier.say(f"{reason}; trying again")
-            if time.monotonic() - began > _GOOD_S:
+            if time.monotonic() - began > _STABLE_S:
                 failures = 0
             self._stop.wait(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
             failures += 1
@@ -74,7 +74,7 @@ class Client:
         """Make one connection, and read it to its end.
 
         Returns:
-            Why it ended, for people.
+            The reason of the end, for the user.
         """
         try:
             opened = open_websocket(self._address, self._stop.is_set)

@@ -1,9 +1,8 @@
-"""One websocket connection to a Foxglove server, read as fast as it comes.
+"""One websocket connection to a Foxglove server, with a fast path for messages.
 
-The handshake, closing, pings, texts and all that is unusual are the business of the
-`websockets` package. The frames that are nearly everything, whole binary ones with a
-message in them, are taken out of what the socket gives before that package sees them:
-a server drops what is not read soon enough, and tells nobody.
+The `websockets` package handles closing, pings, texts and unusual frames. Nearly all
+frames are whole binary ones with one message. This module parses them itself: a server
+silently drops messages that are not read in time.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from typing import Final
 from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 
-from hybridlog.live.sources.foxglove.handshake import TICK_S, Opened, why
+from hybridlog.live.sources.foxglove.handshake import TICK_S, Opened, reason_of
 from hybridlog.live.sources.foxglove.protocol import MAX_TEXT, MESSAGE_DATA, PeerError, Receiver
 
 _SEND_S: Final = 3.0
 _CLOSE_S: Final = 1.0
-_PING_S: Final = 10.0  # silence after which the server is asked whether it is there
-_SILENT_S: Final = 20.0  # silence after which it is not
+_PING_S: Final = 10.0  # silence after which a ping is sent
+_SILENT_S: Final = 20.0  # silence after which the connection counts as broken
 
 _READ: Final = 1 << 17
-_LARGE: Final = 1 << 16  # bytes of a frame from which its payload is read to where it stays
+_LARGE: Final = 1 << 16  # bytes from which a payload is read directly into its own memory
 _MAX_CONTROL: Final = 125
 _MAX_SKIPPED: Final = 16 << 30
 
@@ -39,12 +38,12 @@ _IDS = Struct("<IQ").unpack_from
 
 
 class Connection:
-    """A connection; one thread reads it, and sends what it has to say.
+    """A connection; one thread reads it and sends on it.
 
     Args:
-        opened: The connection after its handshake. Whoever opened it closes it.
-        max_message_bytes: Largest payload that is taken.
-        stopped: Whether the user wants to stop; asked at least four times a second.
+        opened: The connection after its handshake. The caller closes it.
+        max_message_bytes: Largest payload.
+        stopped: Tells whether the source is stopped; called at least four times a second.
     """
 
     def __init__(self, opened: Opened, max_message_bytes: int, stopped: Callable[[], bool]) -> None:
@@ -57,8 +56,8 @@ class Connection:
         self._quiet_s = 0.0
         self._is_pinged = False
         self._deadline: float | None = None
-        self._owed = 0  # bytes of a frame that websockets reads
-        self._skip = 0  # bytes of a frame that nobody reads
+        self._owed = 0  # remaining bytes of a frame for websockets
+        self._skip = 0  # remaining bytes of a skipped frame
         self._large: tuple[int, int, int, bytes] | None = None
         self._in_fragments = False
         self._gathered_is_text = False
@@ -67,13 +66,13 @@ class Connection:
     # Reading.
 
     def read(self, receiver: Receiver) -> str:
-        """Read until the connection ends, or the user wants to stop.
+        """Read until the connection ends or the source is stopped.
 
         Returns:
-            How the server closed it, or an empty string when we did.
+            How the server closed the connection; empty if this side did.
 
         Raises:
-            PeerError: It broke, or the server breaks the rules.
+            PeerError: The connection broke, or the server violates the protocol.
         """
         data = self._early
         self._early = b""
@@ -95,7 +94,7 @@ class Connection:
                 if self._deadline is not None:
                     return ""
                 if self._large is None:
-                    self._tell_cut(data[at:], receiver)
+                    self._report_cut(data[at:], receiver)
                 raise
             data = data[at:] + more if at < len(data) else more
 
@@ -103,7 +102,7 @@ class Connection:
         """Take all whole frames.
 
         Returns:
-            Where the first byte lies that was not used.
+            Offset of the first unused byte.
         """
         take = receiver.data
         at, end = self._go_on(data, receiver), len(data)
@@ -121,7 +120,7 @@ class Connection:
                 (length,) = _U64(data, body)
                 body += 8
             elif length > 127:
-                # Masked, which only clients do: websockets says so.
+                # Masked, which only clients may do: websockets reports it.
                 self._hand_on(data[at:body], receiver)
                 return end
             if data[at] != _WHOLE_BINARY or self._in_fragments:
@@ -143,7 +142,7 @@ class Connection:
         return at
 
     def _go_on(self, data: bytes, receiver: Receiver) -> int:
-        """Use what belongs to a frame that began before."""
+        """Use the bytes of a frame that began earlier; returns their number."""
         if self._skip:
             used = min(self._skip, len(data))
             self._skip -= used
@@ -162,17 +161,15 @@ class Connection:
             self._large = (subscription, log_time, size, have)
             return
         if length > _MAX_SKIPPED:
-            raise PeerError(
-                f"claims a message of {length} bytes, which cannot be; is it a Foxglove server?"
-            )
+            raise PeerError(f"announces a message of {length} bytes; is it a Foxglove server?")
         if data[body] == MESSAGE_DATA:
             receiver.too_large(subscription, size)
         self._skip = size - len(have)
 
     def _fill(self, large: tuple[int, int, int, bytes], receiver: Receiver) -> None:
-        """Read the rest of a large payload to where it stays.
+        """Read the rest of a large payload directly into its own memory.
 
-        What is claimed is memory only as it comes: pages of zeros take none.
+        Memory is used only as bytes come: untouched pages of zeros take none.
         """
         subscription, log_time, size, have = large
         made = self._socket
@@ -191,14 +188,14 @@ class Connection:
         receiver.data(subscription, log_time, store.getvalue())
 
     def _other(self, head: bytes, receiver: Receiver) -> None:
-        """A binary message that is none of ours: times and answers are not recorded."""
+        """Handle another binary message: times and answers are not recorded."""
         if not head:
             receiver.broken("an empty binary message")
         elif head[0] == MESSAGE_DATA:
             receiver.broken(f"a message of {len(head)} bytes, shorter than its header")
 
-    def _tell_cut(self, rest: bytes, receiver: Receiver) -> None:
-        """Say whose message the connection broke in, if so much of it came."""
+    def _report_cut(self, rest: bytes, receiver: Receiver) -> None:
+        """Report the message in which the connection broke, if its header is complete."""
         if self._in_fragments or self._owed:
             head = b"" if self._gathered_is_text else bytes(self._gathered[:5])
         elif rest[:1] == bytes([_WHOLE_BINARY]) and len(rest) > 1:
@@ -209,13 +206,13 @@ class Connection:
         if len(head) == 5 and head[0] == MESSAGE_DATA:
             receiver.cut(int.from_bytes(head[1:], "little"))
 
-    # Frames that websockets reads.
+    # Frames for websockets.
 
     def _unusual(self, data: bytes, at: int, body: int, length: int, receiver: Receiver) -> int:
-        """Hand a frame to websockets, as far as it is there.
+        """Pass the available bytes of a frame to websockets.
 
         Returns:
-            Where the next frame begins.
+            Offset of the next frame.
         """
         opcode, is_last = data[at] & 0x0F, bool(data[at] & 0x80)
         if opcode < 8:
@@ -227,7 +224,7 @@ class Connection:
                 raise PeerError(f"sends a {kind} of more than {limit} bytes")
             self._in_fragments = not is_last
         elif length > _MAX_CONTROL:
-            raise PeerError("breaks the websocket protocol (a control frame is too long)")
+            raise PeerError("violates the websocket protocol (a control frame is too long)")
         stop = min(body + length, len(data))
         self._owed = body + length - stop
         self._hand_on(data[at:stop], receiver)
@@ -249,11 +246,11 @@ class Connection:
         try:
             self._flush()
         except PeerError:
-            # Who has said goodbye need not hear our answer.
+            # A server that has closed need not get the answer.
             if self._protocol.close_rcvd is None:
                 raise
         if self._protocol.parser_exc is not None:
-            raise PeerError(f"breaks the websocket protocol ({self._protocol.parser_exc})")
+            raise PeerError(f"violates the websocket protocol ({self._protocol.parser_exc})")
 
     def _deliver(self, whole: bytes, receiver: Receiver) -> None:
         if self._gathered_is_text:
@@ -267,14 +264,14 @@ class Connection:
     # Waiting, sending, closing.
 
     def _more(self, receiver: Receiver) -> bytes:
-        """What came, at least a byte.
+        """Receive at least one byte.
 
         Raises:
-            PeerError: The connection has ended, or its time is over.
+            PeerError: The connection has ended, or a deadline has passed.
         """
         made = self._socket
         while True:
-            self._look()
+            self._check_stop()
             try:
                 data = made.recv(_READ)
             except TimeoutError:
@@ -282,45 +279,45 @@ class Connection:
                 receiver.look()
                 continue
             except OSError as error:
-                raise PeerError(why(error)) from error
+                raise PeerError(reason_of(error)) from error
             if not data:
                 raise PeerError("the connection broke")
             self._quiet_s = 0.0
             return data
 
     def _more_into(self, made: socket.socket, view: memoryview) -> int:
-        """Number of bytes that came to where they stay, at least one.
+        """Receive at least one byte into a buffer; returns their number.
 
         Raises:
-            PeerError: The connection has ended, or its time is over.
+            PeerError: The connection has ended, or a deadline has passed.
         """
         while True:
-            self._look()
+            self._check_stop()
             try:
                 count = made.recv_into(view)
             except TimeoutError:
                 self._wait()
                 continue
             except OSError as error:
-                raise PeerError(why(error)) from error
+                raise PeerError(reason_of(error)) from error
             if not count:
                 raise PeerError("the connection broke in the middle of a message")
             self._quiet_s = 0.0
             return count
 
-    def _look(self) -> None:
-        """See whether we shall stop, or should have stopped by now."""
+    def _check_stop(self) -> None:
+        """Begin to close if the source is stopped; raise if closing takes too long."""
         if self._deadline is None:
             if self._stopped():
                 self._begin_to_close()
         elif time.monotonic() > self._deadline:
-            raise PeerError("does not say goodbye")
+            raise PeerError("does not close the connection")
 
     def _wait(self) -> None:
-        """Nothing came for a while."""
+        """Handle a pause: ping the server, or give it up."""
         self._quiet_s += TICK_S
         if self._quiet_s >= _SILENT_S:
-            raise PeerError(f"has not been heard of for {_SILENT_S:g} s")
+            raise PeerError(f"has been silent for {_SILENT_S:g} s")
         if self._quiet_s < _PING_S:
             self._is_pinged = False
         elif not self._is_pinged and self._protocol.state is State.OPEN:
@@ -329,21 +326,21 @@ class Connection:
             self._flush()
 
     def _begin_to_close(self) -> None:
-        """Say goodbye; what is under way still comes."""
+        """Send a close frame; messages under way still come."""
         self._deadline = time.monotonic() + _CLOSE_S
         if self._protocol.state is State.OPEN:
             self._protocol.send_close(1000)
             try:
                 self._flush()
             except PeerError:
-                # The server is gone already, or does not read: nothing to wait for.
+                # The server is gone already or does not read: do not wait.
                 self._deadline = time.monotonic()
 
     def send(self, text: str) -> None:
-        """Send a JSON message; nothing happens once the connection is closing.
+        """Send a JSON message, unless the connection is closing.
 
         Raises:
-            PeerError: The server does not take it.
+            PeerError: The server does not read.
         """
         if self._protocol.state is State.OPEN:
             self._protocol.send_text(text.encode())
@@ -358,8 +355,8 @@ class Connection:
                 made.settimeout(_SEND_S)
                 made.sendall(data)
             except TimeoutError as error:
-                raise PeerError(f"does not read what we send for {_SEND_S:g} s") from error
+                raise PeerError(f"has not read for {_SEND_S:g} s") from error
             except OSError as error:
-                raise PeerError(why(error)) from error
+                raise PeerError(reason_of(error)) from error
             finally:
                 made.settimeout(TICK_S)

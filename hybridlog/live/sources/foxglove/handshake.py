@@ -1,4 +1,4 @@
-"""Opening a websocket to a Foxglove server: TCP, TLS, and the agreement on the protocol."""
+"""Opens a websocket to a Foxglove server: TCP, TLS and websocket handshake."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS, Address, Peer
 from hybridlog_storage.errors import UsageError
 
 TICK_S: Final = 0.25
-"""How soon a connection that is silent sees that it shall stop."""
+"""Interval at which a silent connection checks whether to stop."""
 
 _OPEN_S: Final = 10.0
 _READ: Final = 1 << 16
@@ -28,7 +28,7 @@ _MAX_ANSWER: Final = 1 << 16
 
 
 class StoppedError(Exception):
-    """The user wants to stop while a connection is being made."""
+    """The source was stopped while it was connecting."""
 
 
 class Opened(NamedTuple):
@@ -36,8 +36,8 @@ class Opened(NamedTuple):
 
     Attributes:
         socket: With a timeout of `TICK_S`.
-        protocol: The rules of websockets, as far as they have come.
-        early: What the server sent right behind its handshake.
+        protocol: State of the websocket protocol.
+        early: Bytes that followed the server's handshake.
     """
 
     socket: socket.socket
@@ -46,16 +46,16 @@ class Opened(NamedTuple):
 
 
 def websocket_uri(address: Address) -> WebSocketURI:
-    """The address as websockets wants it.
+    """The address as the `websockets` package has it.
 
     Raises:
-        UsageError: It finds fault with it.
+        UsageError: The address is invalid.
     """
     try:
         return parse_uri(address.url)
     except (InvalidURI, ValueError) as error:
         raise UsageError(
-            f"{address.shown}: no address of a Foxglove server; give one like ws://robot:8765"
+            f"{address.shown}: not the address of a Foxglove server; give one like ws://robot:8765"
         ) from error
 
 
@@ -63,18 +63,18 @@ def open_websocket(address: Address, stopped: Callable[[], bool]) -> Opened:
     """Connect, and agree on the protocol.
 
     Args:
-        address: Where to.
-        stopped: Whether the user wants to stop; asked four times a second.
+        address: The server.
+        stopped: Tells whether the source is stopped; called four times a second.
 
     Raises:
-        PeerError: It does not work now; the message says why, and what to do.
-        StoppedError: The user wants to stop.
+        PeerError: The connection failed; the message names reason and remedy.
+        StoppedError: The source was stopped.
     """
     return _Opening(address, stopped).open()
 
 
 class _Opening:
-    """One attempt, with a deadline."""
+    """One attempt to connect, with a deadline."""
 
     def __init__(self, address: Address, stopped: Callable[[], bool]) -> None:
         self._address = address
@@ -105,19 +105,19 @@ class _Opening:
             ) from error
         except ssl.SSLError as error:
             raise PeerError(
-                f"no TLS there ({error.reason or error}); try ws:// instead of wss://"
+                f"does not speak TLS ({error.reason or error}); try ws:// instead of wss://"
             ) from error
         except OSError as error:
-            raise PeerError(why(error)) from error
+            raise PeerError(reason_of(error)) from error
 
     def _connect(self) -> socket.socket:
         address = self._address
         try:
             found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
         except (socket.gaierror, UnicodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "no name of a host"
+            reason = error.strerror if isinstance(error, OSError) else "not a host name"
             raise PeerError(
-                f"host {address.host!r} is not known ({reason}); check its spelling"
+                f"host {address.host!r} is unknown ({reason}); check its spelling"
             ) from error
         last: OSError = ConnectionRefusedError()
         for family, kind, protocol, _, place in found:
@@ -148,7 +148,7 @@ class _Opening:
             self._check()
         failed = made.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if failed:
-            # Called like this it makes the class that fits the number.
+            # With these arguments OSError becomes its subclass for the number.
             raise OSError(failed, os.strerror(failed))
 
     def _secure(self, plain: socket.socket) -> socket.socket:
@@ -159,7 +159,7 @@ class _Opening:
                 plain, server_hostname=host, do_handshake_on_connect=False
             )
         except ValueError as error:
-            raise PeerError(f"no certificate can be for {host!r}; check its spelling") from error
+            raise PeerError(f"{host!r} cannot have a certificate; check its spelling") from error
         try:
             while True:
                 try:
@@ -176,7 +176,7 @@ class _Opening:
         """Do the websocket handshake.
 
         Returns:
-            What came behind it.
+            Bytes that followed it.
         """
         protocol = self._protocol
         protocol.send_request(protocol.connect())
@@ -204,7 +204,7 @@ class _Opening:
             )
         if protocol.subprotocol is None:
             raise PeerError(
-                "a websocket server, but none that speaks Foxglove; start foxglove_bridge or "
+                "a websocket server that does not speak Foxglove; start foxglove_bridge or "
                 "a program with the Foxglove SDK, and give its port"
             )
         return early
@@ -216,26 +216,26 @@ class _Opening:
             raise PeerError(f"does not answer within {_OPEN_S:g} s; check host and port")
 
 
-_NO_WEBSOCKET = "it is no websocket server; check the port (foxglove_bridge uses 8765)"
+_NO_WEBSOCKET = "not a websocket server; check the port (foxglove_bridge uses 8765)"
 
 
 def _refusal(status: str) -> str:
-    """What to do about an answer that is not the one for websockets."""
+    """Reason and remedy for an HTTP answer that refuses the websocket."""
     if not status.startswith("HTTP/"):
         return _NO_WEBSOCKET
     code = status[9:12]
     if code in {"401", "403"}:
-        return f"refuses us (HTTP {code}); give ws://USER:PASSWORD@HOST:PORT"
+        return f"refuses access (HTTP {code}); give ws://USER:PASSWORD@HOST:PORT"
     return (
         f"answers HTTP {code} instead of a websocket; check the port and the path, and "
         "whether it is a Foxglove server"
     )
 
 
-def why(error: OSError) -> str:
-    """What went wrong with a socket, for people."""
+def reason_of(error: OSError) -> str:
+    """The reason of a socket error, for the user."""
     if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there; start foxglove_bridge or the program, or correct the port"
+        return "refuses connections; start foxglove_bridge or the program, or correct the port"
     if isinstance(error, ConnectionResetError | BrokenPipeError):
         return "the connection broke"
     return f"cannot be reached ({error.strerror or error})"

@@ -1,4 +1,4 @@
-"""What the messages of the Foxglove WebSocket protocol mean, without any socket."""
+"""Messages of the Foxglove WebSocket protocol: parsing and encoding."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""What we speak, the one we like best first."""
+"""Protocol versions that the client speaks, the preferred one first."""
 
 MESSAGE_DATA: Final = 1
-"""First byte of a binary message that carries a payload."""
+"""First byte of a binary message with a payload."""
 
 MAX_TEXT: Final = 128 << 20
-"""Largest JSON message, in bytes; a thousand channels with their definitions take 20 MB."""
+"""Largest JSON message, bytes; a thousand channels with their definitions take 20 MB."""
 
 _SCHEMA_ENCODINGS = {
     "ros1": "ros1msg",
@@ -33,52 +33,52 @@ _SCHEMA_ENCODINGS = {
 }
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
 _MAX_ID = 1 << 64
-_LONGEST = 200  # characters of an address that are shown
+_MAX_SHOWN = 200  # characters of an address that are shown
 _PORTS = {"ws": 80, "wss": 443}
 
 
 class Receiver(Protocol):
-    """What a connection speaks to, on the thread that reads it."""
+    """Receiver of a connection's messages, called by the thread that reads it."""
 
     def data(self, subscription: int, log_time: int, payload: bytes) -> None:
-        """A message, with the server's log time in ns since the epoch."""
+        """Take a message, with the server's log time in ns since the epoch."""
         ...
 
     def text(self, data: bytes) -> None:
-        """A JSON message."""
+        """Take a JSON message."""
         ...
 
     def broken(self, reason: str) -> None:
-        """A binary message that cannot be what it says."""
+        """Note a malformed binary message."""
         ...
 
     def too_large(self, subscription: int, size: int) -> None:
-        """A message over the limit, in bytes; it is passed over."""
+        """Note a skipped message that is larger than the limit, bytes."""
         ...
 
     def cut(self, subscription: int) -> None:
-        """The connection broke in the middle of a message."""
+        """Note that the connection broke in the middle of a message."""
         ...
 
     def look(self) -> None:
-        """Something came, or nothing did for a moment: time for what was put off."""
+        """Do postponed work; called after reads and in pauses."""
         ...
 
 
 class PeerError(Exception):
-    """A server that cannot be reached, or does what none may do; the message is for people."""
+    """The server is unreachable or violates the protocol; the message is for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a server is.
+    """Address of a server.
 
     Attributes:
-        url: As the user gave it, a password included: not to be shown.
-        shown: Without user and password.
-        host: Name or number.
+        url: As the user gave it, with a password: not to be shown.
+        shown: The URL without user and password.
+        host: Host name or IP address.
         port: TCP port.
-        is_secure: TLS is wanted.
+        is_secure: Use TLS.
     """
 
     url: str
@@ -93,10 +93,10 @@ class Advertised:
     """A channel that a server offers.
 
     Attributes:
-        id: The server's number of it.
-        channel: As a log would have it.
-        type_name: Name of its type, empty when the server gives none.
-        problem: What is wrong with its definition, empty when nothing is.
+        id: The server's number of the channel.
+        channel: The channel, as in a log.
+        type_name: Name of its type, empty if unknown.
+        problem: Problem with its definition, or an empty string.
     """
 
     id: int
@@ -106,28 +106,30 @@ class Advertised:
 
 
 def parse_address(url: str) -> Address:
-    """Parses the address of a server.
+    """Parse the address of a server.
 
     Raises:
-        UsageError: It is none.
+        UsageError: The address is invalid.
     """
-    cure = "give an address like ws://robot:8765"
+    remedy = "give an address like ws://robot:8765"
     shown = without_user(url)
     if not url.isprintable() or " " in url:
-        raise UsageError(f"{shown}: no address of a Foxglove server; {cure}")
+        raise UsageError(f"{shown}: not the address of a Foxglove server; {remedy}")
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError as error:
-        raise UsageError(f"{shown}: no address of a Foxglove server ({error}); {cure}") from error
+        raise UsageError(
+            f"{shown}: not the address of a Foxglove server ({error}); {remedy}"
+        ) from error
     if parts.scheme not in _PORTS:
-        raise UsageError(f"{shown}: does not begin with ws:// or wss://; {cure}")
+        raise UsageError(f"{shown}: does not begin with ws:// or wss://; {remedy}")
     if not host:
-        raise UsageError(f"{shown}: names no host; {cure}")
+        raise UsageError(f"{shown}: names no host; {remedy}")
     if parts.fragment:
-        raise UsageError(f"{shown}: an address of a server has no part behind '#'; {cure}")
+        raise UsageError(f"{shown}: an address has no part after '#'; {remedy}")
     if port == 0:
-        raise UsageError(f"{shown}: nobody can listen on port 0; {cure}")
+        raise UsageError(f"{shown}: port 0 is invalid; {remedy}")
     if parts.username is not None and parts.password is None:
         raise UsageError(
             f"{shown}: a user without a password; give both "
@@ -143,59 +145,59 @@ def parse_address(url: str) -> Address:
 
 
 def without_user(url: str) -> str:
-    """An address as it may be shown: no password, nothing that a terminal acts on."""
-    return one_line(re.sub(r"//[^/]*@", "//", url), _LONGEST)
+    """An address to show: without password and control characters."""
+    return one_line(re.sub(r"//[^/]*@", "//", url), _MAX_SHOWN)
 
 
 def parse_text(data: bytes) -> Mapping[str, object]:
-    """Parses a JSON message.
+    """Parse a JSON message.
 
     Raises:
-        PeerError: It is none.
+        PeerError: The message is malformed.
     """
     try:
         message = json.loads(data.decode())
     except (ValueError, RecursionError) as error:
-        raise PeerError(f"sent a message that is no JSON ({error}); it is left out") from error
+        raise PeerError(f"sent a message that is not JSON ({error}); it is ignored") from error
     if not isinstance(message, dict) or not isinstance(message.get("op"), str):
-        raise PeerError("sent a JSON message without an operation ('op'); it is left out")
+        raise PeerError("sent a JSON message without an operation ('op'); it is ignored")
     return message
 
 
 def subscribe(wanted: Mapping[int, int]) -> str:
-    """The request for messages.
+    """The request to subscribe to channels.
 
     Args:
-        wanted: Our number of each subscription, and the server's number of its channel.
+        wanted: Number of each new subscription, and the server's number of its channel.
     """
     subscriptions = [{"id": number, "channelId": channel} for number, channel in wanted.items()]
     return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
 
 
 def unsubscribe(number: int) -> str:
-    """The request for no more messages of a subscription."""
+    """The request to end a subscription."""
     return json.dumps({"op": "unsubscribe", "subscriptionIds": [number]})
 
 
 def parse_channel(entry: object) -> Advertised:
-    """Makes a channel of what a server advertises.
+    """Parse an advertised channel.
 
-    A definition that cannot be read leaves a channel without one: its messages are as
-    good as ever, only their fields cannot be told apart.
+    A channel with an unreadable definition has none: its messages are recorded, but their
+    fields cannot be searched.
 
     Raises:
-        PeerError: There is no id, topic or encoding to work with.
+        PeerError: Id, topic or encoding are missing.
     """
     if not isinstance(entry, dict):
-        raise PeerError("advertised a channel that is no JSON object; it is left out")
+        raise PeerError("advertised a channel that is not a JSON object; it is ignored")
     number = entry.get("id")
     if type(number) is not int or not 0 <= number < _MAX_ID:
-        raise PeerError("advertised a channel without a number ('id'); it is left out")
+        raise PeerError("advertised a channel without a number ('id'); it is ignored")
     topic, encoding = entry.get("topic"), entry.get("encoding")
     if not _is_text(topic) or not topic:
-        raise PeerError(f"advertised channel {number} without a topic; it is left out")
+        raise PeerError(f"advertised channel {number} without a topic; it is ignored")
     if not _is_text(encoding):
-        raise PeerError(f"advertised {topic!r} without an encoding; it is left out")
+        raise PeerError(f"advertised {topic!r} without an encoding; it is ignored")
     name = entry.get("schemaName")
     schema, problem = _parse_schema(entry, name if _is_text(name) else "", encoding)
     metadata = entry.get("metadata")
@@ -215,24 +217,24 @@ def parse_channel(entry: object) -> Advertised:
 def _parse_schema(
     entry: Mapping[str, object], name: str, encoding: str
 ) -> tuple[Schema | None, str]:
-    """The definition of a channel, and what is wrong with it."""
+    """The definition of a channel, and its problem if any."""
     text, kind = entry.get("schema"), entry.get("schemaEncoding")
     if not kind:
         kind = _SCHEMA_ENCODINGS.get(encoding, encoding)
     if not text:
         return (Schema(name, "", b"") if name else None), ""
     if not _is_text(text) or not _is_text(kind):
-        return Schema(name, "", b""), "is no text"
+        return Schema(name, "", b""), "is not text"
     if kind not in _BASE64:
         return Schema(name, kind, text.encode()), ""
     try:
         return Schema(name, kind, base64.b64decode(text, validate=True)), ""
     except (binascii.Error, ValueError) as error:
-        return Schema(name, "", b""), f"is no base64 ({error})"
+        return Schema(name, "", b""), f"is not base64 ({error})"
 
 
 def _is_text(value: object) -> TypeGuard[str]:
-    """Whether a value is text that UTF-8 can hold; JSON also has halves of characters."""
+    """Tells whether a value is text that UTF-8 can encode; JSON may have lone surrogates."""
     if not isinstance(value, str):
         return False
     try:

@@ -1,4 +1,4 @@
-"""What one connection to a Foxglove server has been told, and what became of it."""
+"""Channels and subscriptions of one connection to a Foxglove server."""
 
 from __future__ import annotations
 
@@ -31,49 +31,49 @@ from hybridlog_storage.messages import Channel
 _MAX_CHANNELS: Final = 1 << 16
 _MAX_RETIRED: Final = 1 << 12
 _MAX_NS: Final = 1 << 63
-_MAX_QUOTED: Final = 100
+_MAX_COMPLAINTS: Final = 100
 _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
 _MAX_REFUSALS: Final = 20
-_AGAIN_S: Final = 0.02
+_RETRY_S: Final = 0.02
 _NUMBER: Final = Struct("<I").unpack_from
 
 
 class Notifier:
-    """Says things about one server, in one clear line each.
+    """Reports problems of one server to the user, one line each.
 
     Args:
-        sink: Who is told.
-        name: The server, as people know it.
+        sink: Shows the lines.
+        name: Name of the server for the user.
     """
 
     def __init__(self, sink: Sink, name: str) -> None:
         self._sink = sink
         self._name = name
-        self._quoted = 0
+        self._complaints = 0
 
     def say(self, text: str) -> None:
-        """Say something that may hold words of the server."""
+        """Report a problem; the text may quote the server."""
         self._sink.say(f"{self._name}: {one_line(text)}")
 
     def complain(self, text: str) -> None:
-        """Say what the server may give reason for as often as it likes: not too often."""
-        self._quoted += 1
-        if self._quoted <= _MAX_QUOTED:
+        """Report a problem that the server can cause any number of times, up to a limit."""
+        self._complaints += 1
+        if self._complaints <= _MAX_COMPLAINTS:
             self.say(text)
-        elif self._quoted == _MAX_QUOTED + 1:
-            self.say(f"has given {_MAX_QUOTED} reasons to complain; further ones are not shown")
+        elif self._complaints == _MAX_COMPLAINTS + 1:
+            self.say(f"has caused {_MAX_COMPLAINTS} complaints; further ones are not shown")
 
 
 @dataclass(slots=True)
 class _Subscription:
-    """A subscription that the server may have refused some times.
+    """A subscription to a channel.
 
     Attributes:
-        number: Ours.
-        offer: What it is to.
-        refusals: How often the server said that there is no such channel.
+        number: Number of the subscription.
+        offer: The channel.
+        refusals: Number of times that the server refused it.
     """
 
     number: int
@@ -86,10 +86,10 @@ class Session:
 
     Args:
         sink: Takes the messages.
-        notifier: Says what is wrong.
+        notifier: Reports problems.
         send: Sends a JSON message.
-        missed: Topics that were recorded before, and since when they are not: ns since
-            the epoch. Topics that are there again are taken out.
+        missed: Topics of an earlier connection, with the time of its end, ns since the
+            epoch. Topics that are available again are removed.
     """
 
     def __init__(
@@ -110,8 +110,8 @@ class Session:
         self._topics: dict[str, int] = {}
         self._retired: deque[int] = deque()
         self._is_full = False
-        self._again: set[int] = set()
-        self._again_at = 0.0
+        self._retries: set[int] = set()
+        self._retry_at = 0.0
 
     # Messages.
 
@@ -119,17 +119,15 @@ class Session:
         """Take a message."""
         route = self._routes.get(subscription)
         if route is None:
-            self._left_out("of a subscription that we do not have")
-            self._notifier.complain(
-                "sends messages of a subscription that we do not have; they are left out"
-            )
+            self._ignored("of an unknown subscription")
+            self._notifier.complain("sends messages of an unknown subscription; they are ignored")
             return
         channel, gaps = route
         received = time.time_ns()
         if log_time >= _MAX_NS:
             self._notifier.complain(
-                f"gives {channel.topic!r} a time after the year 2262; the time of receiving "
-                "stands for it"
+                f"gives {channel.topic!r} a time after the year 2262; it is replaced by the "
+                "receive time"
             )
             log_time = received
         self._take(channel, payload, received=received, sent=log_time)
@@ -139,19 +137,19 @@ class Session:
                 self._report(channel.topic, gaps.confirmed())
 
     def too_large(self, subscription: int, size: int) -> None:
-        """A message over the limit was passed over."""
+        """Note a skipped message that is larger than the limit."""
         topic = self._topic_of(subscription)
         if topic is None:
             return
         now = time.time_ns()
-        detail = f"a message of {size} bytes is over the limit of this source"
+        detail = f"a message of {size} bytes exceeds the limit of this source"
         self._sink.lost(topic, Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
         self._notifier.complain(
-            f"{topic!r} has messages over the limit of this source; they are left out"
+            f"{topic!r} has messages that exceed the limit of this source; they are skipped"
         )
 
     def cut(self, subscription: int) -> None:
-        """The connection broke in the middle of a message."""
+        """Note that the connection broke in the middle of a message."""
         topic = self._topic_of(subscription)
         if topic is not None:
             now = time.time_ns()
@@ -159,12 +157,12 @@ class Session:
             self._sink.lost(topic, Cause.CONNECTION, 1, first=now, last=now, detail=detail)
 
     def broken(self, reason: str) -> None:
-        """A binary message that cannot be what it says."""
-        self._left_out("too short to be a message")
-        self._notifier.complain(f"sends {reason}; it is left out")
+        """Note a malformed binary message."""
+        self._ignored("too short for a message")
+        self._notifier.complain(f"sends {reason}; it is ignored")
 
-    def _left_out(self, detail: str) -> None:
-        """A message of nobody knows which topic is a row as well."""
+    def _ignored(self, detail: str) -> None:
+        """Note a lost message of an unknown topic."""
         now = time.time_ns()
         self._sink.lost("", Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
 
@@ -172,10 +170,10 @@ class Session:
         route = self._routes.get(subscription)
         return None if route is None else route[0].topic
 
-    # What the server says of itself.
+    # JSON messages.
 
     def text(self, data: bytes) -> None:
-        """Act on a JSON message; those that mean nothing to a recorder are passed over."""
+        """Handle a JSON message; operations that do not matter to a recorder are ignored."""
         try:
             message = parse_text(data)
         except PeerError as error:
@@ -191,7 +189,7 @@ class Session:
 
     def _advertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._notifier.complain("advertises no list of channels; it is left out")
+            self._notifier.complain("advertises something else than a list of channels")
             return
         wanted: dict[int, int] = {}
         for entry in channels:
@@ -207,11 +205,11 @@ class Session:
             self._send(subscribe(wanted))
 
     def _offered(self, offer: Advertised) -> int | None:
-        """The number of a new subscription to a channel, None when there is none to make."""
+        """Number of a new subscription to a channel, None if it needs none."""
         topic = offer.channel.topic
         known = self._subscriptions.get(offer.id)
         if known is not None:
-            if _alike(known.offer.channel, offer.channel):
+            if _are_equal(known.offer.channel, offer.channel):
                 return None
             self._send(unsubscribe(known.number))
             self._retire(offer.id)
@@ -219,13 +217,13 @@ class Session:
             return None
         if len(self._subscriptions) >= _MAX_CHANNELS:
             if not self._is_full:
-                self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is left out")
+                self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
             self._is_full = True
             return None
         if offer.problem:
             self._notifier.complain(
-                f"the definition of {topic!r} {offer.problem}; its messages are kept, their "
-                "fields cannot be searched"
+                f"the definition of {topic!r} {offer.problem}; its messages are recorded, but "
+                "their fields cannot be searched"
             )
         gaps = SequenceGapDetector() if has_sequence_numbers(offer.channel) else None
         number = self._next
@@ -243,20 +241,20 @@ class Session:
                 None,
                 first=since,
                 last=time.time_ns(),
-                detail="there was no connection; what was sent meanwhile is not known",
+                detail="the connection was down; messages of this time are unknown",
             )
         return number
 
     def _unadvertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._notifier.complain("takes back no list of channels; it is left out")
+            self._notifier.complain("unadvertises something else than a list of channels")
             return
         for number in channels:
             if type(number) is int and number in self._subscriptions:
                 self._retire(number)
 
     def _retire(self, channel_id: int) -> None:
-        """Forget a channel. Messages of it may have been overtaken, and still count."""
+        """Remove a channel. Late messages of it are still recorded."""
         gone = self._subscriptions.pop(channel_id)
         self._is_full = False
         self._retired.append(gone.number)
@@ -271,9 +269,9 @@ class Session:
             self._sink.topic_gone(topic)
 
     def _status(self, text: str) -> None:
-        """Act on what the server has to say, or pass it on.
+        """Handle a status message: retry a refused subscription, or show it to the user.
 
-        A server may advertise a channel a moment before it lets anybody subscribe to it.
+        A server may advertise a channel a moment before it accepts subscriptions.
         """
         found = _NO_CHANNEL.search(text)
         refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
@@ -285,20 +283,20 @@ class Session:
             topic = refused.offer.channel.topic
             self._notifier.complain(f"offers {topic!r}, but does not send it ({text})")
             return
-        self._again.add(refused.offer.id)
-        self._again_at = time.monotonic() + _AGAIN_S * (refused.refusals - 1)
+        self._retries.add(refused.offer.id)
+        self._retry_at = time.monotonic() + _RETRY_S * (refused.refusals - 1)
         self.look()
 
     def look(self) -> None:
-        """Ask again for what was refused, when it is time."""
-        if not self._again or time.monotonic() < self._again_at:
+        """Retry refused subscriptions when it is time."""
+        if not self._retries or time.monotonic() < self._retry_at:
             return
         wanted = {
             self._subscriptions[number].number: number
-            for number in self._again
+            for number in self._retries
             if number in self._subscriptions
         }
-        self._again.clear()
+        self._retries.clear()
         if wanted:
             self._send(subscribe(wanted))
 
@@ -316,10 +314,10 @@ class Session:
             )
 
     def end(self, *, is_stopped: bool) -> None:
-        """The connection is over.
+        """End the session.
 
         Args:
-            is_stopped: Because the user wants it so.
+            is_stopped: The source was stopped; otherwise the connection ended.
         """
         now = time.time_ns()
         for channel, gaps in self._routes.values():
@@ -334,8 +332,8 @@ class Session:
         self._routes.clear()
 
 
-def _alike(one: Channel, other: Channel) -> bool:
-    """Whether two channels cannot be told apart."""
+def _are_equal(one: Channel, other: Channel) -> bool:
+    """Tells whether two channels are equal."""
     return (one.topic, one.message_encoding, one.schema, one.metadata) == (
         other.topic,
         other.message_encoding,

@@ -1,21 +1,19 @@
 """Recording from a Foxglove WebSocket server: foxglove_bridge, or a program with its SDK.
 
-What can be known of losses, and what cannot:
+Losses that can be detected, and those that cannot:
 
-* A server keeps a number of messages for each of its clients (the SDK 1024, the bridge
-  some megabytes), and drops the oldest when a client does not keep up. It tells nobody:
-  the protocol has no numbers. So this source reads as fast as it can, and its reading
-  thread does nothing else. At tens of thousands of messages a second 1024 are a moment
-  that any busy computer can miss: give the server more (`message_backlog_size`).
-* Messages of ROS 1 that begin with a header carry the number of their publisher, and a
-  gap in what counted without gaps before is reported as lost in transport, wherever it
-  was lost: in the publisher, in the bridge, or in its queue to us. Topics without a
-  header, all of ROS 2 and all of the SDK's own types have nothing of that kind.
-* While the connection is down, nobody knows what was sent: that is a row without a
-  number, once the topic is back.
+* A server queues messages for each client (the SDK 1024, the bridge some megabytes), and
+  silently drops the oldest when a client is slow: the protocol has no sequence numbers.
+  So this source has a thread that only reads. At tens of thousands of messages a second a
+  queue of 1024 overflows within a moment: raise the server's `message_backlog_size`.
+* ROS 1 messages that begin with a header carry a sequence number (see `sequence_gaps`).
+  A gap is reported as lost in transport, wherever the messages were lost: in the
+  publisher, the bridge or its queue. Other messages have no numbers.
+* While the connection is down, the number of lost messages is unknown. Once the topic is
+  back, the loss ledger gets a row without a count.
 
-The server gives each message a time of its own clock, its log time: it becomes the time
-of sending. With simulated time that may be no time of this century.
+The server's log time of a message becomes its send time. With simulated time it may lie
+in another century.
 """
 
 from __future__ import annotations
@@ -28,20 +26,20 @@ from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 _JOIN_S: Final = 5.0
-_MIN_LIMIT: Final = 1 << 20
+_MIN_MESSAGE_BYTES: Final = 1 << 20
 
 
 class FoxgloveSource(LiveSource):
-    """A client of one Foxglove WebSocket server. Its certificate is checked as ever.
+    """A client of one Foxglove WebSocket server. TLS certificates are checked.
 
-    A server that is away, or becomes so, is tried again with growing pauses. Its
-    channels may come back under any number.
+    It reconnects with growing pauses. After that the server's channels may have other
+    numbers.
 
     Args:
-        url: Address, such as `ws://robot:8765`; user and password may stand before the
-            host. Proxies of the environment are not used.
-        max_message_bytes: Largest payload that is taken, at least 1 MiB. Larger ones are
-            passed over, and are rows of the loss ledger.
+        url: Address, such as `ws://robot:8765`, optionally with user and password. Proxies
+            of the environment are not used.
+        max_message_bytes: Largest payload, at least 1 MiB. Larger messages are skipped and
+            noted in the loss ledger.
 
     Raises:
         UsageError: The limit is too small.
@@ -50,8 +48,8 @@ class FoxgloveSource(LiveSource):
     kind = "Foxglove"
 
     def __init__(self, url: str, *, max_message_bytes: int = 1 << 30) -> None:
-        if max_message_bytes < _MIN_LIMIT:
-            raise UsageError("the largest message must be allowed at least 1 MiB")
+        if max_message_bytes < _MIN_MESSAGE_BYTES:
+            raise UsageError("the maximum message size must be at least 1 MiB")
         self._url = url
         self.address = without_user(url)
         self.was_reached = False
@@ -60,18 +58,18 @@ class FoxgloveSource(LiveSource):
         self._thread: threading.Thread | None = None
 
     def check(self) -> None:
-        """Refuse an address that is none.
+        """Check the address.
 
         Raises:
-            UsageError: It is none.
+            UsageError: The address is invalid.
         """
         parse_address(self._url)
 
     def start(self, sink: Sink) -> None:
-        """Begin to listen; a server that is not there yet is waited for.
+        """Begin to listen; the server need not be up yet.
 
         Raises:
-            UsageError: The address is none.
+            UsageError: The address is invalid.
             MissingDependencyError: `websockets` is not installed.
         """
         address = parse_address(self._url)
@@ -89,10 +87,10 @@ class FoxgloveSource(LiveSource):
         self.was_reached = True
 
     def stop(self) -> None:
-        """Say goodbye, take what is under way, and close.
+        """Close the connection after the messages that are under way.
 
-        Only the name of a host that no name server answers for may hold the thread
-        longer; it then ends without another word to the sink.
+        A hanging look-up of a host name may keep the thread alive longer; it then ends
+        without calling the sink.
         """
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
