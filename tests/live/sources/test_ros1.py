@@ -316,14 +316,14 @@ def _xml(value: object) -> bytes:
         (b"", "does not speak HTTP"),
         (b"SSH-2.0-x\r\n\r\n", "does not speak HTTP"),
         (b"HTTP/1.0 404 \x1b[2JNo\r\n\r\n", "404 ?[2JNo"),
-        (_http(b"<html>"), "no XML-RPC"),
+        (_http(b"<html>"), "malformed XML-RPC"),
         (_http(b"", length="99999999999"), "longer than"),
-        (_http(b"", length="-1"), "gives a length that is none"),
+        (_http(b"", length="-1"), "an invalid content length"),
         (_http(b"abc", length="10"), "in the middle of its answer"),
-        (_http(b"<!DOCTYPE a [<!ENTITY b 'c'>]>"), "definitions of its own"),
-        (_xml([1, "", [[["/a", "b"]], [], []]]), "none that a ROS master gives"),
-        (_xml([1, "", 5]), "none that a ROS master gives"),
-        (_xml({"a": 1}), "none that a ROS node gives"),
+        (_http(b"<!DOCTYPE a [<!ENTITY b 'c'>]>"), "XML with a document type"),
+        (_xml([1, "", [[["/a", "b"]], [], []]]), "not that of a ROS master"),
+        (_xml([1, "", 5]), "not that of a ROS master"),
+        (_xml({"a": 1}), "not that of a ROS node"),
         (_xml([-1, "go \x9b away", 0]), "it refuses: go ? away"),
         (_http(xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no")).encode()), "it answers: no"),
         (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", "in chunks"),
@@ -379,7 +379,7 @@ def _raw_server(script: Script) -> Iterator[int]:
 )
 def test_an_address_that_is_none(uri: str) -> None:
     with Ros1Source(uri) as source:
-        with pytest.raises(UsageError, match=r"no address.*ROS_MASTER_URI") as caught:
+        with pytest.raises(UsageError, match=r"not an address.*ROS_MASTER_URI") as caught:
             source.start(Collector())
     assert str(caught.value).isprintable()
 
@@ -454,10 +454,10 @@ def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:
     ("greeting", "words"),
     [
         (b"\xff\xff\xff\xff", "connection header of 4294967295 bytes"),
-        (b"\x08\0\0\0\xff\xff\xff\x7fabcd", "longer than it"),
+        (b"\x08\0\0\0\xff\xff\xff\x7fabcd", "exceeds it by"),
         (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "no '='"),
-        (b"\x20\0\0\0abc", "hangs up before its connection header is complete"),
-        (b"", "hangs up before its connection header is complete"),
+        (b"\x20\0\0\0abc", "closed the connection within its header"),
+        (b"", "closed the connection within its header"),
         (framed(framed(b"error=you \x1b[31m may not")), "it refuses: you ?[31m may not"),
     ],
 )
@@ -497,7 +497,7 @@ def test_a_publisher_that_is_not_there() -> None:
         master.add("/topic", "", "/dead", f"http://127.0.0.1:{_free_port()}/")
         master.add("/topic", "", "/odd", "tcp://\x9bnowhere")
         sink.wait_said("/topic", "refused", "rosnode cleanup", "ROS_IP")
-        sink.wait_said("/topic", "no address")
+        sink.wait_said("/topic", "not an address")
         sink.wait(lambda: sink.topics[-1] == ("/topic", "std_msgs/String", 1))
     assert all(line.isprintable() for line in sink.said)
 
@@ -577,9 +577,9 @@ def test_what_other_programs_may_ask() -> None:
             assert node.publisherUpdate("/me")[0] == -1
             assert node.publisherUpdate("/me", "/foreign", ["http://robot:1/"])[0] == 1
             assert node.shutdown("/me\x9b", "because")[0] == -1
-            with pytest.raises(xmlrpc.client.Fault, match="no method"):
+            with pytest.raises(xmlrpc.client.Fault, match="unknown method"):
                 node.system.listMethods()
-        sink.wait_said("/me? asks this node to end")
+        sink.wait_said("/me? asks this node to shut down")
         place = ("127.0.0.1", int(api.rstrip("/").rpartition(":")[2]))
         for request in (
             b"GET / HTTP/1.0\r\n\r\n",
@@ -628,7 +628,7 @@ def test_an_address_of_our_node_that_is_none(
     monkeypatch.setenv(variable, "192.0.2.1")
     with _system(FakePublisher(sends(b"x"))) as (_, sink):
         sink.wait_for(b"x")
-        sink.wait_said(f"{variable}=192.0.2.1", "no address of this computer")
+        sink.wait_said(f"{variable}=192.0.2.1", "not an address of this computer")
 
 
 def _has_ipv6() -> bool:

@@ -1,1 +1,1 @@
-"""ROS 1: a subscriber of our own, without any ROS installation."""
+"""ROS 1: a subscriber in plain Python, without a ROS installation."""

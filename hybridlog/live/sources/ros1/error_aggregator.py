@@ -1,4 +1,4 @@
-"""What cannot be had from publishers, told once a node and not once a topic."""
+"""Aggregates subscription errors: one report per node instead of one per topic."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from hybridlog.live.sources.text import one_line
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_QUIET_S = 1.5  # without more news it is told; a busy master delays some topics by a second
-_MAX_S: Final = 5.0
-_NAMED: Final = 3
-_MOST: Final = 10_000
+_QUIET_S = 1.5  # without further errors they are reported; a busy master delays some topics
+_MAX_DELAY_S: Final = 5.0
+_MAX_NAMED: Final = 3
+_MAX_ERRORS: Final = 10_000
 
-_Key = tuple[str, bool]  # a node's address, and whether it cannot be reached at all
+_Key = tuple[str, bool]  # a node's address, and True if it is unreachable
 
 
 class ErrorAggregator:
-    """Gathers what fails about the topics of a node for a moment, and says it in one line.
+    """Collects errors of a node's topics for a moment, and reports them in one line.
 
-    What fails again is not told again, however its reason is worded by then.
+    A repeated error is not reported again, even with another reason.
 
     Args:
-        say: Takes the lines.
+        say: Reports a line to the user.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -37,23 +37,23 @@ class ErrorAggregator:
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, uri: str, topic: str, error: Exception) -> None:
-        """A topic cannot be had from a node. Within the event loop."""
+        """Adds an error of a topic; call it within the event loop."""
         key = uri, isinstance(error, UnreachedError)
         topics = self._known.setdefault(key, set())
-        if topic in topics or self._size >= _MOST:
+        if topic in topics or self._size >= _MAX_ERRORS:
             return
-        is_told = bool(topics) and key[1] and key not in self._new
+        is_reported = bool(topics) and key[1] and key not in self._new
         topics.add(topic)
         self._size += 1
-        if is_told:
-            return  # a node that is away is so for all of its topics
+        if is_reported:
+            return  # an unreachable node is so for all of its topics
         self._flush_soon()
         self._new.setdefault(key, (reason_of(error), []))[1].append(topic)
 
     def resolve(self, uri: str, topic: str) -> None:
-        """A topic was had from a node for a while: what fails from now on is news."""
-        away = self._known.pop((uri, True), set())
-        self._size -= len(away)
+        """Forgets the errors of a topic that works; later ones are reported again."""
+        unreachable = self._known.pop((uri, True), set())
+        self._size -= len(unreachable)
         rest = self._known.get((uri, False), set())
         if topic in rest:
             rest.remove(topic)
@@ -65,23 +65,27 @@ class ErrorAggregator:
             self._timer.cancel()
         if not self._new:
             self._since = loop.time()
-        self._timer = loop.call_at(min(loop.time() + _QUIET_S, self._since + _MAX_S), self.flush)
+        self._timer = loop.call_at(
+            min(loop.time() + _QUIET_S, self._since + _MAX_DELAY_S), self.flush
+        )
 
     def flush(self) -> None:
-        """Say what has been gathered."""
+        """Reports the collected errors."""
         new, self._new = self._new, {}
-        for (uri, is_away), (reason, topics) in new.items():
-            self._say(_line(one_line(uri), reason, sorted(topics), is_away=is_away))
+        for (uri, is_unreachable), (reason, topics) in new.items():
+            self._say(_line(one_line(uri), reason, sorted(topics), is_unreachable=is_unreachable))
 
 
-def _line(uri: str, reason: str, topics: list[str], *, is_away: bool) -> str:
-    named = ", ".join(map(one_line, topics[:_NAMED])) + (", …" if len(topics) > _NAMED else "")
+def _line(uri: str, reason: str, topics: list[str], *, is_unreachable: bool) -> str:
+    named = ", ".join(map(one_line, topics[:_MAX_NAMED])) + (
+        ", …" if len(topics) > _MAX_NAMED else ""
+    )
     its = "its"
     if len(topics) > 1:
         named, its = f"{len(topics)} topics ({named})", "their"
-    if not is_away:
-        return f"{named}: nothing can be had from {its} publisher at {uri}: {reason}; trying on"
+    if not is_unreachable:
+        return f"{named}: cannot subscribe at {its} publisher {uri}: {reason}; trying again"
     return (
-        f"{named}: {its} publisher at {uri} cannot be reached: {reason}; trying on. Is it dead "
-        "(`rosnode cleanup`), or on a computer whose name is not known here (set ROS_IP there)?"
+        f"{named}: {its} publisher {uri} cannot be reached: {reason}; trying again. Is it dead "
+        "(`rosnode cleanup`), or on a computer with an unknown name (set ROS_IP there)?"
     )

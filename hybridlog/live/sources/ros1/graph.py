@@ -1,9 +1,9 @@
-"""Watches the master, and keeps a subscription for each topic that is wanted.
+"""Polls the master, and holds a subscription for each wanted topic.
 
-The master is asked about once a second what there is. That finds new topics, which nobody
-announces; it finds publishers that the master could not tell us of because it cannot
-reach us; and it finds that a master was started anew and has forgotten us. What the
-master does tell is taken as a hint to ask at once, so it need not be trusted.
+Polling once a second finds new topics, which the master does not announce. It finds
+publishers that the master could not announce because it cannot reach this node, and
+restarted masters that lost the registration. Announcements of the master only trigger a
+poll, so they need not be trusted.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _Item = TypeVar("_Item")
 
 
 class Graph:
-    """The topics of a master, and ours among them.
+    """The topics of a master, and the subscriptions to them.
 
     Args:
-        master: Whom to ask.
-        uri: Its address, for people.
-        poll_s: How often it is asked, seconds.
-        reached: Called each time it has answered.
+        master: The master.
+        uri: Its address, for the user.
+        poll_s: Polling interval, seconds.
+        reached: Called after each answer.
     """
 
     def __init__(
@@ -62,48 +62,48 @@ class Graph:
         self._calls = asyncio.Semaphore(_CALLS_AT_ONCE)
 
     def hint(self, topic: str) -> None:
-        """Something may have changed about the publishers of a topic."""
+        """Polls soon: the publishers of a topic may have changed."""
         if topic in self._subscriptions:
             self._hinted.add(topic)
             self._hint.set()
 
     def topics(self) -> list[str]:
-        """Topics that we have asked the master for."""
+        """Topics with a subscription."""
         return list(self._subscriptions)
 
     async def watch(self, context: Context) -> None:
-        """Follows the master until it is cancelled."""
+        """Polls the master until cancelled."""
         loop = asyncio.get_running_loop()
         pause = _FIRST_PAUSE_S
         while True:
             began = loop.time()
             try:
-                await self._look(context)
+                await self._poll(context)
             except PeerError as error:
                 context.sink.say(
                     f"no ROS master at {one_line(self._uri)} ({error}); waiting for it. Start "
-                    "roscore, or say with --ros1 or ROS_MASTER_URI where it is"
+                    "roscore, or give its address with --ros1 or ROS_MASTER_URI"
                 )
                 pause = min(pause * 2, _MAX_PAUSE_S)
                 await asyncio.sleep(pause)
                 continue
             pause = _FIRST_PAUSE_S
-            # A system so large that looking at it takes long is not looked at all the time.
+            # A large system that takes long to poll is polled less often.
             rest = min(max(_AFTER_HINT_S, _REST * (loop.time() - began)), _MAX_REST_S)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._poll_s):
                     await self._hint.wait()
-                # Several publishers often come and go together.
+                # Publishers often appear and disappear together.
                 await asyncio.sleep(rest)
 
     async def farewell(self) -> None:
-        """Takes all registrations back, as far as two seconds suffice."""
+        """Takes back all registrations, within two seconds."""
         with contextlib.suppress(TimeoutError, PeerError):
             async with asyncio.timeout(_FAREWELL_S):
                 await self._all(self._master.unsubscribe, self._subscriptions)
 
-    async def _look(self, context: Context) -> None:
-        """Asks the master once, and does what follows from its answers."""
+    async def _poll(self, context: Context) -> None:
+        """Polls the master once, and updates the subscriptions."""
         self._hint.clear()
         hinted, self._hinted = self._hinted, set()
         try:
@@ -124,7 +124,7 @@ class Graph:
             raise
 
     async def _learn_types(self, state: State) -> None:
-        """Asks for types when a topic is new, or its type was not known last time."""
+        """Asks for types if a topic is new or its type was unknown."""
         before, self._listed = self._listed, state.publishers
         if any(
             topic not in before or self._types.get(topic, ANY) == ANY for topic in state.publishers
@@ -136,7 +136,7 @@ class Graph:
                 raise
 
     def _choose(self, context: Context, state: State) -> None:
-        """Begins a subscription for each topic that is wanted and has none."""
+        """Adds a subscription for each wanted topic without one."""
         asked, self._asked = self._asked, {}
         for topic in state.publishers:
             type_name = self._type_of(topic)
@@ -148,14 +148,12 @@ class Graph:
                 self._subscriptions[topic] = Subscription(context, topic)
 
     async def _refresh(self, context: Context, state: State, subscription: Subscription) -> None:
-        """Registers for a topic, and takes its publishers as they are now."""
+        """Registers for a topic, and updates its publishers."""
         topic = subscription.topic
         try:
             uris = await self._master.subscribe(topic)
         except RefusedError as error:
-            context.sink.say(
-                f"{one_line(topic)}: the ROS master does not let us subscribe: {error}"
-            )
+            context.sink.say(f"{one_line(topic)}: the ROS master refuses the subscription: {error}")
             return
         subscription.nodes = state.publishers.get(topic, frozenset())
         type_name, is_wanted = self._asked.get(topic, ("", True))
@@ -168,7 +166,7 @@ class Graph:
     async def _all(
         self, call: Callable[[_Item], Coroutine[None, None, None]], items: Iterable[_Item]
     ) -> None:
-        """Calls the master for each item, some at a time; raises the first error at the end."""
+        """Calls the master for all items, some in parallel; raises the first error at the end."""
 
         async def one(item: _Item) -> None:
             async with self._calls:

@@ -1,4 +1,4 @@
-"""How a subscriber gets from a publisher's name to a socket that messages come out of."""
+"""Connects to a publisher of a topic: XML-RPC request, TCP connection, header exchange."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hybridlog.live.sources.ros1.wire import (
 )
 from hybridlog.live.sources.text import one_line
 
-# A computer that was switched off is noticed after some 25 s of silence.
+# A peer that was switched off is noticed after some 25 s of silence.
 _KEEPALIVE: Final = (
     (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
     (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10),
@@ -46,13 +46,13 @@ async def subscribe(
         uri: The publisher's address for calls.
 
     Returns:
-        The socket, of which the next byte belongs to the first message, and the fields
-        of the publisher's header.
+        The socket, positioned at the first message, and the fields of the publisher's
+        header.
 
     Raises:
         UnreachedError: The publisher cannot be reached.
-        PeerError: It refuses, or does not speak as it should.
-        OSError: It hangs up.
+        PeerError: It refuses, or violates the protocol.
+        OSError: It closes the connection.
     """
     protocol = await call(network, uri, "requestTopic", caller, topic, [["TCPROS"]])
     place = _place_of(protocol)
@@ -72,7 +72,7 @@ async def subscribe(
 
 
 def _place_of(protocol: object) -> Endpoint:
-    """Where a publisher says that it sends a topic."""
+    """The endpoint in a publisher's answer to `requestTopic`."""
     if isinstance(protocol, list) and len(protocol) >= 3:
         name, host, port = protocol[:3]
         if (
@@ -94,7 +94,7 @@ async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -
             "topic": topic,
             "type": ANY,
             "md5sum": ANY,
-            # A small message that waits for the next one would get a wrong log time.
+            # A small message must not wait for the next one: its receive time would be wrong.
             "tcp_nodelay": "1",
         }
     )
@@ -112,12 +112,12 @@ async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -
 
 
 async def _exactly(connected: socket.socket, count: int) -> bytes:
-    """So many bytes; what follows stays in the socket."""
+    """Receives exactly `count` bytes."""
     loop = asyncio.get_running_loop()
     got = bytearray()
     while len(got) < count:
         data = await loop.sock_recv(connected, min(count - len(got), 64 << 10))
         if not data:
-            raise PeerError("it hangs up before its connection header is complete")
+            raise PeerError("it closed the connection within its header")
         got += data
     return bytes(got)

@@ -1,4 +1,4 @@
-"""The ROS master as a subscriber needs it: who publishes what, and who may be told."""
+"""Client of the ROS master: topics, types, registrations."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
 
 class State(NamedTuple):
-    """What the master knows at a moment.
+    """State of the ROS system at one time.
 
     Attributes:
-        publishers: Names of the nodes that publish each topic.
-        ours: Topics that we are registered for.
+        publishers: Names of each topic's publishers.
+        ours: Topics that this node is registered for.
     """
 
     publishers: dict[str, frozenset[str]]
@@ -29,8 +29,8 @@ class Master:
     Args:
         network: Makes connections.
         uri: The master's address.
-        caller: Our node's name.
-        api: Our address, where the master tells of new publishers.
+        caller: Name of this node.
+        api: Address of this node, where the master announces publishers.
     """
 
     def __init__(self, network: Network, uri: str, caller: str, api: str) -> None:
@@ -40,35 +40,35 @@ class Master:
         self._api = api
 
     async def state(self) -> State:
-        """All topics with their nodes."""
+        """All topics with their publishers."""
         answer = await self._call("getSystemState")
         if not isinstance(answer, list) or len(answer) != 3:
-            raise PeerError("its answer is none that a ROS master gives")
+            raise PeerError("its answer is not that of a ROS master")
         publishers = {topic: nodes for topic, nodes in _lists(answer[0]).items() if nodes}
         subscribers = _lists(answer[1])
         ours = frozenset(t for t, nodes in subscribers.items() if self._caller in nodes)
         return State(publishers, ours)
 
     async def types(self) -> dict[str, str]:
-        """Types of all topics; those that nobody has told are missing, or are `*`."""
+        """Types of all topics; unknown ones are missing or `*`."""
         answer = await self._call("getTopicTypes")
         pairs = answer if isinstance(answer, list) else [None]
         types: dict[str, str] = {}
         for pair in pairs:
             if not isinstance(pair, list) or [type(part) for part in pair] != [str, str]:
-                raise PeerError("its answer is none that a ROS master gives")
+                raise PeerError("its answer is not that of a ROS master")
             types[pair[0]] = pair[1]
         return types
 
     async def subscribe(self, topic: str) -> list[str]:
-        """Registers us for a topic, again if need be; gives its publishers' addresses."""
+        """Registers this node for a topic, and returns its publishers' addresses."""
         answer = await self._call("registerSubscriber", topic, "*", self._api)
         if not isinstance(answer, list):
-            raise PeerError("its answer is none that a ROS master gives")
+            raise PeerError("its answer is not that of a ROS master")
         return [uri for uri in answer if isinstance(uri, str)]
 
     async def unsubscribe(self, topic: str) -> None:
-        """Takes our registration back."""
+        """Takes back the registration for a topic."""
         await self._call("unregisterSubscriber", topic, self._api)
 
     async def _call(self, method: str, *arguments: object) -> object:
@@ -76,7 +76,7 @@ class Master:
 
 
 def _lists(value: object) -> dict[str, frozenset[str]]:
-    """Topics and their nodes, as they stand in the answer on the system's state."""
+    """Topics and their nodes in an answer to `getSystemState`."""
     lists: dict[str, frozenset[str]] = {}
     for pair in value if isinstance(value, list) else [None]:
         if (
@@ -85,6 +85,6 @@ def _lists(value: object) -> dict[str, frozenset[str]]:
             or not isinstance(pair[0], str)
             or not isinstance(pair[1], list)
         ):
-            raise PeerError("its answer is none that a ROS master gives")
+            raise PeerError("its answer is not that of a ROS master")
         lists[pair[0]] = frozenset(node for node in pair[1] if isinstance(node, str))
     return lists

@@ -1,4 +1,4 @@
-"""Where peers listen, and how to get there without ever blocking the event loop."""
+"""Addresses of peers, and connections that never block the event loop."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     Addresses = Sequence[tuple[int, tuple[object, ...]]]
 
 PATIENCE_S: Final = 5.0
-"""How long a peer may take for one step: to be found, to accept, to answer."""
+"""Time limit for a look-up, a connection or an answer."""
 
 _MAX_ADDRESSES = 8
 
 
 class PeerError(Exception):
-    """A peer that cannot be reached or does not speak as it should; says what is wrong."""
+    """A peer is unreachable or violates the protocol; the message names the problem."""
 
 
 class UnreachedError(PeerError):
-    """A peer that does not answer at all."""
+    """A peer does not answer."""
 
 
 class Endpoint(NamedTuple):
-    """Where a program listens.
+    """Host and port of a program.
 
     Attributes:
         host: Name or address, without brackets.
@@ -43,19 +43,19 @@ class Endpoint(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        """As it stands in a URI."""
+        """The endpoint as in a URI."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 def endpoint_of(uri: str, default_port: int | None = None) -> Endpoint:
     """Host and port of an `http` address.
 
-    Nodes on IPv6 may leave out the brackets (`http://::1:4711/`): the last colon counts.
+    Nodes on IPv6 may omit the brackets (`http://::1:4711/`): the last colon counts.
 
     Raises:
-        PeerError: It is no such address.
+        PeerError: The address is invalid.
     """
-    wrong = PeerError(f"{one_line(uri)!r} is no address of the form http://host:port")
+    wrong = PeerError(f"{one_line(uri)!r} is not an address like http://host:port")
     try:
         parts = urlsplit(uri)
     except ValueError as error:
@@ -76,7 +76,7 @@ def endpoint_of(uri: str, default_port: int | None = None) -> Endpoint:
 
 
 def reason_of(error: Exception) -> str:
-    """What went wrong with a peer, in a few words for people."""
+    """The reason of an error, in a few words for the user."""
     if isinstance(error, TimeoutError):
         return "no answer in time"
     if isinstance(error, OSError) and error.errno and not isinstance(error, socket.gaierror):
@@ -87,8 +87,8 @@ def reason_of(error: Exception) -> str:
 class Network:
     """Connects to peers. Belongs to one event loop.
 
-    Names are looked up in threads, one a name at a time, since nothing can interrupt a
-    look-up: one that takes too long is left to the resolver's own patience.
+    Names are looked up in threads, one at a time per name, since a look-up cannot be
+    interrupted. One that takes too long ends with the resolver's own timeout.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class Network:
         """A connected socket that does not block.
 
         Raises:
-            OSError: Nobody listens there, the name is not known, or nobody answers.
+            OSError: The connection is refused, the name is unknown, or the peer does not answer.
         """
         loop = asyncio.get_running_loop()
         failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
@@ -111,8 +111,8 @@ class Network:
                 async with asyncio.timeout(PATIENCE_S):
                     await loop.sock_connect(made, address)
                 if made.getsockname() == made.getpeername():
-                    # Its own port was the one asked for: it has been joined to itself.
-                    raise ConnectionRefusedError("nobody listens there")
+                    # The socket got the wanted port itself, and is connected to itself.
+                    raise ConnectionRefusedError("connection refused")
             except OSError as error:
                 made.close()
                 failure = error
@@ -127,7 +127,7 @@ class Network:
         """Address families and addresses (with port 0) of a host.
 
         Raises:
-            OSError: The name is not known, or nobody answers.
+            OSError: The name is unknown, or the resolver does not answer.
         """
         try:
             return _look_up(host, socket.AI_NUMERICHOST)
@@ -145,19 +145,19 @@ def _look_up(host: str, flags: int = 0) -> Addresses:
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM, flags=flags)
     except ValueError as error:
-        raise OSError(f"{one_line(host)} is no host name") from error
+        raise OSError(f"{one_line(host)} is not a host name") from error
     return [(int(family), address) for family, _, _, _, address in found]
 
 
 def _in_thread(host: str) -> asyncio.Future[Addresses]:
-    """Looks a name up in a thread of its own."""
+    """Looks up a name in its own thread."""
     loop = asyncio.get_running_loop()
     answer: asyncio.Future[Addresses] = loop.create_future()
 
     def settle(found: Addresses | OSError) -> None:
         if isinstance(found, OSError):
             answer.set_exception(found)
-            answer.exception()  # nobody may be waiting any more, and that is all right
+            answer.exception()  # retrieved, since its caller may be gone
         else:
             answer.set_result(found)
 
@@ -167,7 +167,7 @@ def _in_thread(host: str) -> asyncio.Future[Addresses]:
             found = _look_up(host)
         except OSError as error:
             found = error
-        # The loop may have ended meanwhile: then nobody waits for the answer.
+        # The loop may have ended meanwhile.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(settle, found)
 

@@ -1,4 +1,4 @@
-"""The thread that empties the sockets of all connections as soon as anything comes."""
+"""The thread that reads the sockets of all publishers."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ _LAST_READ_S: Final = 0.5
 class Reader:
     """Reads streams until it is stopped.
 
-    One thread serves all: the kernel copies large messages while other threads run, and
-    small ones are cut by Python, which runs one thread at a time anyway.
+    One thread is enough: the kernel copies large messages while other threads run, and
+    Python splits small ones in one thread at a time anyway.
 
     Args:
-        failed: Called in the thread before it ends with an error that is a mistake in
-            the program.
+        failed: Called in the thread with an unexpected error before it ends.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:
@@ -46,7 +45,7 @@ class Reader:
         self._thread.start()
 
     def add(self, stream: Stream) -> None:
-        """Reads one more stream, which is closed when it or the reader ends."""
+        """Adds a stream, which is closed when it or the reader ends."""
         with self._lock:
             stopped = self._stopping
             if not stopped:
@@ -57,14 +56,14 @@ class Reader:
             self._notify()
 
     def stop(self) -> None:
-        """Takes what has come by now, for half a second at most, and closes all streams."""
+        """Reads pending messages for up to half a second, and closes all streams."""
         with self._lock:
             self._stopping = True
         self._notify()
         self._thread.join()
 
     def _notify(self) -> None:
-        # A full pipe wakes as well; a closed one has nobody behind it any more.
+        # A full pipe wakes the thread as well; a closed one has no thread.
         with contextlib.suppress(OSError):
             self._wake.send(b"\0")
 
@@ -81,9 +80,9 @@ class Reader:
         finally:
             self._close()
 
-    def _read(self, patience: float | None) -> int:
-        """Reads once from each stream that has something; gives their number."""
-        ready = self._selector.select(patience)
+    def _read(self, timeout: float | None) -> int:
+        """Reads once from each stream with data; returns their number."""
+        ready = self._selector.select(timeout)
         for key, _ in ready:
             stream: Stream | None = key.data
             if stream is None:
@@ -94,7 +93,7 @@ class Reader:
         return len(ready)
 
     def _admit(self) -> None:
-        """Begins to read what has been added."""
+        """Registers added streams."""
         with contextlib.suppress(BlockingIOError):
             self._woken.recv(4096)
         while self._new:

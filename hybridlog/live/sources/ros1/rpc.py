@@ -1,8 +1,8 @@
-"""XML-RPC as ROS nodes speak it, in an event loop, bounded in time and memory.
+"""XML-RPC client and server for ROS, in an event loop, bounded in time and memory.
 
-The library's own client and server block, believe any length, and read without end; here
-a peer may be anybody. So HTTP is spoken by hand (version 1.0: one call a connection, no
-chunks), and only the XML goes through the library.
+The client and server of the standard library block, trust any length and read without
+limit, but peers are untrusted. So this module implements HTTP 1.0 (one call a connection,
+no chunks), and uses the library only for XML.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class RefusedError(PeerError):
-    """A peer that understood the call, and says no."""
+    """A peer refuses a valid call."""
 
 
 _MAX_ANSWER: Final = 32 << 20
@@ -47,12 +47,12 @@ _MAX_CLIENTS: Final = 64
 
 
 async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
-    """Calls a method of the master or of a node, and gives what stands behind its status.
+    """Calls a method of the master or of a node, and returns its value.
 
     Raises:
-        UnreachedError: No answer within 10 s.
-        PeerError: An answer that makes no sense.
-        RefusedError: The answer is no.
+        UnreachedError: The peer does not answer within 10 s.
+        PeerError: The answer is malformed.
+        RefusedError: The peer refuses.
     """
     endpoint = endpoint_of(uri)
     path = urlsplit(uri).path or "/RPC2"
@@ -72,7 +72,7 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
 
 
 async def _exchange(connected: socket.socket, request: bytes) -> bytes:
-    """Sends a request, and reads the body of the answer."""
+    """Sends a request, and returns the body of the answer."""
     loop = asyncio.get_running_loop()
     await loop.sock_sendall(connected, request)
     got = bytearray()
@@ -86,7 +86,7 @@ async def _exchange(connected: socket.socket, request: bytes) -> bytes:
         if body < 0:
             body = got.find(b"\r\n\r\n")
             if body < 0 and len(got) > _MAX_HTTP_HEADER:
-                raise PeerError("it answers with a header without end")
+                raise PeerError("it answers with an endless header")
             if body >= 0:
                 body += 4
                 length = _content_length(bytes(got[:body]))
@@ -106,13 +106,13 @@ async def _exchange(connected: socket.socket, request: bytes) -> bytes:
 
 
 def _content_length(head: bytes) -> int | None:
-    """The length of a body as its header says, None when it does not."""
+    """The content length in an HTTP header, None if it has none."""
     for line in head.split(b"\r\n")[1:]:
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length":
             value = value.strip()
             if not value.isdigit() or len(value) > 12:
-                raise PeerError("it gives a length that is none")
+                raise PeerError("it sends an invalid content length")
             return int(value)
         if name.strip().lower() == b"transfer-encoding":
             raise PeerError("it answers in chunks, which HTTP 1.0 does not have")
@@ -121,9 +121,9 @@ def _content_length(head: bytes) -> int | None:
 
 def _parsed(body: bytes) -> tuple[tuple[object, ...], str | None]:
     """Values and method name of an XML-RPC text."""
-    # No node sends one, and it is how small texts are made to grow.
+    # ROS nodes send none, and entities let small texts expand.
     if b"<!DOCTYPE" in body or b"<!ENTITY" in body:
-        raise PeerError("it sends XML with definitions of its own")
+        raise PeerError("it sends XML with a document type")
     try:
         return xmlrpc.client.loads(body)
     except xmlrpc.client.Fault as fault:
@@ -137,14 +137,14 @@ def _parsed(body: bytes) -> tuple[tuple[object, ...], str | None]:
         TypeError,
         ValueError,
     ) as error:
-        # The library raises all of these for XML that is no XML-RPC.
-        raise PeerError("it sends what is no XML-RPC") from error
+        # The library raises all of these for malformed XML-RPC.
+        raise PeerError("it sends malformed XML-RPC") from error
 
 
 def _value_of(answer: object) -> object:
-    """The value of a ROS answer, which is a list of status, text for people, and value."""
+    """The value in a ROS answer, a list of status, text and value."""
     if not isinstance(answer, list) or len(answer) != 3 or not isinstance(answer[0], int):
-        raise PeerError("its answer is none that a ROS node gives")
+        raise PeerError("its answer is not that of a ROS node")
     if answer[0] != 1:
         raise RefusedError(f"it refuses: {one_line(str(answer[1]))}")
     value: object = answer[2]
@@ -158,7 +158,7 @@ class RpcServer:
     """Answers calls on one socket, which it owns.
 
     Attributes:
-        endpoint: Where it listens.
+        endpoint: Its address.
     """
 
     def __init__(self, listening: socket.socket, methods: Mapping[str, Method]) -> None:
@@ -169,28 +169,28 @@ class RpcServer:
         self.endpoint = Endpoint(host, port)
 
     async def serve(self) -> None:
-        """Answers until it is cancelled; then closes everything."""
+        """Answers calls until cancelled; then closes all sockets."""
         loop = asyncio.get_running_loop()
         try:
             while True:
                 while len(self._clients) >= _MAX_CLIENTS:
                     await asyncio.wait(self._clients, return_when=asyncio.FIRST_COMPLETED)
-                await self._called()
+                await self._wait_for_call()
                 try:
-                    # The loop's own `sock_accept` loses a caller whom it has taken when it
-                    # is cancelled in that moment; here nothing waits in between.
+                    # The loop's `sock_accept` loses an accepted client if it is cancelled
+                    # at that moment. Here nothing waits after `accept`.
                     client, _ = self._socket.accept()
                 except BlockingIOError:
                     continue
                 except OSError:
-                    # It was gone before we looked, or there are no descriptors left.
+                    # The client is gone already, or no descriptors are left.
                     await asyncio.sleep(0.1)
                     continue
                 client.setblocking(False)
                 task = loop.create_task(self._answer(client))
                 self._clients.add(task)
                 task.add_done_callback(self._clients.discard)
-                # Also when it is cancelled before it begins.
+                # Closes it even if the task is cancelled before it begins.
                 task.add_done_callback(partial(_close, client))
         finally:
             self._socket.close()
@@ -198,8 +198,8 @@ class RpcServer:
                 task.cancel()
             await asyncio.gather(*self._clients, return_exceptions=True)
 
-    async def _called(self) -> None:
-        """Waits until somebody calls."""
+    async def _wait_for_call(self) -> None:
+        """Waits for a client."""
         loop = asyncio.get_running_loop()
         called = asyncio.Event()
         loop.add_reader(self._socket, called.set)
@@ -209,7 +209,7 @@ class RpcServer:
             loop.remove_reader(self._socket)
 
     async def _answer(self, client: socket.socket) -> None:
-        """Takes one call. Who does not speak as he should is hung up on."""
+        """Answers one call; malformed calls close the connection."""
         loop = asyncio.get_running_loop()
         with contextlib.suppress(OSError, PeerError):
             async with asyncio.timeout(PATIENCE_S):
@@ -231,7 +231,7 @@ class RpcServer:
             got += data
         length = _content_length(bytes(got[:end]))
         if not got.startswith(b"POST ") or length is None or length > _MAX_REQUEST:
-            raise PeerError("it does not call as it should")
+            raise PeerError("its call is malformed")
         while len(got) < end + 4 + length:
             data = await loop.sock_recv(client, 64 << 10)
             if not data:
@@ -242,7 +242,7 @@ class RpcServer:
     def _result(self, method: str | None, values: tuple[object, ...]) -> str:
         known = self._methods.get(method or "")
         if known is None:
-            fault = xmlrpc.client.Fault(1, f"there is no method {one_line(method or '')}")
+            fault = xmlrpc.client.Fault(1, f"unknown method {one_line(method or '')}")
             return xmlrpc.client.dumps(fault, methodresponse=True)
         return xmlrpc.client.dumps((known(values),), methodresponse=True)
 

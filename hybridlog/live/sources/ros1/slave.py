@@ -1,4 +1,4 @@
-"""What other programs may ask our node, and the address where they may do so."""
+"""The slave API of this node, and the socket where it listens."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _BACKLOG: Final = 64
 async def listen(
     network: Network, environment: Mapping[str, str], say: Callable[[str], None]
 ) -> tuple[socket.socket, str]:
-    """Opens the socket of our node, where `ROS_HOSTNAME` or `ROS_IP` says.
+    """Opens the node's socket on the address in `ROS_HOSTNAME` or `ROS_IP`.
 
-    Without them it listens on loopback: a master elsewhere then cannot tell us of new
-    publishers, and we hear of them when we ask next.
+    Without these variables it listens on loopback. A master on another computer then cannot
+    announce publishers, and polling finds them.
 
     Args:
-        network: Finds addresses of names.
-        environment: The variables of the process.
-        say: Takes what is wrong with them.
+        network: Looks up names.
+        environment: Environment variables.
+        say: Reports problems with them.
 
     Returns:
-        The socket, and the host that others are to be told.
+        The socket, and the host name for peers.
 
     Raises:
-        OSError: Not even loopback works.
+        OSError: Even loopback fails.
     """
     is_ipv6 = environment.get("ROS_IPV6") == "on"
     loopback = "::1" if is_ipv6 else "127.0.0.1"
@@ -47,14 +47,14 @@ async def listen(
         if host == loopback:
             raise
         say(
-            f"{variable}={one_line(host)} is no address of this computer ({reason_of(error)}); "
-            "the ROS master cannot tell of new publishers, they are found by asking it"
+            f"{variable}={one_line(host)} is not an address of this computer ({reason_of(error)}); "
+            "the ROS master cannot announce publishers, so polling must find them"
         )
     return _bound(await network.addresses_of(loopback), is_ipv6=is_ipv6), loopback
 
 
 def _bound(addresses: Addresses, *, is_ipv6: bool) -> socket.socket:
-    """A socket that listens on the first address, of the preferred kind if there is one."""
+    """A socket that listens on the first address, if possible of the preferred family."""
     preferred = socket.AF_INET6 if is_ipv6 else socket.AF_INET
     family, address = min(addresses, key=lambda entry: entry[0] != preferred)
     made = socket.socket(family, socket.SOCK_STREAM)
@@ -69,7 +69,7 @@ def _bound(addresses: Addresses, *, is_ipv6: bool) -> socket.socket:
 
 
 def uri_of(host: str, listening: socket.socket) -> str:
-    """Our node's address for calls."""
+    """The node's address for calls."""
     return f"http://{Endpoint(host, listening.getsockname()[1])}/"
 
 
@@ -83,9 +83,9 @@ def methods(
 
     Args:
         master_uri: The master's address.
-        topics: Gives the topics that we are registered for.
+        topics: Returns the topics that the node is registered for.
         changed: Called with a topic whose publishers may have changed.
-        say: Takes what people should know.
+        say: Reports a line to the user.
     """
 
     def publisher_update(arguments: tuple[object, ...]) -> list[object]:
@@ -95,9 +95,9 @@ def methods(
         return [-1, "publisherUpdate takes a caller, a topic and its publishers", 0]
 
     def shutdown(arguments: tuple[object, ...]) -> list[object]:
-        caller = one_line(str(arguments[0])) if arguments else "somebody"
-        say(f"{caller} asks this node to end; recordings are ended where they were begun")
-        return [-1, "a recorder is ended by who started it", 0]
+        caller = one_line(str(arguments[0])) if arguments else "a node"
+        say(f"{caller} asks this node to shut down; only its own user can stop a recording")
+        return [-1, "only its own user can stop a recorder", 0]
 
     def answer(value: Callable[[], object]) -> Method:
         return lambda _: [1, "", value()]

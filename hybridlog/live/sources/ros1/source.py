@@ -1,8 +1,7 @@
-"""Topics of a running ROS 1 system, without any ROS installation.
+"""The ROS 1 source: subscribes to the topics of a running ROS 1 system.
 
-Two threads: one runs an event loop for all talk that takes time (master, publishers'
-calls and handshakes, see `graph` and `subscription`), the other does nothing
-but empty the sockets that messages come from (`reader`).
+It has two threads. One runs an event loop for master, calls and handshakes (see `graph`
+and `subscription`). The other only reads messages from sockets (see `reader`).
 """
 
 from __future__ import annotations
@@ -35,23 +34,22 @@ _DEFAULT_PORT: Final = 11311
 
 
 class Ros1Source(LiveSource):
-    """Subscribes to what the publishers of a ROS 1 system send, whatever its type.
+    """Subscribes to topics of a ROS 1 system, whatever their type.
 
-    Each connection to a publisher is a channel with the fields of its header, as in a
-    bag. ROS 1 says nothing of when a message was sent, so there is no publish time.
-    Messages that a publisher dropped in its queue are seen by the gaps in `header.seq`,
-    where a type begins with a header (see `sequence_gaps`); of other types nobody can
-    know.
+    Each connection to a publisher is a channel with the fields of its header, as in a bag.
+    ROS 1 does not transmit send times, so channels have no publish time. Gaps in
+    `header.seq` show messages that a publisher dropped in its queue (see `sequence_gaps`).
+    Losses of types without a header cannot be detected.
 
-    The node is called `/hybridlog_PID_RANDOM`. It listens on loopback, or on what
-    `ROS_HOSTNAME` or `ROS_IP` names.
+    The node's name is `/hybridlog_PID_RANDOM`. It listens on loopback, or on the address in
+    `ROS_HOSTNAME` or `ROS_IP`.
 
     Args:
-        master_uri: The master's address; `ROS_MASTER_URI`, or the default port of this
-            computer, if None.
-        max_message_bytes: Longest message that is believed: who announces a longer one
-            is hung up on. Memory grows only as bytes come, whatever was announced.
-        poll_s: How often the master is asked what is new, seconds.
+        master_uri: The master's address; if None, `ROS_MASTER_URI` or the default port of
+            this computer.
+        max_message_bytes: Longest message. A connection that announces a longer one is
+            closed. Memory grows only as bytes come.
+        poll_s: Interval at which the master is polled, seconds.
     """
 
     kind = "ROS 1"
@@ -74,18 +72,18 @@ class Ros1Source(LiveSource):
         self._thread: threading.Thread | None = None
 
     def check(self) -> None:
-        """Refuses an address that is none.
+        """Checks the address.
 
         Raises:
-            UsageError: The master's address is none.
+            UsageError: The master's address is invalid.
         """
         self._endpoint()
 
     def start(self, sink: Sink) -> None:
-        """Begins to follow the master, which need not be there yet.
+        """Begins to poll the master, which need not be up yet.
 
         Raises:
-            UsageError: The master's address is none.
+            UsageError: The master's address is invalid.
         """
         endpoint = self._endpoint()
         self._thread = threading.Thread(
@@ -94,7 +92,7 @@ class Ros1Source(LiveSource):
         self._thread.start()
 
     def stop(self) -> None:
-        """Hands over what has come by now, and leaves the system as if we had not been."""
+        """Passes on the messages received so far, and takes back all registrations."""
         with self._lock:
             self._is_stopped = True
             if self._end is not None:
@@ -107,8 +105,7 @@ class Ros1Source(LiveSource):
             return endpoint_of(self.address, _DEFAULT_PORT)
         except PeerError as error:
             raise UsageError(
-                f"{error}: a ROS master's looks like {_DEFAULT_URI}; say it with --ros1 or "
-                "ROS_MASTER_URI"
+                f"{error}; give a ROS master like {_DEFAULT_URI} with --ros1 or ROS_MASTER_URI"
             ) from error
 
     def _reached(self) -> None:
@@ -123,7 +120,7 @@ class Ros1Source(LiveSource):
             raise
 
     async def _main(self, sink: Sink, uri: str) -> None:
-        """Lets `end` be called from anywhere, until the source has ended."""
+        """Makes `end` callable from any thread until the source has ended."""
         loop = asyncio.get_running_loop()
         over: asyncio.Future[None] = loop.create_future()
 
@@ -155,7 +152,7 @@ class Ros1Source(LiveSource):
         over: asyncio.Future[None],
         end: Callable[[BaseException | None], None],
     ) -> None:
-        """Runs everything until somebody ends it, or something fails that must not."""
+        """Runs all tasks until the source is stopped or one of them fails."""
         loop = asyncio.get_running_loop()
         tasks: set[asyncio.Task[None]] = set()
 

@@ -1,10 +1,9 @@
-"""One TCPROS connection after its handshake: cuts messages out of what the socket gives.
+"""One TCPROS connection after its handshake: splits the byte stream into messages.
 
-Small messages are cut out of blocks, many from one read. A large one is read by itself,
-behind its length, so that its bytes are copied once, from the kernel into the object
-that is handed over; the kernel is asked to wake us when all of it has come. When more
-waits than that, because other threads kept us from reading, large ones too are cut out
-of blocks: each read may cost a turn of the interpreter, which is dearer than a copy.
+Small messages are cut out of blocks, many per read. A large one is read separately after
+its length, so that its bytes are copied only once, from the kernel into its own object. The
+kernel wakes the reader when the message is complete. If more data waits, large messages are
+cut out of blocks too: a read may wait for the interpreter, which costs more than a copy.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ class Stream:
 
     Attributes:
         socket: Connected, not blocking; closed by `close`.
-        closed: Called once by `close`, with what went wrong, empty for an orderly end.
-        failure: What was wrong when `read` said that this is the end.
+        closed: Called once by `close` with the error, empty after a regular end.
+        failure: The error that ended `read`.
     """
 
     def __init__(
@@ -66,25 +65,24 @@ class Stream:
         self._longest = min(_PIECE, max_message_bytes + 4)
         self._gaps = SequenceGapDetector() if has_sequence_numbers(channel) else None
         self._publisher = f"publisher {one_line(channel.metadata.get('callerid', '') or 'unknown')}"
-        # Of the message that is not whole yet: its first bytes and how many are missing;
-        # without a length yet, what there is of the length.
+        # An incomplete message: its first bytes and the number of missing ones. Before its
+        # length is complete: the bytes of the length.
         self._parts: list[bytes] = []
         self._missing = 0
         self._prefix = b""
         self._large = 0
         self._wakes_at = 1
         self._since = self._last = time.time_ns()
-        # Linux makes room for what it is asked to collect: what comes while we are kept
-        # from reading then waits here, not in the publisher's short queue.
+        # Linux enlarges the buffer to what it shall collect: while this thread cannot read,
+        # messages wait here and not in the publisher's short queue.
         self._wake_at(_PIECE)
         self._wake_at(1)
 
     def read(self) -> bool:
-        """Reads once and hands over every message that is whole.
+        """Reads once, and passes on all complete messages.
 
         Returns:
-            Whether there may be more; if not, `failure` says why unless the publisher
-            just closed.
+            False at the end of the stream; `failure` then holds the error, if any.
         """
         want = min(self._missing, _PIECE)
         if want < _LARGE:
@@ -96,7 +94,7 @@ class Stream:
             return True
         except OSError as error:
             self.failure = f"the connection broke: {error.strerror or error}"
-            # What was under way is discarded by the kernel, and nobody knows how much.
+            # The kernel discards an unknown number of messages.
             self._sink.lost(
                 self._channel.topic,
                 Cause.CONNECTION,
@@ -130,7 +128,7 @@ class Stream:
         self.closed(self.failure)
 
     def _split(self, data: bytes, now: int) -> bool:
-        """Takes what a read gave; False when the stream makes no sense."""
+        """Splits the data of a read; False if the stream is malformed."""
         pos = 0
         if self._missing:
             pos = self._missing
@@ -151,7 +149,7 @@ class Stream:
         return pos == len(data) or self._begin(data, pos, now)
 
     def _finish(self, rest: bytes, now: int) -> None:
-        """Hands over the message that was not whole until now."""
+        """Passes on the message that was incomplete until now."""
         if self._parts:
             self._parts.append(rest)
             rest = b"".join(self._parts)
@@ -170,10 +168,10 @@ class Stream:
         self._sink.take(self._channel, rest, received=now, sequence=number)
 
     def _cut(self, data: bytes, pos: int, now: int) -> int:
-        """Hands over all whole messages from `pos` on.
+        """Passes on all complete messages from `pos` on.
 
         Returns:
-            Where the first one begins that is not whole.
+            Offset of the first incomplete message.
         """
         take, channel, length = self._sink.take, self._channel, u32
         last = len(data) - 4
@@ -187,7 +185,7 @@ class Stream:
         return pos
 
     def _cut_numbered(self, data: bytes, pos: int, now: int, gaps: SequenceGapDetector) -> int:
-        """Like `_cut`, for messages that begin with the publisher's count."""
+        """Like `_cut`, for messages with a sequence number."""
         take, channel, length = self._sink.take, self._channel, u32
         last = len(data) - 4
         while pos <= last:
@@ -210,16 +208,14 @@ class Stream:
         return pos
 
     def _begin(self, data: bytes, pos: int, now: int) -> bool:
-        """Keeps the beginning of a message; False when it cannot be one."""
+        """Stores the beginning of a message; False if it is too long."""
         self._since = now
         if len(data) - pos < 4:
             self._prefix = data[pos:]
             return True
         size = u32(data, pos)[0]
         if size > self._limit:
-            self.failure = (
-                f"it announced a message of {size} bytes; more than {self._limit} are not taken"
-            )
+            self.failure = f"it announced a message of {size} bytes; the limit is {self._limit}"
             self._sink.lost(
                 self._channel.topic,
                 Cause.UNREADABLE,
@@ -237,17 +233,17 @@ class Stream:
         return True
 
     def _next_large(self) -> int:
-        """How much to read behind a large message.
+        """Number of bytes to read after a large message.
 
-        Just the next length, as a rule: the next large message then begins an object of
-        its own. But if more than one waits already, all that waits.
+        Usually only the next length, so that the next large message gets its own object. If
+        more than one message waits already, all waiting bytes.
         """
         answer = fcntl.ioctl(self.socket, termios.FIONREAD, _NOTHING)
         waiting = int(struct.unpack("i", answer)[0])
         return 4 if waiting <= self._large + 8 else min(waiting, self._longest)
 
     def _report(self, gaps: Sequence[SequenceGap]) -> None:
-        """Notes messages that the publisher counted and that never came."""
+        """Reports messages that the publisher counted and that never came."""
         for gap in gaps:
             self._sink.lost(
                 self._channel.topic,
@@ -259,7 +255,7 @@ class Stream:
             )
 
     def _cut_off(self, now: int) -> None:
-        """The publisher has closed: in the middle of a message, that one is lost."""
+        """Handles the end of the stream; an incomplete message is lost."""
         have = sum(map(len, self._parts)) + len(self._prefix)
         if not have and not self._missing:
             return
@@ -275,13 +271,13 @@ class Stream:
         )
 
     def _wake_at(self, count: int) -> None:
-        """Asks the kernel to report the socket only when so many bytes are there.
+        """Makes the kernel report the socket only when so many bytes are available.
 
-        It also does so at the end of the stream, and when it has no room for as many.
+        It also reports the end of the stream, and a full buffer.
         """
         count = count if count >= _LARGE else 1
         if count != self._wakes_at:
             self._wakes_at = count
-            # Where a system does not know the option, it wakes us more often.
+            # A system without this option only wakes the reader more often.
             with contextlib.suppress(OSError):
                 self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, count)

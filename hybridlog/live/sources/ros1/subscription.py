@@ -1,4 +1,4 @@
-"""One topic and its publishers: each is kept connected for as long as there is hope."""
+"""One topic and the connections to its publishers, which reconnect after failures."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ _MAX_CHANNELS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What all subscriptions of a source share.
+    """Parts that all subscriptions of a source share.
 
     Attributes:
         network: Makes connections.
-        caller: Our node's name.
+        caller: Name of this node.
         sink: Takes the messages.
-        reader: Reads them.
-        max_message_bytes: Longest message that is believed.
+        reader: Reads the connections.
+        max_message_bytes: Longest message.
         spawn: Runs a coroutine until the source stops.
         look_again: Asks the master for the publishers of a topic soon.
-        errors: Tells of publishers from which nothing can be had.
+        errors: Reports publishers that cannot be subscribed to.
     """
 
     network: Network
@@ -55,11 +55,11 @@ class Context:
 
 
 class Subscription:
-    """A topic that is wanted.
+    """A wanted topic.
 
     Attributes:
         topic: Name as the master spells it.
-        nodes: Names of its publishers when they were last asked for, None before.
+        nodes: Names of its publishers at the last registration, None before.
     """
 
     def __init__(self, context: Context, topic: str) -> None:
@@ -70,18 +70,18 @@ class Subscription:
         self._type = ""
         self._types: dict[str, bool] = {}
         self._channels: dict[tuple[tuple[str, str], ...], Channel] = {}
-        self._told = (0, "")
+        self._reported = (0, "")
 
     def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
-        """Takes the publishers as the master lists them now.
+        """Updates the publishers.
 
-        A connection to one that is not listed any more goes on until it ends: a master
-        that was started anew knows of nobody.
+        A connection to a publisher that is no longer listed goes on until it ends: a
+        restarted master lists none at first.
 
         Args:
-            type_name: The topic's type, empty when the master does not know it.
+            type_name: The topic's type, empty if the master does not know it.
             uris: Addresses of its publishers.
-            is_wanted: Whether messages of that type are wanted.
+            is_wanted: Messages of that type are wanted.
         """
         if type_name:
             self._type = type_name
@@ -94,14 +94,14 @@ class Subscription:
         for uri in sorted(listed - set(self._links)):
             link = self._links[uri] = _Link(self, uri)
             self._context.spawn(self._keep(uri, link))
-        self.tell()
+        self.report()
 
-    def tell(self) -> None:
-        """Tells the sink how many publishers there are, if that has changed."""
+    def report(self) -> None:
+        """Reports the number of connected publishers to the sink if it has changed."""
         now = (sum(link.is_up for link in self._links.values()), self._type)
-        if now == self._told:
+        if now == self._reported:
             return
-        before, self._told = self._told, now
+        before, self._reported = self._reported, now
         if now[0]:
             self._context.sink.topic_came(self.topic, self._type, now[0])
         elif before[0]:
@@ -111,7 +111,7 @@ class Subscription:
         """The channel of a connection, the same one for the same header.
 
         Returns:
-            None when messages of the publisher's type are not wanted.
+            None if messages of the publisher's type are not wanted.
         """
         type_name = fields.get("type", "")
         if type_name and type_name != ANY and not self._takes(type_name, fields):
@@ -127,15 +127,15 @@ class Subscription:
         return channel
 
     def _takes(self, type_name: str, fields: Mapping[str, str]) -> bool:
-        """Whether messages of a type are wanted; says so when publishers disagree."""
+        """Tells whether messages of a type are wanted; reports publishers that disagree."""
         if not self._type:
             self._type = type_name
         elif type_name != self._type:
-            publisher = one_line(fields.get("callerid", "a node without a name"))
+            publisher = one_line(fields.get("callerid", "an unnamed node"))
             self._context.sink.say(
                 f"{one_line(self.topic)}: publishers do not agree on its type, "
                 f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
-                "each is recorded as it comes"
+                "both are recorded"
             )
         wanted = self._types.get(type_name)
         if wanted is None:
@@ -149,15 +149,15 @@ class Subscription:
         link.is_up, link.has_ended = False, True
         if not link.is_listed:
             del self._links[uri]
-        self.tell()
+        self.report()
 
 
 class _Link:
-    """One publisher of a topic.
+    """The connection to one publisher of a topic.
 
     Attributes:
-        is_listed: The master lists it.
-        is_up: It is connected.
+        is_listed: The master lists the publisher.
+        is_up: The connection is established.
         has_ended: `run` has returned.
     """
 
@@ -168,17 +168,17 @@ class _Link:
         self._subscription = subscription
         self._uri = uri
         self._failures = 0
-        self._has_told = False
+        self._has_reported = False
         self._hurry = asyncio.Event()
 
     def list(self, *, is_listed: bool) -> None:
-        """Takes what the master says now."""
+        """Updates `is_listed`; a new listing retries at once."""
         if is_listed and not self.is_listed:
             self._hurry.set()
         self.is_listed = is_listed
 
     async def run(self, context: Context) -> None:
-        """Connects again and again, until the publisher is neither listed nor there."""
+        """Connects and reconnects until the publisher is neither listed nor reachable."""
         topic = self._subscription.topic
         while True:
             try:
@@ -189,8 +189,7 @@ class _Link:
                 if not self.is_listed:
                     return
                 self._failures += 1
-                # One failure is nothing: nodes that end are listed a little longer than
-                # they live.
+                # A single failure is normal: a node that ends is listed a little longer.
                 if self._failures >= 2:
                     context.errors.add(self._uri, topic, error)
             else:
@@ -204,12 +203,12 @@ class _Link:
                     return
                 await self._serve(context, connected, channel)
             self._set_up(is_up=False)
-            # It may have come back under another address, which only the master knows.
+            # It may have returned under another address, which only the master knows.
             context.look_again(topic)
             await self._pause()
 
     async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
-        """Has a connection read until it ends."""
+        """Lets the reader read a connection until it ends."""
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[str] = loop.create_future()
 
@@ -226,14 +225,14 @@ class _Link:
         context.reader.add(stream)
         failure = await ended
         if loop.time() - began > _STABLE_S:
-            self._failures, self._has_told = 0, False
+            self._failures, self._has_reported = 0, False
             context.errors.resolve(self._uri, self._subscription.topic)
         else:
             self._failures += 1
-        # A publisher that breaks off again and again is told of once; the ledger has all.
-        if failure and not self._has_told:
-            self._has_told = True
-            name = channel.metadata.get("callerid", "a node without a name")
+        # Repeated failures of a publisher are reported once; the ledger has all.
+        if failure and not self._has_reported:
+            self._has_reported = True
+            name = channel.metadata.get("callerid", "an unnamed node")
             context.sink.say(
                 f"{one_line(self._subscription.topic)}: lost the connection to {one_line(name)} at "
                 f"{one_line(self._uri)}: {failure}; connecting again"
@@ -241,10 +240,10 @@ class _Link:
 
     def _set_up(self, *, is_up: bool) -> None:
         self.is_up = is_up
-        self._subscription.tell()
+        self._subscription.report()
 
     async def _pause(self) -> None:
-        """Waits, the longer the more often it failed, unless the master lists it anew."""
+        """Waits longer after each failure, unless the master lists the publisher again."""
         self._hurry.clear()
         pause = min(_FIRST_PAUSE_S * 2 ** min(self._failures, 10), _MAX_PAUSE_S)
         with contextlib.suppress(TimeoutError):

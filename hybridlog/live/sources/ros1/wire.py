@@ -1,8 +1,8 @@
-"""What TCPROS puts on the wire before the messages: a header of fields, both ways.
+"""Connection headers of TCPROS, and the channels that they describe.
 
-A header is its length, then fields, each with a length of its own: `key=value`. All
-lengths are 4 bytes, little-endian. After the headers have been exchanged the publisher
-sends messages, each behind its length, until one side closes.
+A header is its length, then fields `key=value`, each after its own length. All lengths are
+4 bytes, little-endian. After both headers the publisher sends messages, each after its
+length, until one side closes.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 MAX_HEADER: Final = 4 << 20
-"""Longest connection header that is believed, bytes; a definition of 100 kB is a long one."""
+"""Longest connection header, bytes; a definition of 100 kB is a long one."""
 
 ANY: Final = "*"
-"""What a subscriber asks for, and what a relay says that does not know its type yet."""
+"""Wildcard of subscribers, and of relays that do not know their type yet."""
 
 u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from
-"""Reads the number at a place of a buffer, in a tuple."""
+"""Reads the number at an offset of a buffer, as a tuple."""
 
 _MAX_FIELDS = 1000
 
 
 class WireError(Exception):
-    """A peer that does not speak as it should. The message names what it did."""
+    """A malformed connection header; the message names the fault."""
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """A connection header, its length included."""
+    """A connection header with its length."""
     lines = [f"{key}={value}".encode() for key, value in fields.items()]
     body = b"".join(len(line).to_bytes(4, "little") + line for line in lines)
     return len(body).to_bytes(4, "little") + body
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """The fields of a connection header, without the length in front of it.
+    """The fields of a connection header, which comes without its length.
 
     Raises:
-        WireError: Lengths that do not fit, or a field without `=`.
+        WireError: Lengths are inconsistent, or a field has no `=`.
     """
     fields: dict[str, str] = {}
     pos = 0
     while pos < len(body):
         if pos + 4 > len(body):
-            raise WireError(f"its header has {len(body) - pos} bytes too many")
+            raise WireError(f"its header has {len(body) - pos} surplus bytes")
         end = pos + 4 + u32(body, pos)[0]
         if end > len(body):
-            raise WireError(f"a field of its header is {end - len(body)} bytes longer than it")
+            raise WireError(f"a field of its header exceeds it by {end - len(body)} bytes")
         key, equals, value = body[pos + 4 : end].partition(b"=")
         if not equals:
             raise WireError(f"a field of its header has no '=': {one_line(key)}")
@@ -64,7 +64,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 def channel_of(topic: str, fields: Mapping[str, str]) -> Channel:
-    """The channel that a publisher's header stands for, as a bag would have it.
+    """The channel that a publisher's header describes, as in a bag.
 
     Args:
         topic: Name as the master spells it.
