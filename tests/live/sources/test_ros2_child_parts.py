@@ -27,8 +27,8 @@ from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live.sources.ros2.child.publication_gaps import (
     MAX_GAPS,
+    RECOVERED_AFTER,
     SUSPICIOUS_NS,
-    WELL,
     Loss,
     PublicationGapDetector,
 )
@@ -153,7 +153,7 @@ def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
 
 def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
     numbers = PublicationGapDetector()
-    seen(numbers, 1, 5, *range(6, 6 + WELL))
+    seen(numbers, 1, 5, *range(6, 6 + RECOVERED_AFTER))
     assert numbers.suspect(A, 10_000) is None
     numbers.see(B, 1, 0)
     numbers.see(B, 3, 1)
@@ -379,12 +379,12 @@ def test_events_of_services_and_feedback_of_actions(tmp_path: Path) -> None:
         ("c/msg/Top", "package c is not installed"),
         ("a/msg/Nothing", "has no msg/Nothing"),
         ("a/msg/Needy", "package c is not installed"),
-        ("a/msg/Wrong", "which is no type"),
-        ("a/msg/../../x", "no name of a type"),
-        ("../msg/X", "no name of a type"),
-        ("a/msg/\x1b[31m", "no name of a type"),
-        ("std_msgs/String", "no name of a type"),
-        ("", "no name of a type"),
+        ("a/msg/Wrong", "which is not a type"),
+        ("a/msg/../../x", "not a type name"),
+        ("../msg/X", "not a type name"),
+        ("a/msg/\x1b[31m", "not a type name"),
+        ("std_msgs/String", "not a type name"),
+        ("", "not a type name"),
     ],
 )
 def test_types_that_cannot_be_said(tmp_path: Path, name: str, reason: str) -> None:
@@ -521,7 +521,7 @@ class FakeRos:
     def __init__(self) -> None:
         self.graph: dict[tuple[str, str], list[Offer]] = {}
         self.made: list[FakeSubscription] = []
-        self.odd: dict[str, str] = {}
+        self.invalid: dict[str, str] = {}
 
     def publishers(self) -> dict[tuple[str, str], list[Offer]]:
         return self.graph
@@ -561,7 +561,7 @@ class Rig:
                 pass
 
         self.box: Any = Box()
-        self.events = EventSender(self.box)
+        self.sender = EventSender(self.box)
         found = packages(
             folder,
             {
@@ -571,8 +571,8 @@ class Rig:
                 "a/msg/Bad.msg": "",
             },
         )
-        self.topics = Topics(self.ros, self.events, found, overrides or {})
-        self.child = Child(self.ros, self.topics, self.box, self.events)
+        self.topics = Topics(self.ros, self.sender, found, overrides or {})
+        self.child = Child(self.ros, self.topics, self.box, self.sender)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.events if event["event"] == kind]
@@ -692,7 +692,7 @@ def test_what_overrides_exclude_is_said(tmp_path: Path) -> None:
     rig.topics.look()
     rig.topics.look()
     [said] = rig.told("say")
-    assert "/t: /poor cannot be heard, its reliability" in said["text"]
+    assert "/t: /poor is incompatible: its reliability" in said["text"]
 
 
 @pytest.mark.parametrize(
@@ -757,7 +757,10 @@ def test_the_last_messages_of_who_goes_in_an_overload_are_feared_for(tmp_path: P
     rig.topics.look()
     rig.topics.account(final=True)
     rows = [(lost["count"], lost["detail"]) for lost in rig.told("lost")]
-    assert rows == [(None, "from /one, after its last message, after others"), (3, "from /one")]
+    assert rows == [
+        (None, "from /one, after its last message, probably"),
+        (3, "from /one"),
+    ]
 
 
 @pytest.mark.parametrize("gid", [A, None])
@@ -807,8 +810,8 @@ def test_what_the_middleware_lost_before_and_after_is_told(tmp_path: Path) -> No
     assert [(lost["count"], lost["detail"].partition(", ")[2]) for lost in rig.told("lost")] == [
         (2, "before the first message that came"),
         (2, ""),
-        (None, "after its last message, after others"),
-        (5, "before the first message that came or after the last, as the middleware says"),
+        (None, "after its last message, probably"),
+        (5, "before the first message that came or after the last, as the middleware counts"),
     ]
     assert all(lost["detail"].startswith("from /one") for lost in rig.told("lost"))
 
@@ -852,7 +855,7 @@ def test_without_names_nobody_is_accused_when_publishers_change(tmp_path: Path) 
     rig.topics.account(final=True)
     assert not rig.told("lost")
     [said] = rig.told("say")
-    assert "does not tell the messages of its publishers apart" in said["text"]
+    assert "does not name the publishers of messages" in said["text"]
     assert len(rig.messages) == 8
 
 
@@ -862,7 +865,7 @@ def test_without_names_the_middleware_is_believed_of_several(tmp_path: Path) -> 
     rig.ros.made[0].told = 3
     rig.topics.account(final=True)
     [lost] = rig.told("lost")
-    assert (lost["count"], lost["detail"]) == (3, "the middleware says so")
+    assert (lost["count"], lost["detail"]) == (3, "as the middleware counts")
 
 
 def test_without_numbers_the_middleware_is_believed(tmp_path: Path) -> None:
@@ -877,16 +880,16 @@ def test_without_numbers_the_middleware_is_believed(tmp_path: Path) -> None:
     assert not rig.told("say")
     rig.ros.made[0].tells_losses = False
     rig.topics.look()
-    assert "no numbers" in rig.told("say")[0]["text"]
+    assert "does not number messages" in rig.told("say")[0]["text"]
 
 
 def test_names_that_ros_does_not_take_are_said_once(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
-    rig.ros.odd = {"/my-topic\x1b": "must not contain"}
+    rig.ros.invalid = {"/my-topic\x1b": "must not contain"}
     rig.topics.look()
     rig.topics.look()
     [said] = rig.told("say")
-    assert said["text"].startswith("'/my-topic\\x1b' is left out")
+    assert said["text"].startswith("'/my-topic\\x1b' is ignored")
 
 
 def test_times_that_make_no_sense_are_not_believed(tmp_path: Path) -> None:

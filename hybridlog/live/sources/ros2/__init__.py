@@ -1,1 +1,1 @@
-"""ROS 2: starts a child process under the Python that has rclpy, and reads from it."""
+"""ROS 2: reads from a child process that runs under the Python that has rclpy."""

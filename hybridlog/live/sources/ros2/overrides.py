@@ -1,4 +1,4 @@
-"""Quality of service that the user wants otherwise: a YAML file as rosbag2 takes it.
+"""QoS overrides of the user: a YAML file in the format of rosbag2.
 
 /tf_static:
   history: keep_last
@@ -30,13 +30,13 @@ _POLICIES = {
 
 
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
-    """Fields of `Profile` by topic.
+    """Reads the overrides: fields of `Profile` by topic.
 
     Args:
         path: The YAML file.
 
     Raises:
-        UsageError: No such file, no YAML, or a policy that does not exist.
+        UsageError: The file is unreadable or not YAML, or a policy is unknown.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -47,17 +47,17 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     except OSError as error:
         raise UsageError(f"{path}: cannot be opened: {error.strerror}") from error
     if len(data) > MAX_BYTES:
-        raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are no QoS overrides")
+        raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are too large for QoS overrides")
     try:
-        # Hostile YAML may nest deeply; the safe loader makes nothing but plain values.
+        # Hostile YAML may nest deeply; the safe loader only makes plain values.
         root: object = YAML(typ="safe", pure=True).load(data)
     except (YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise UsageError(f"{path}: no YAML that can be read: {reason}") from error
+        raise UsageError(f"{path}: invalid YAML: {reason}") from error
     if root is None:
         return {}
     if not isinstance(root, dict):
-        raise UsageError(f"{path}: topics with their policies below them are expected")
+        raise UsageError(f"{path}: topics with policies below them are expected")
     found = {}
     for topic, policies in root.items():
         if not isinstance(topic, str) or not isinstance(policies, dict):
@@ -73,7 +73,7 @@ def _policy(name: object, value: object, where: str) -> int:
     """The number of a policy.
 
     Raises:
-        UsageError: There is no such policy, or it has no such value.
+        UsageError: The policy or its value is unknown.
     """
     if name in DURATIONS:
         return _duration(value, f"{where}: {name}")
@@ -88,7 +88,7 @@ def _policy(name: object, value: object, where: str) -> int:
     words = _POLICIES.get(name) if isinstance(name, str) else None
     if words is None:
         known = ", ".join(Profile._fields)
-        raise UsageError(f"{where}: there is no policy {name!r}; there are {known}")
+        raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
     number = words.get(value.lower()) if isinstance(value, str) else None
     if number is None:
         raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {value!r}")
@@ -99,7 +99,7 @@ def _duration(value: object, where: str) -> int:
     """A duration in ns.
 
     Raises:
-        UsageError: It is none.
+        UsageError: The value is not a duration.
     """
     if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
         sec, nsec = value["sec"], value["nsec"]

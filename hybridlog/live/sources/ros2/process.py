@@ -1,7 +1,7 @@
-"""The child process: which Python it runs under, how it is started and ended.
+"""The child process: choice of its Python, start and end.
 
-rclpy belongs to the Python of a ROS environment, which may be another version than ours,
-and the wheels of rclpy start Python anew each time. So it lives in a process of its own.
+rclpy belongs to the Python of a ROS environment, which may have another version. The wheels
+of rclpy also restart Python when they load. So rclpy runs in its own process.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ PYTHON_VARIABLE = "HYBRIDLOG_ROS2_PYTHON"
 START = Path(__file__).with_name("child") / "__main__.py"
 
 HELLO_S = 30.0
-"""How long a child may take to load rclpy and to greet."""
+"""Time limit for a child to load rclpy and send its greeting."""
 
 SOCKET_BYTES = 4 << 20
-"""What the socket is asked to hold; the kernel may give less."""
+"""Requested size of the socket buffer; the kernel may give less."""
 
-_GLANCE_S = 0.2
-_WORDS = 30
-_WORD = 300
+_POLL_S = 0.2
+_MAX_LINES = 30
+_MAX_LINE = 300
 _MAX_HELLO = 1 << 16
 
-_CURE = (
+_REMEDY = (
     "on a robot, source the set-up file of ROS first (source /opt/ros/DISTRO/setup.bash); "
     "elsewhere install the wheels into a virtual environment of their own (python3 -m venv ros2; "
     "ros2/bin/pip install ros-rclpy ros-rmw-fastrtps-cpp ros-std-msgs ros-sensor-msgs "
@@ -58,29 +58,29 @@ _CURE = (
 
 
 class ChildError(Exception):
-    """A child that did not come up; the message is one line that says why."""
+    """The child did not start; the message is one line with the reason."""
 
 
 class ChildMissingError(ChildError):
-    """A Python that is none, or that has no rclpy."""
+    """The Python does not exist, or has no rclpy."""
 
 
 class Process:
-    """A child that has greeted.
+    """A running child, which has sent its greeting.
 
     Args:
         python: The interpreter.
-        settings: What it needs to know first.
-        environment: Its environment.
-        cancelled: Set when nobody wants it any more, even before it has greeted.
+        settings: First line of input for the child.
+        environment: Environment variables.
+        cancelled: Set to give up waiting for the greeting.
 
     Attributes:
-        hello: What it said of itself.
-        peer: The socket to it.
+        hello: The greeting.
+        peer: The socket to the child.
 
     Raises:
-        ChildMissingError: No such Python, or no rclpy in it.
-        ChildError: It failed otherwise.
+        ChildMissingError: The Python does not exist, or has no rclpy.
+        ChildError: The child failed otherwise.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Process:
     ) -> None:
         self.peer, theirs = socket.socketpair()
         self._cancelled = cancelled
-        self._words: deque[str] = deque(maxlen=_WORDS)
+        self._lines: deque[str] = deque(maxlen=_MAX_LINES)
         for end, option in ((self.peer, socket.SO_RCVBUF), (theirs, socket.SO_SNDBUF)):
             end.setsockopt(socket.SOL_SOCKET, option, SOCKET_BYTES)
         try:
@@ -104,7 +104,7 @@ class Process:
                     stderr=subprocess.STDOUT,
                     pass_fds=[theirs.fileno()],
                     env=dict(environment),
-                    # Ctrl-C is for the recorder, which ends its child in good order.
+                    # Ctrl-C must only reach the recorder, which ends its child.
                     start_new_session=True,
                 )
         except OSError as error:
@@ -121,14 +121,14 @@ class Process:
             raise
 
     def _listen(self, output: IO[bytes]) -> None:
-        """Keeps the last lines that it prints; they may say why it died."""
+        """Stores the last lines of output, which may explain a failure."""
         with output:
             while line := output.readline(1 << 12):
-                self._words.append(line.decode(errors="replace").strip()[:_WORD])
+                self._lines.append(line.decode(errors="replace").strip()[:_MAX_LINE])
 
     def _greet(self, python: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         deadline = time.monotonic() + HELLO_S
-        self.peer.settimeout(_GLANCE_S)
+        self.peer.settimeout(_POLL_S)
         try:
             self.peer.sendall(dumps(settings).encode("ascii") + b"\n")
             kind, length = HEADER.unpack(self._receive(HEADER.size, deadline))
@@ -139,7 +139,7 @@ class Process:
         except TimeoutError as error:
             raise ChildError(f"{python} did not load rclpy within {HELLO_S:.0f} s") from error
         except OSError as error:
-            raise ChildMissingError(f"{python} ended: {self.last_words()}") from error
+            raise ChildMissingError(f"{python} ended: {self.exit_report()}") from error
         except WireError as error:
             raise ChildError(f"{python}: {error}") from error
         self.peer.settimeout(None)
@@ -149,10 +149,10 @@ class Process:
         raise ChildMissingError(why) if hello.get("missing") else ChildError(why)
 
     def _receive(self, size: int, deadline: float) -> bytes:
-        """So many bytes, until a time of the monotonic clock.
+        """Receives exactly `size` bytes, with a deadline of the monotonic clock.
 
         Raises:
-            OSError: There will be no more, or they take too long.
+            OSError: The child has ended, or the deadline has passed.
         """
         parts = b""
         while len(parts) < size:
@@ -167,8 +167,8 @@ class Process:
             parts += part
         return parts
 
-    def last_words(self) -> str:
-        """What it printed last, and how it ended if it has; one line."""
+    def exit_report(self) -> str:
+        """Exit code or signal of the child, and its last line of output."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         self._listener.join(1.0)
@@ -181,27 +181,27 @@ class Process:
             how = f"killed by {code}"
         else:
             how = f"exit code {code}"
-        words = [line for line in self._words if line]
-        return one_line(f"{how}: {words[-1]}" if words else how)
+        lines = [line for line in self._lines if line]
+        return one_line(f"{how}: {lines[-1]}" if lines else how)
 
-    def no_more_orders(self) -> None:
-        """Asks it to hand over what it has, and to end."""
+    def end_input(self) -> None:
+        """Asks the child to pass on its messages and end."""
         with suppress(OSError):
             self.peer.shutdown(socket.SHUT_WR)
 
     def terminate(self) -> None:
-        """Asks it less gently."""
+        """Terminates the child."""
         self._process.terminate()
 
     def kill(self) -> None:
-        """Ends it, and whoever reads from it."""
+        """Kills the child, and ends reads from it."""
         self._process.kill()
         with suppress(OSError):
             self.peer.shutdown(socket.SHUT_RDWR)
 
     def end(self) -> None:
-        """Makes sure that nothing is left of it. Takes two seconds at most."""
-        self.no_more_orders()
+        """Ends the child within two seconds."""
+        self.end_input()
         for harder, seconds in ((self._process.terminate, 1.0), (self._process.kill, None)):
             if self._process.poll() is not None:
                 break
@@ -219,17 +219,17 @@ def launch(
     """Starts a child under the first Python that has rclpy.
 
     Args:
-        python: The only one to try; None for those that `candidates` names.
-        settings: What the child needs to know first.
+        python: The only interpreter to try; None for those of `candidates`.
+        settings: First line of input for the child.
         domain_id: ROS domain, None for that of the environment.
-        cancelled: Set when nobody wants it any more.
+        cancelled: Set to give up.
 
     Returns:
-        The child, and its Python.
+        The child and its interpreter.
 
     Raises:
-        MissingDependencyError: None has.
-        ChildError: rclpy is there, and does not come up.
+        MissingDependencyError: No interpreter has rclpy.
+        ChildError: rclpy does not start.
     """
     tried = []
     for name in [python] if python else candidates(os.environ):
@@ -239,18 +239,18 @@ def launch(
         except ChildMissingError as error:
             tried.append(str(error))
     raise MissingDependencyError(
-        f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_CURE}"
+        f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_REMEDY}"
     )
 
 
 def candidates(environment: Mapping[str, str]) -> Sequence[str]:
-    """Interpreters that may have rclpy, the likeliest first; at least one."""
+    """Interpreters that may have rclpy, at least one, the most likely first."""
     named = environment.get(PYTHON_VARIABLE)
     if named:
         return [named]
     found = []
     if environment.get("ROS_DISTRO") or environment.get("AMENT_PREFIX_PATH"):
-        # Ours may be the first on the PATH; a robot's ROS is built for the system's.
+        # The first on the PATH may be our own; ROS is built for the system's Python.
         on_path = shutil.which("python3", path=environment.get("PATH"))
         found = [path for path in (on_path, "/usr/bin/python3") if path and Path(path).exists()]
     return list(dict.fromkeys([*found, sys.executable]))
@@ -260,7 +260,7 @@ def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
     """The environment of a child."""
     found = dict(os.environ)
     if python != sys.executable:
-        # The wheels look for their libraries once; ours may not be those of the child.
+        # The wheels set this once they have found their libraries, and the child has others.
         found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     if domain_id is not None:
         found["ROS_DOMAIN_ID"] = str(domain_id)

@@ -1,4 +1,4 @@
-"""The recorder's end of the socket: frames of the child become calls of the sink."""
+"""The recorder's end of the socket: turns frames of the child into calls of the sink."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.live.sources.base import Sink
 
-# Reads of whole multiples of this go past the buffer.
+# Reads of whole multiples of this size bypass the buffer.
 _BUFFER = 32 << 10
 _CAUSES = {
     "transport": Cause.TRANSPORT,
@@ -40,16 +40,16 @@ class Receiver:
     """Reads from one child until it ends.
 
     Args:
-        peer: The socket to it.
-        sink: Who gets what it says.
-        outages: Topics that have not been heard since a child died, and when that was,
-            ns since the epoch. What is heard again is taken out.
+        peer: The socket to the child.
+        sink: Takes messages and events.
+        outages: Topics that an earlier child recorded, with the time of its end, ns since
+            the epoch. Topics that are recorded again are removed.
 
     Attributes:
-        heard: Topics that it has subscribed to.
-        present: Topics that the sink knows to have publishers.
-        last_heard: When it last said anything, ns since the epoch.
-        said_bye: It ended in good order.
+        subscribed: Topics that the child has subscribed to.
+        present: Topics with publishers, as reported to the sink.
+        last_received: Time of the last frame, ns since the epoch.
+        said_bye: The child has ended regularly.
     """
 
     def __init__(self, peer: socket.socket, sink: Sink, outages: dict[str, int]) -> None:
@@ -57,20 +57,20 @@ class Receiver:
         self._sink = sink
         self._outages = outages
         self._channels: dict[int, Channel] = {}
-        self.heard: set[str] = set()
+        self.subscribed: set[str] = set()
         self.present: set[str] = set()
-        self.last_heard = time.time_ns()
+        self.last_received = time.time_ns()
         self.said_bye = False
 
     def run(self) -> None:
         """Reads to the end.
 
         Raises:
-            WireError: The child says what it must not, or ends in the middle of a frame.
+            WireError: The child violates the protocol, or ends in the middle of a frame.
             OSError: The socket is broken.
         """
-        # A read for as many bytes as a large payload has goes into the bytes that are
-        # handed over, without a copy in between.
+        # A large payload is read directly into the bytes object for the sink, without a
+        # copy.
         raw = io.FileIO(self._peer.fileno(), closefd=False)
         with io.BufferedReader(raw, _BUFFER) as file:
             while header := file.read(HEADER.size):
@@ -84,7 +84,7 @@ class Receiver:
                     self._messages(_read(file, length))
                 else:
                     self._message(file, length)
-                self.last_heard = time.time_ns()
+                self.last_received = time.time_ns()
 
     def _message(self, file: io.BufferedIOBase, length: int) -> None:
         number, size, received, sent, sequence = ENTRY.unpack(_read(file, ENTRY.size))
@@ -92,7 +92,7 @@ class Receiver:
             raise WireError("a payload that is not as long as its frame")
         channel = self._channels.get(number)
         if channel is None:
-            raise WireError("a message of a channel that does not exist")
+            raise WireError("a message of an unknown channel")
         self._sink.take(
             channel,
             _read(file, size),
@@ -113,7 +113,7 @@ class Receiver:
         ):
             end = at + size
             if end > len(body) or number not in channels:
-                raise WireError("a message longer than its frame, or of no channel")
+                raise WireError("a message longer than its frame, or of an unknown channel")
             take(
                 channels[number],
                 body[at:end],
@@ -146,19 +146,19 @@ class Receiver:
         elif kind == "bye":
             self.said_bye = True
         else:
-            raise WireError("an event that does not exist")
+            raise WireError("an unknown event")
 
     def _candidate(self, topic: str, kind: str) -> None:
         if self._sink.wants(topic, kind):
-            order = dumps({"subscribe": topic, "type": kind})
-            self._peer.sendall(order.encode("ascii") + b"\n")
+            command = dumps({"subscribe": topic, "type": kind})
+            self._peer.sendall(command.encode("ascii") + b"\n")
 
     def _channel(self, event: dict[str, Any]) -> None:
         topic = _text(event, "topic")
         try:
             definition = _text(event, "definition").encode("utf-8", "surrogateescape")
         except UnicodeEncodeError as error:
-            raise WireError("a definition that is no text") from error
+            raise WireError("a definition that is not text") from error
         metadata = {"offered_qos_profiles": _text(event, "offered")}
         type_hash = _text(event, "hash")
         if type_hash:
@@ -172,7 +172,7 @@ class Receiver:
             has_publish_time=True,
         )
         self._sink.expect(self._channels[number])
-        self.heard.add(topic)
+        self.subscribed.add(topic)
         since = self._outages.pop(topic, None)
         if since is not None:
             report_outage(self._sink, topic, since)
@@ -193,12 +193,12 @@ class Receiver:
 
 
 def report_outage(sink: Sink, topic: str, since: int) -> None:
-    """Tells that a topic was not heard from some time until now.
+    """Reports that a topic was not recorded from some time until now.
 
     Args:
-        sink: Whom to tell.
-        topic: Which.
-        since: ns since the epoch.
+        sink: Takes the report.
+        topic: The topic.
+        since: Begin of the outage, ns since the epoch.
     """
     sink.lost(
         topic,

@@ -1,7 +1,6 @@
-"""ROS 2 as a live source: a child in the ROS environment, watched over.
+"""The ROS 2 source: starts and supervises a child in the ROS environment.
 
-A child that dies is started again, with growing pauses; what nobody heard meanwhile is
-told topic by topic.
+A child that dies is restarted with growing pauses. The outage is reported for each topic.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ MAX_DOMAIN = 232
 
 _PAUSE_S = 0.5
 _MAX_PAUSE_S = 30.0
-_WELL_S = 30.0
+_STABLE_S = 30.0
 _HAND_OVER_S = 3.0
 _TERM_S = 1.0
 
 
 class Ros2Source(LiveSource):
-    """The topics of a ROS 2 domain.
+    """Records the topics of a ROS 2 domain.
 
     Args:
-        python: The interpreter that has rclpy. None for the one that the environment
-            variable `HYBRIDLOG_ROS2_PYTHON` names; else `python3` when a ROS environment
-            is sourced; else our own.
-        qos_overrides: YAML file with quality of service by topic, as rosbag2 takes it.
+        python: An interpreter with rclpy. None for the one in the environment variable
+            `HYBRIDLOG_ROS2_PYTHON`; else `python3` if a ROS environment is sourced; else
+            the current one.
+        qos_overrides: YAML file with QoS profiles by topic, in the format of rosbag2.
         domain_id: ROS domain, None for that of the environment.
     """
 
@@ -65,12 +64,12 @@ class Ros2Source(LiveSource):
         self._outages: dict[str, int] = {}
 
     def check(self) -> None:
-        """Start the child, which says nothing of any message before `start`.
+        """Start the child; messages are read after `start`.
 
         Raises:
-            UsageError: A domain that is none, overrides that cannot be read.
-            SourceError: ROS that does not come up.
-            MissingDependencyError: No Python that has rclpy.
+            UsageError: The domain is invalid, or the overrides are unreadable.
+            SourceError: ROS does not start.
+            MissingDependencyError: No interpreter has rclpy.
         """
         if self._child is None:
             self._child, self._settings = self._launched()
@@ -90,23 +89,23 @@ class Ros2Source(LiveSource):
         self._thread.start()
 
     def _launched(self) -> tuple[Process, dict[str, object]]:
-        """A child, and what it was told."""
+        """A new child and its settings."""
         domain = self.address.partition(" ")[2]
         if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
-            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, and no {domain[:40]!r}")
+            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
         overrides = {} if self._overrides is None else read_overrides(self._overrides)
         settings: dict[str, object] = {"overrides": overrides}
         try:
             child, self._python = launch(self._python, settings, self._domain_id, self._stopping)
         except ChildError as error:
             raise SourceError(
-                f"ROS 2 does not come up: {one_line(str(error))}; does `ros2 topic list` work?"
+                f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
             ) from error
         self.address = f"domain {domain}, {one_line(str(child.hello.get('middleware')))}"
         return child, settings
 
     def stop(self) -> None:
-        """Stop listening; what the child has received is handed over first."""
+        """Stop listening, after the child has passed on its messages."""
         with self._lock:
             self._stopping.set()
             child, self._child = self._child, None
@@ -117,7 +116,7 @@ class Ros2Source(LiveSource):
         if child is None:
             self._thread.join()
             return
-        child.no_more_orders()
+        child.end_input()
         self._thread.join(_HAND_OVER_S)
         if self._thread.is_alive():
             child.terminate()
@@ -127,27 +126,25 @@ class Ros2Source(LiveSource):
         self._thread.join()
 
     def _run(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
-        """Listens until the source is stopped."""
+        """Reads from children until the source is stopped."""
         try:
-            self._listen_to_all(child, sink, settings)
+            self._supervise(child, sink, settings)
         except Exception as error:
-            # No child can cause it; whoever waits for this source is to know all the same.
-            sink.ended(f"ROS 2 cannot be listened to any more: {error!r}")
+            # An error of our own; the recorder must not wait for this source.
+            sink.ended(f"the ROS 2 source failed: {error!r}")
             raise
 
-    def _listen_to_all(
-        self, child: Process | None, sink: Sink, settings: dict[str, object]
-    ) -> None:
-        """Listens to one child after the other."""
+    def _supervise(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
+        """Reads from one child after the other."""
         pause = _PAUSE_S
         while child is not None:
             began = time.monotonic()
             reason = self._listen(child, sink)
             if self._stopping.is_set():
                 break
-            if time.monotonic() - began > _WELL_S:
+            if time.monotonic() - began > _STABLE_S:
                 pause = _PAUSE_S
-            sink.say(f"ROS 2: the child ended ({reason}); it is started again")
+            sink.say(f"ROS 2: the child ended ({reason}); restarting it")
             child = self._start_again(sink, settings, pause)
             pause = min(2 * pause, _MAX_PAUSE_S)
         for topic, since in self._outages.items():
@@ -155,33 +152,33 @@ class Ros2Source(LiveSource):
         self._outages.clear()
 
     def _listen(self, child: Process, sink: Sink) -> str:
-        """Listens to a child until it ends; why it did."""
+        """Reads from a child until it ends; returns the reason of its end."""
         receiver = Receiver(child.peer, sink, self._outages)
         reason = ""
-        last_words = ""
+        exit_report = ""
         try:
             try:
                 receiver.run()
             except (WireError, MemoryError) as error:
-                reason = str(error) or "no memory for a message of the size that it has"
+                reason = str(error) or "not enough memory for a message"
                 child.kill()
             except OSError as error:
                 reason = error.strerror or str(error)
-                last_words = child.last_words()
+                exit_report = child.exit_report()
             else:
-                last_words = child.last_words()
+                exit_report = child.exit_report()
         finally:
             child.end()
         if not (self._stopping.is_set() and receiver.said_bye):
-            for topic in receiver.heard:
-                self._outages.setdefault(topic, receiver.last_heard)
+            for topic in receiver.subscribed:
+                self._outages.setdefault(topic, receiver.last_received)
         if not self._stopping.is_set():
             for topic in sorted(receiver.present):
                 sink.topic_gone(topic)
-        return one_line("; ".join(filter(None, (reason, last_words))))
+        return one_line("; ".join(filter(None, (reason, exit_report))))
 
     def _start_again(self, sink: Sink, settings: dict[str, object], pause: float) -> Process | None:
-        """A new child, after a pause; None when the source is stopped meanwhile."""
+        """A new child after a pause; None if the source is stopped meanwhile."""
         while not self._stopping.wait(pause):
             pause = min(2 * pause, _MAX_PAUSE_S)
             try:
@@ -189,7 +186,7 @@ class Ros2Source(LiveSource):
             except (ChildError, MissingDependencyError) as error:
                 if self._stopping.is_set():
                     break
-                sink.say(one_line(f"ROS 2 does not come up again, and is tried again: {error}"))
+                sink.say(one_line(f"ROS 2 does not restart, trying again: {error}"))
                 continue
             with self._lock:
                 if not self._stopping.is_set():

@@ -1,7 +1,7 @@
 """Starts the child under the Python of the ROS environment; run by its path.
 
-That Python need not know hybridlog, nor have what hybridlog needs: the packages are
-named here without loading what their `__init__` loads.
+That Python need not have hybridlog or its dependencies. So the packages are registered
+here without running their `__init__` modules.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ _PACKAGE = "hybridlog.live.sources.ros2.child"
 
 
 def main() -> None:
-    """Runs the child; the argument is the number of its socket."""
+    """Runs the child; the argument is the file descriptor of its socket."""
     here = Path(__file__).resolve().parent
-    # Python puts this folder first, where names such as `profile` hide those of others.
+    # Python puts this folder first, where `profile` would hide the standard module.
     sys.path = [entry for entry in sys.path if Path(entry or ".").resolve() != here]
     name, folder = _PACKAGE, here
     while name:

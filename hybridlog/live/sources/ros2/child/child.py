@@ -1,9 +1,7 @@
-"""The child in the ROS environment: looks at the graph, subscribes, hands messages over.
+"""The child in the ROS environment: polls the graph, subscribes, passes messages on.
 
-It decides nothing. It tells of each topic and type that has publishers; the recorder says
-which of them to subscribe to. One thread does all but listening to the recorder.
-
-Runs under Python 3.10 as well, with nothing but the standard library and rclpy.
+It reports each topic and type with publishers; the recorder decides which to subscribe to.
+One thread does everything except reading the recorder's commands.
 """
 
 from __future__ import annotations
@@ -29,13 +27,13 @@ _LOOK_S = 0.5
 _FIRST_LOOKS_S = 0.1
 _EAGER_S = 3.0
 _IDLE_S = 0.5
-_BREATH_S = 0.001
-_FEW = 64
-_FEW_BYTES = 1 << 20
-_MUCH_BYTES = 1 << 20
-_GLANCE_S = 0.01
+_PAUSE_S = 0.001
+_SMALL_COUNT = 64
+_SMALL_BYTES = 1 << 20
+_SEND_BYTES = 1 << 20
+_SHORT_WAIT_S = 0.01
 _CATCH_UP_S = 0.5
-_LAST_WORDS_S = 2.0
+_FLUSH_S = 2.0
 
 
 class Child:
@@ -43,9 +41,9 @@ class Child:
 
     Args:
         middleware: ROS.
-        topics: What we listen to.
-        outbox: Where messages and events go.
-        events: Who puts events there.
+        topics: The topics of the graph.
+        outbox: Takes messages and events.
+        events: Puts events into the outbox.
     """
 
     def __init__(
@@ -55,43 +53,43 @@ class Child:
         self._topics = topics
         self._outbox = outbox
         self._events = events
-        self._orders: deque[dict[str, Any]] = deque()
+        self._commands: deque[dict[str, Any]] = deque()
         self._is_stopping = False
 
     # From other threads.
 
-    def order(self, order: dict[str, Any]) -> None:
-        """Takes an order of the recorder's."""
-        self._orders.append(order)
+    def command(self, command: dict[str, Any]) -> None:
+        """Takes a command of the recorder."""
+        self._commands.append(command)
         self._middleware.wake()
 
     def stop(self) -> None:
-        """Ends `run` soon, with all that has been received handed over."""
+        """Ends `run` soon, after it has passed on all received messages."""
         self._is_stopping = True
         self._middleware.wake()
 
-    # The one thread.
+    # The main thread.
 
     def run(self, peer: socket.socket) -> None:
-        """Works until it is told to stop.
+        """Works until it is stopped.
 
         Args:
-            peer: The socket that the outbox writes to.
+            peer: The socket of the outbox.
 
         Raises:
-            OSError: The recorder is gone.
+            OSError: The recorder has ended.
         """
         writable = select.poll()
         writable.register(peer, select.POLLOUT)
         began = next_look = time.monotonic()
         while not self._is_stopping:
-            while self._orders:
-                order = self._orders.popleft()
-                self._topics.subscribe(str(order.get("subscribe")), str(order.get("type")))
+            while self._commands:
+                command = self._commands.popleft()
+                self._topics.subscribe(str(command.get("subscribe")), str(command.get("type")))
             now = time.monotonic()
             if now >= next_look:
                 self._topics.look()
-                # Whoever starts a recorder wants the topics that there are at once.
+                # A new recorder needs the existing topics at once.
                 next_look = now + (_FIRST_LOOKS_S if now - began < _EAGER_S else _LOOK_S)
             wait = 0.0
             if self._outbox.send() and not self._topics.doubled:
@@ -99,50 +97,50 @@ class Child:
             count, size = self._take(wait)
             if not self._outbox.send():
                 writable.poll(2)
-            elif count < _FEW and size < _FEW_BYTES:
-                # A breath, so that messages come by the dozen and not one a wake-up.
-                time.sleep(_BREATH_S)
+            elif count < _SMALL_COUNT and size < _SMALL_BYTES:
+                # A short pause, so that messages come in batches and not one per wake-up.
+                time.sleep(_PAUSE_S)
         self._finish(writable)
 
     def _take(self, wait: float) -> tuple[int, int]:
-        """Takes what the subscriptions have; messages and bytes.
+        """Takes messages of all subscriptions; returns their number and bytes.
 
         Args:
-            wait: Seconds to wait at most while there is nothing.
+            wait: Maximum time to wait for a message, seconds.
         """
         ready = self._middleware.wait(wait)
         owners = self._topics.owners
         count = size = 0
-        # What has two subscriptions goes on even when nothing comes, to close one in time.
+        # Topics with two subscriptions are always visited, to close one in time.
         for topic in dict.fromkeys([*(owners[found] for found in ready), *self._topics.doubled]):
             assert topic.stream is not None
             try:
                 taken, taken_size = topic.stream.take(self._outbox)
             except Exception as error:
-                # rclpy has errors of many kinds; each of them costs a message.
+                # rclpy raises errors of many kinds; each costs one message.
                 self._events.lost(topic.name, "unreadable", 1, detail=str(error))
                 self._events.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
                 continue
             count += taken
             size += taken_size
-            if taken_size >= _MUCH_BYTES:
-                # The recorder goes on meanwhile, and the next topic finds room.
+            if taken_size >= _SEND_BYTES:
+                # The recorder can work meanwhile, and the next topic has room.
                 self._outbox.send()
         self._outbox.close_batch()
         return count, size
 
     def _finish(self, writable: select.poll) -> None:
-        """Hands over what has come by now, as long as that takes no more than a moment."""
+        """Passes on the messages received so far, for a limited time."""
         self._topics.end()
         deadline = time.monotonic() + _CATCH_UP_S
-        while self._take(_GLANCE_S)[0] >= _FEW or not self._topics.has_caught_up():
+        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT or not self._topics.has_caught_up():
             if time.monotonic() >= deadline:
                 break
             if not self._outbox.send():
                 writable.poll(2)
         self._topics.account(final=True)
         self._events.bye()
-        deadline = time.monotonic() + _LAST_WORDS_S
+        deadline = time.monotonic() + _FLUSH_S
         while not self._outbox.send() and time.monotonic() < deadline:
             writable.poll(100)
 
@@ -158,7 +156,7 @@ def run(number: int) -> int:
     """
     peer = socket.socket(fileno=number)
     peer.set_inheritable(False)
-    # The recorder gives no other order before it has been greeted.
+    # The recorder sends no command before the greeting.
     with peer.makefile("rb") as file:
         settings = parse_object(file.readline(MAX_BATCH))
     outbox = Outbox(peer)
@@ -166,7 +164,7 @@ def run(number: int) -> int:
     try:
         middleware = Middleware()
     except Exception as error:
-        # Whatever ROS has against coming up, the recorder is to say it.
+        # The recorder reports any error of ROS.
         events.failed(error)
         outbox.send()
         return 1
@@ -179,7 +177,7 @@ def run(number: int) -> int:
     try:
         child.run(peer)
     except (BrokenPipeError, ConnectionResetError):
-        # The recorder has died; there is nobody left to tell.
+        # The recorder has died.
         return 1
     finally:
         middleware.close()
@@ -187,7 +185,7 @@ def run(number: int) -> int:
 
 
 def _listen(peer: socket.socket, child: Child) -> None:
-    """Passes the recorder's orders on until it has no more."""
+    """Reads the recorder's commands until the end of input."""
     readable = select.poll()
     readable.register(peer, select.POLLIN)
     rest = b""
@@ -204,11 +202,11 @@ def _listen(peer: socket.socket, child: Child) -> None:
         *lines, rest = (rest + data).split(b"\n")
         try:
             for line in lines:
-                child.order(parse_object(line))
+                child.command(parse_object(line))
         except WireError as error:
-            print(f"an order that is none: {error}", file=sys.stderr)  # noqa: T201
+            print(f"malformed command: {error}", file=sys.stderr)  # noqa: T201
             break
     child.stop()
-    # Whatever the middleware is stuck in, nothing outlives the recorder.
-    time.sleep(2 * _LAST_WORDS_S)
+    # Even if the middleware hangs, the child must not outlive the recorder.
+    time.sleep(2 * _FLUSH_S)
     os._exit(1)

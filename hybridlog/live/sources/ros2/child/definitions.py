@@ -1,11 +1,8 @@
 """Definitions of ROS 2 types, from the files of the message packages.
 
-A definition is a text with all that it needs, as bags of ROS 2 have it: the `.msg` file
-and those of its fields' types (`ros2msg`), or `.idl` files where one has no other form
-(`ros2idl`). Type names come from the network: they are looked up as files before any
-package of that name is imported.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+A definition is a complete text, as in bags of ROS 2: the `.msg` file and those of its
+fields' types (`ros2msg`), or `.idl` files if a type has no `.msg` file (`ros2idl`). Type
+names come from the network. They are looked up as files before a package is imported.
 """
 
 from __future__ import annotations
@@ -52,7 +49,7 @@ _PRIMITIVE = frozenset(
 )
 _LINE = b"=" * 80 + b"\n"
 
-# Topics of services and actions have types of their own, which these files define.
+# Services and actions have topics with types that their files define.
 _PARTS = {
     "srv": ("_Event",),
     "action": ("_FeedbackMessage", "_SendGoal_Event", "_GetResult_Event"),
@@ -60,11 +57,11 @@ _PARTS = {
 
 
 class UnknownTypeError(Exception):
-    """A type that cannot be said; the message says why, and what helps."""
+    """A type has no usable definition; the message names reason and remedy."""
 
 
 class TypeName(NamedTuple):
-    """`package/folder/name`; `part` is what of a service or an action is meant."""
+    """`package/folder/name`; `part` is a part of a service or an action."""
 
     package: str
     folder: str
@@ -77,8 +74,8 @@ class Definition(NamedTuple):
 
     Attributes:
         encoding: `ros2msg` or `ros2idl`.
-        text: The definition with all that it needs.
-        has_bytes: Some field is an array of bytes of any length, as in images.
+        text: The definition with all definitions that it needs.
+        has_bytes: Some field is a byte array of any length, as in images.
         has_arrays: Some field is an array of any length.
     """
 
@@ -89,14 +86,14 @@ class Definition(NamedTuple):
 
 
 def parse_type(name: str) -> TypeName:
-    """Takes a type's name apart.
+    """Parses the name of a type.
 
     Raises:
-        UnknownTypeError: It is no name of a ROS 2 type.
+        UnknownTypeError: The name is not that of a ROS 2 type.
     """
     found = _TYPE.fullmatch(name)
     if found is None:
-        raise UnknownTypeError(f"{name!r} is no name of a type, which is package/msg/Name")
+        raise UnknownTypeError(f"{name!r} is not a type name like package/msg/Name")
     package, folder, last = found.groups()
     for part in _PARTS.get(folder, ()):
         if last.endswith(part) and len(last) > len(part):
@@ -105,14 +102,14 @@ def parse_type(name: str) -> TypeName:
 
 
 def share_folders() -> list[Path]:
-    """Where packages of this environment lie: sourced workspaces, then the wheels' place."""
+    """Folders of the environment's packages: sourced workspaces, then installed wheels."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders = [Path(prefix) / "share" for prefix in [*prefixes, sys.prefix] if prefix]
     return list(dict.fromkeys(folders))
 
 
 class Definitions:
-    """Finds definitions below some folders, the first that has a package first."""
+    """Finds definitions in folders; earlier folders take precedence."""
 
     def __init__(self, folders: Iterable[Path]) -> None:
         self._folders = list(folders)
@@ -121,10 +118,10 @@ class Definitions:
         """The definition of a type.
 
         Args:
-            name: As the graph has it: `sensor_msgs/msg/Image`.
+            name: Type name such as `sensor_msgs/msg/Image`.
 
         Raises:
-            UnknownTypeError: The package, the type or one that it needs is not installed.
+            UnknownTypeError: The package, the type or a required type is not installed.
         """
         root = parse_type(name)
         try:
@@ -149,7 +146,7 @@ class Definitions:
                 more = self._read(need, ".msg" if word == "MSG" else suffix)
                 size += len(more)
                 if len(known) > MAX_TYPES or size > MAX_TEXT:
-                    raise UnknownTypeError("its definition needs too many others")
+                    raise UnknownTypeError("its definition needs too many other definitions")
                 waiting.append((need.package, more))
                 parts += [b"\n", _LINE, _title(word, need), more]
         return Definition(
@@ -160,15 +157,15 @@ class Definitions:
         )
 
     def _read(self, name: TypeName, suffix: str) -> bytes:
-        """The file of a type.
+        """Reads the file of a type.
 
         Raises:
-            UnknownTypeError: There is none, or it cannot be read.
+            UnknownTypeError: The file does not exist or cannot be read.
         """
-        is_there = False
+        is_installed = False
         for folder in self._folders:
             package = folder / name.package
-            is_there = is_there or package.is_dir()
+            is_installed = is_installed or package.is_dir()
             path = package / name.folder / f"{name.name}{suffix}"
             try:
                 with path.open("rb") as file:
@@ -180,14 +177,14 @@ class Definitions:
             if len(data) > MAX_FILE:
                 raise UnknownTypeError(f"{path} is too large for a definition")
             return data
-        if not is_there:
+        if not is_installed:
             raise UnknownTypeError(
-                f"the package {name.package} is not installed where rclpy is; install it there, "
-                "or source the workspace that has it"
+                f"the package {name.package} is not installed beside rclpy; install it there, "
+                "or source its workspace"
             )
         raise UnknownTypeError(
-            f"the package {name.package} that is installed has no {name.folder}/{name.name}; "
-            "source the workspace that its publisher was built in"
+            f"the installed package {name.package} has no {name.folder}/{name.name}; source the "
+            "workspace of its publisher"
         )
 
 
@@ -197,7 +194,7 @@ def _title(word: str, name: TypeName) -> bytes:
 
 
 def _needs(text: bytes, package: str, word: str) -> Iterator[TypeName]:
-    """Types that a definition names, in its order."""
+    """Types that a definition refers to, in order."""
     if word == "IDL":
         for found in _INCLUDE.findall(text):
             yield TypeName(*found.decode().split("/"))
@@ -213,5 +210,5 @@ def _needs(text: bytes, package: str, word: str) -> Iterator[TypeName]:
         full = {1: [package, "msg", *steps], 2: [steps[0], "msg", steps[-1]]}.get(len(steps), steps)
         found_type = _TYPE.fullmatch("/".join(full))
         if found_type is None:
-            raise UnknownTypeError(f"its definition names {base[:80]!r}, which is no type")
+            raise UnknownTypeError(f"its definition refers to {base[:80]!r}, which is not a type")
         yield TypeName(*found_type.groups())

@@ -1,7 +1,4 @@
-"""What the child tells the recorder besides messages: events of the wire, one method each.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
-"""
+"""Sends the child's events to the recorder, one method per kind of event."""
 
 from __future__ import annotations
 
@@ -12,15 +9,15 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.definitions import Definition
     from hybridlog.live.sources.ros2.child.outbox import Outbox
 
-MAX_SAID = 10_000
-"""Different complaints that are told; what has more to say has one reason for all."""
+MAX_REPORTS = 10_000
+"""Maximum number of different problem reports."""
 
 
 class EventSender:
-    """Puts events into the outbox, behind the messages that came before.
+    """Puts events into the outbox, after earlier messages.
 
     Args:
-        outbox: Where they go.
+        outbox: Takes the events.
     """
 
     def __init__(self, outbox: Outbox) -> None:
@@ -29,34 +26,34 @@ class EventSender:
         self._said: set[str] = set()
 
     def hello(self, middleware: str) -> None:
-        """ROS is up."""
+        """Greets the recorder: ROS is up."""
         self._outbox.event({"event": "hello", "middleware": middleware})
 
     def failed(self, error: Exception) -> None:
-        """ROS does not come up."""
+        """Reports that ROS does not start."""
         why = f"{type(error).__name__}: {error}"
         missing = isinstance(error, ImportError)
         self._outbox.event({"event": "failed", "missing": missing, "why": why})
 
     def candidate(self, topic: str, kind: str) -> None:
-        """There is a topic that the recorder may want."""
+        """Reports a topic that the recorder may want."""
         self._outbox.event({"event": "candidate", "topic": topic, "type": kind})
 
     def publishers(self, topic: str, kind: str, count: int) -> None:
-        """A wanted topic has so many publishers now."""
+        """Reports the number of publishers of a wanted topic."""
         self._outbox.event({"event": "topic", "topic": topic, "type": kind, "publishers": count})
 
     def gone(self, topic: str) -> None:
-        """A wanted topic has no publishers any more."""
+        """Reports that a wanted topic has no publishers left."""
         self._outbox.event({"event": "gone", "topic": topic})
 
     def channel(
         self, topic: str, kind: str, definition: Definition, offered: str, type_hash: str
     ) -> int:
-        """Messages of a topic will come.
+        """Announces a channel for the messages of a topic.
 
         Returns:
-            The number of the channel that they are to have.
+            The number of the channel.
         """
         number = len(self._channels)
         self._channels.append(topic)
@@ -83,14 +80,14 @@ class EventSender:
         times: tuple[int, int] | None = None,
         detail: str = "",
     ) -> None:
-        """Messages will never come.
+        """Reports lost messages.
 
         Args:
-            topic: Whose.
+            topic: Their topic.
             cause: Value of `base.Cause`.
-            count: How many, None when that cannot be known.
-            times: From when until when, ns since the epoch; None for now.
-            detail: For people.
+            count: Number of messages, None if unknown.
+            times: Begin and end of the loss, ns since the epoch; None for now.
+            detail: Text for the user.
         """
         now = time.time_ns()
         first, last = times or (now, now)
@@ -107,7 +104,7 @@ class EventSender:
         )
 
     def refusals(self) -> None:
-        """Messages found no room in the outbox."""
+        """Reports messages that the outbox refused."""
         for number, refusal in self._outbox.refused.items():
             self.lost(
                 self._channels[number],
@@ -119,11 +116,11 @@ class EventSender:
         self._outbox.refused.clear()
 
     def say(self, text: str) -> None:
-        """Something is wrong; the same is said once."""
-        if text not in self._said and len(self._said) < MAX_SAID:
+        """Reports a problem to the user, each text once."""
+        if text not in self._said and len(self._said) < MAX_REPORTS:
             self._said.add(text)
             self._outbox.event({"event": "say", "text": text})
 
     def bye(self) -> None:
-        """All has been handed over."""
+        """Reports that all messages were passed on."""
         self._outbox.event({"event": "bye"})

@@ -1,10 +1,7 @@
-"""rclpy, as far as a recorder needs it: the graph, raw subscriptions, waiting for them.
+"""The parts of rclpy that a recorder needs: graph, raw subscriptions, waiting.
 
-The only module that touches rclpy. Subscriptions are polled, not spun: an executor makes
-a task of each message and is a fifth as fast.
-
-Runs under Python 3.10 as well, with nothing but the standard library and rclpy, from
-Humble on.
+No other module imports rclpy. Subscriptions are polled: an executor creates a task per
+message, and has a fifth of the speed.
 """
 
 from __future__ import annotations
@@ -24,19 +21,19 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.definitions import TypeName
 
 _ID = 16
-"""Bytes that name a publisher; some releases fill them up with zeros."""
+"""Length of a publisher's id in bytes; some releases pad it with zeros."""
 
-_MAX_ODD = 100
+_MAX_INVALID = 100
 
 
 class Offer(NamedTuple):
     """A publisher.
 
     Attributes:
-        publisher: Its id, as messages have it too.
-        node: Name of its node, with the namespace; empty as long as nobody has heard it.
-        profile: The quality of service that it offers.
-        type_hash: Hash of the type's description, empty in releases without.
+        publisher: Its id, as in its messages.
+        node: Name of its node with the namespace; empty until it is known.
+        profile: Quality of service that it offers.
+        type_hash: Hash of the type's description; empty in older releases.
     """
 
     publisher: bytes
@@ -49,10 +46,10 @@ class Subscription:
     """A raw subscription.
 
     Attributes:
-        profile: What it asks for.
-        tells_all: The middleware counts what it loses before the first message and after
-            the last too, and nothing that was sent before it listened.
-        take: The next message and its information, None when there is none.
+        profile: Requested quality of service.
+        tells_all: The middleware also counts losses before the first message and after the
+            last, but no message from before the subscription.
+        take: Returns the next message and its information, None if there is none.
     """
 
     def __init__(self, middleware: Middleware, handle: Any, profile: Profile) -> None:
@@ -64,23 +61,23 @@ class Subscription:
         self._middleware = middleware
         self._subscription = handle
         self._losses = middleware.losses_of(self.handle)
-        # Others may count otherwise.
+        # Other middlewares may count differently.
         self.tells_all = middleware.implementation.startswith("rmw_fastrtps")
 
     @property
     def tells_losses(self) -> bool:
-        """Whether the middleware counts what it loses."""
+        """True if the middleware counts losses."""
         return self._losses is not None
 
     def losses(self) -> int:
-        """Messages that the middleware says it has lost since the last call."""
+        """Messages lost since the last call, as the middleware counts them."""
         if self._losses is None:
             return 0
         status = self._losses.take_event()
         return 0 if status is None else int(status.total_count_change)
 
     def close(self) -> None:
-        """Ends it; what has not been taken is gone."""
+        """Ends the subscription; messages that were not taken are gone."""
         if self._losses is not None:
             self._losses.destroy_when_not_in_use()
             self._losses = None
@@ -88,14 +85,14 @@ class Subscription:
 
 
 class Middleware:
-    """A node of our own, without services, parameters or log topic.
+    """A node without services, parameters or log topic.
 
     Attributes:
-        implementation: Name of the middleware, `rmw_fastrtps_cpp`.
-        odd: Topics that cannot be looked at, and why.
+        implementation: Name of the middleware, such as `rmw_fastrtps_cpp`.
+        invalid: Topics with names that ROS refuses, and the errors.
 
     Raises:
-        ImportError: There is no rclpy.
+        ImportError: rclpy is not installed.
     """
 
     def __init__(self) -> None:
@@ -123,27 +120,27 @@ class Middleware:
         self._wait_set: Any = None
         self._open: list[Subscription] = []
         self._at: dict[int, Subscription] = {}
-        self.odd: dict[str, str] = {}
+        self.invalid: dict[str, str] = {}
         self.implementation = str(rclpy.get_rmw_implementation_identifier())
 
     def wake(self) -> None:
-        """Ends a wait; may be called from any thread, even at the end."""
+        """Ends a wait; thread safe, even while the node closes."""
         with suppress(self._native.InvalidHandle):
             self._guard.trigger()
 
     def publishers(self) -> dict[tuple[str, str], list[Offer]]:
-        """All publishers but our own, by topic and type.
+        """All publishers of other nodes, by topic and type.
 
-        Names that ROS does not take, of programs that speak DDS without it, go to `odd`.
+        DDS programs without ROS may have names that ROS refuses; these go to `invalid`.
         """
         found: dict[tuple[str, str], list[Offer]] = {}
         for topic, _ in self._node.get_topic_names_and_types():
             try:
                 infos = self._node.get_publishers_info_by_topic(topic)
             except Exception as error:
-                # rclpy has errors of many kinds; each leaves this topic out and no other.
-                if len(self.odd) < _MAX_ODD:
-                    self.odd[topic] = " ".join(str(error).split())
+                # rclpy raises errors of many kinds; each concerns only this topic.
+                if len(self.invalid) < _MAX_INVALID:
+                    self.invalid[topic] = " ".join(str(error).split())
                 continue
             for info in infos:
                 offer = _offer(info)
@@ -152,11 +149,11 @@ class Middleware:
         return found
 
     def subscribe(self, topic: str, kind: TypeName, profile: Profile) -> Subscription:
-        """Subscribes to the bytes of a topic.
+        """Subscribes to the serialized messages of a topic.
 
         Raises:
-            ImportError: The package of the type has no Python.
-            Exception: Whatever rclpy has against it.
+            ImportError: The type has no Python module.
+            Exception: Any error of rclpy.
         """
         handle = self._node.create_subscription(
             message_class(kind),
@@ -172,18 +169,18 @@ class Middleware:
         return found
 
     def forget(self, subscription: Subscription, inner: Any) -> None:
-        """Ends a subscription; called by itself only.
+        """Ends a subscription; only `Subscription.close` calls it.
 
         Args:
-            subscription: Ours.
-            inner: That of rclpy.
+            subscription: The subscription.
+            inner: Its rclpy object.
         """
         self._open = [other for other in self._open if other is not subscription]
         self._wait_set = None
         self._node.destroy_subscription(inner)
 
     def losses_of(self, handle: Any) -> Any:
-        """Where rclpy tells of messages that a subscription lost, None when it does not."""
+        """The rclpy event of lost messages, None if it is not supported."""
         if not hasattr(self._native, "EventHandle"):
             return None  # Humble
         kinds = self._native.rcl_subscription_event_type_t
@@ -193,10 +190,10 @@ class Middleware:
             return None
 
     def wait(self, seconds: float) -> list[Subscription]:
-        """Waits until some subscriptions have messages, for so long at most.
+        """Waits until some subscriptions have messages, with a time limit.
 
         Returns:
-            Those that have.
+            The subscriptions with messages.
         """
         if self._wait_set is None:
             self._at = {sub.handle.pointer: sub for sub in self._open}
@@ -213,13 +210,13 @@ class Middleware:
         return [self._at[pointer] for pointer in wait_set.get_ready_entities("subscription")]
 
     def close(self) -> None:
-        """Takes the node from the graph."""
+        """Removes the node from the graph."""
         self._wait_set = None
         self._node.destroy_node()
         self._rclpy.shutdown()
 
     def _quality(self, profile: Profile) -> Any:
-        """A profile as rclpy has it."""
+        """The rclpy object of a profile."""
         from rclpy.duration import Duration  # type: ignore[import-not-found]
         from rclpy.qos import QoSProfile  # type: ignore[import-not-found]
 
@@ -232,11 +229,11 @@ class Middleware:
 
 
 def _nothing(_message: object) -> None:
-    """Never called: nobody spins the node."""
+    """Never called: the node does not spin."""
 
 
 def _no_callbacks() -> Any:
-    """Keeps rclpy from telling a log of what nobody waits for."""
+    """Event callbacks that keep rclpy from logging unhandled events."""
     try:
         module = import_module("rclpy.event_handler")
     except ImportError:
@@ -245,7 +242,7 @@ def _no_callbacks() -> Any:
 
 
 def _offer(info: Any) -> Offer:
-    """A publisher as the graph has it."""
+    """A publisher from the information in the graph."""
     quality = info.qos_profile
     profile = Profile(
         history=int(quality.history),
@@ -272,7 +269,7 @@ def _offer(info: Any) -> Offer:
 
 
 def publisher_id(gid: bytes) -> bytes:
-    """A publisher's id in the length that the graph and messages have in common."""
+    """A publisher's id, cut to the common length in graph and messages."""
     return gid[:_ID]
 
 
@@ -280,10 +277,10 @@ def message_class(kind: TypeName) -> Any:
     """The Python class of a type.
 
     Raises:
-        ImportError: There is none.
+        ImportError: The type has no Python class.
     """
     found: Any = import_module(f"{kind.package}.{kind.folder}")
-    # An event of a service of an action: Name.Impl.SendGoalService.Event.
+    # The event of an action's service is Name.Impl.SendGoalService.Event.
     steps = {
         "": [],
         "Event": ["Event"],
@@ -296,5 +293,5 @@ def message_class(kind: TypeName) -> Any:
             found = getattr(found, step)
         except AttributeError as error:
             name = "/".join(kind[:3])
-            raise ImportError(f"the Python of {name} that is installed has no {step}") from error
+            raise ImportError(f"the installed Python module of {name} has no {step}") from error
     return found

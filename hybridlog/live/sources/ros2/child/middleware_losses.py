@@ -1,67 +1,64 @@
-"""What the middleware says it has lost, beside the gaps in the numbers.
+"""Losses that the middleware counts, without those that gaps in the numbers show too.
 
-Fast DDS knows of losses that leave no gap: before the first message that came, and after
-the last. It counts most of the gaps too, so its count and theirs must not be added. What
-it says and no gap explains is told of; a gap that shows later, and was told of so, is not
-told of again.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+Fast DDS also counts losses that leave no gap: before the first message and after the last.
+It counts most gaps as well, so both counts must not be added. The counter reports what no
+gap explains. If a later gap explains it, that gap is not reported again.
 """
 
 from __future__ import annotations
 
 _LOOKS = 4
-"""Looks at the graph during which no gap has explained what the middleware says."""
+"""Looks at the graph that wait for a gap to explain a count."""
 
 
 class MiddlewareLossCounter:
-    """The count of one subscription."""
+    """Counts the losses that the middleware of one subscription reports."""
 
     def __init__(self) -> None:
-        self._said = 0
+        self._counted = 0  # by the middleware
         self._gaps = 0
-        self._heads = 0
-        self._open = 0
-        self._left = [0] * _LOOKS
+        self._before_first = 0
+        self._unexplained = 0  # reported without a gap
+        self._history = [0] * _LOOKS
 
     def add(self, count: int) -> None:
-        """The middleware says that it has lost some more."""
-        self._said += count
+        """Add losses that the middleware reports."""
+        self._counted += count
 
-    def before_first(self, before: int) -> int:
-        """The first message of all has come.
+    def before_first(self, sent: int) -> int:
+        """Take the first message of a publisher.
 
         Args:
-            before: Messages that its publisher sent before it.
+            sent: Messages that the publisher sent before it.
 
         Returns:
-            How many of them were lost; the others were sent before we listened.
+            Number of these that were lost. The others were sent before the subscription.
         """
-        found = max(0, min(before, self._said - self._explained()))
-        self._heads += found
+        found = max(0, min(sent, self._counted - self._explained()))
+        self._before_first += found
         return found
 
     def unreported(self, missing: int) -> int:
-        """A gap is told of; how many of it have not been told of before."""
-        again = min(missing, self._open)
-        self._open -= again
+        """Take the missing messages of a gap, and return how many were not reported yet."""
+        reported = min(missing, self._unexplained)
+        self._unexplained -= reported
         self._gaps += missing
-        return missing - again
+        return missing - reported
 
     def unexplained(self, waiting: int, *, final: bool) -> int:
-        """What is to be told of now; to be called at each look, after all gaps.
+        """Number of losses to report without a gap; call it at each look, after all gaps.
 
         Args:
-            waiting: Messages in gaps that have not been told of.
-            final: There will be no other look.
+            waiting: Missing messages in gaps that are not reported yet.
+            final: No further look follows.
         """
-        # A publisher may take a message back without the middleware calling it lost.
-        self._said = max(self._said, self._explained())
-        self._left = [*self._left[1:], self._said - self._explained() - waiting]
-        found = max(0, self._left[-1] if final else min(self._left))
-        self._open += found
-        self._left = [left - found for left in self._left]
+        # A publisher may withdraw a message, which the middleware does not count as lost.
+        self._counted = max(self._counted, self._explained())
+        self._history = [*self._history[1:], self._counted - self._explained() - waiting]
+        found = max(0, self._history[-1] if final else min(self._history))
+        self._unexplained += found
+        self._history = [count - found for count in self._history]
         return found
 
     def _explained(self) -> int:
-        return self._heads + self._gaps + self._open
+        return self._before_first + self._gaps + self._unexplained

@@ -1,9 +1,7 @@
-"""What waits to be handed to the recorder, in bounded memory.
+"""Queue of messages and events for the recorder, in bounded memory.
 
-The socket is written without waiting. While the recorder does not take what comes, the
-outbox fills; what then finds no room is counted, topic by topic.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+Writes to the socket do not block. While the recorder does not read, the outbox fills up.
+Messages that do not fit are counted by channel.
 """
 
 from __future__ import annotations
@@ -25,14 +23,14 @@ from hybridlog.live.sources.ros2.child.wire import (
 )
 
 BUDGET = 256 << 20
-"""Bytes that may wait."""
+"""Maximum number of queued bytes."""
 
 _BATCH = 1 << 20
 _AT_ONCE = 64
 
 
 class Refusal:
-    """Messages of one channel that were not handed over, since it was last told."""
+    """Refused messages of one channel since the last report."""
 
     __slots__ = ("count", "first", "last")
 
@@ -46,12 +44,12 @@ class Outbox:
     """Packs messages and events into frames, and sends them.
 
     Args:
-        peer: The socket; it is made one that does not wait.
-        budget: Bytes that may wait.
+        peer: The socket; it becomes non-blocking.
+        budget: Maximum number of queued bytes.
 
     Attributes:
-        waiting: Bytes that wait.
-        refused: By channel, what found no room, and what was too large for any.
+        waiting: Queued bytes.
+        refused: Messages by channel that did not fit or were too large.
     """
 
     def __init__(self, peer: socket.socket, budget: int = BUDGET) -> None:
@@ -66,7 +64,7 @@ class Outbox:
         self.refused: dict[int, Refusal] = {}
 
     def message(self, channel: int, payload: bytes, received: int, sent: int, number: int) -> None:
-        """Puts a message in; the arguments are those of `ros2_wire.ENTRY`."""
+        """Adds a message; the arguments are those of `wire.ENTRY`."""
         size = len(payload)
         if (self.waiting and self.waiting + size > self._budget) or size > MAX_PAYLOAD:
             refusal = self.refused.get(channel)
@@ -88,12 +86,12 @@ class Outbox:
             self.close_batch()
 
     def event(self, event: dict[str, Any]) -> None:
-        """Puts an event in, behind all messages so far, even where there is no room."""
+        """Adds an event after all messages so far, even beyond the budget."""
         self.close_batch()
         self._put(event_frame(event))
 
     def close_batch(self) -> None:
-        """Makes a frame of the small messages that have come."""
+        """Packs the small messages so far into a frame."""
         if not self._entries:
             return
         length = COUNT.size + self._small
@@ -109,10 +107,13 @@ class Outbox:
         self.waiting += len(data)
 
     def send(self) -> bool:
-        """Sends what the socket takes at once; whether that is all.
+        """Sends as much as the socket takes without blocking.
+
+        Returns:
+            True if the queue is empty.
 
         Raises:
-            OSError: The recorder is gone.
+            OSError: The recorder has ended.
         """
         self.close_batch()
         buffers = self._buffers

@@ -1,14 +1,11 @@
-"""A profile for Fast DDS that loses less of what is large, unless the user has one.
+"""A default profile for Fast DDS that loses fewer large messages.
 
-Fast DDS hands messages to processes of the same computer through shared memory that the
-publisher owns: half a megabyte for all its topics. A message that is larger than that, or
-a burst, overwrites itself before it can be read. A subscriber that names UDP addresses
-only gets them through a socket instead, whose buffer is ours to size. Shared memory is
-still there for what discovery has to say.
+On one computer Fast DDS transports messages through shared memory of the publisher: half a
+megabyte for all its topics. A larger message or a burst is overwritten before it is read. A
+subscriber with UDP addresses only gets messages through a socket, whose buffer it can
+enlarge. Discovery still uses shared memory.
 
-Other middlewares do not look at it.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+A profile of the user takes precedence. Other middlewares ignore it.
 """
 
 from __future__ import annotations
@@ -20,18 +17,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""Where Fast DDS looks for the name of a file; releases before 3 know the second."""
+"""Variables with the file name of a profile; releases before 3 know the second."""
 
 _OTHERS = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE")
 _FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
-_MAX_ALLOWED = Path("/proc/sys/net/core/rmem_max")
+_KERNEL_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 BUFFER = 32 << 20
-"""Bytes that a socket is asked to hold, where the kernel allows so many."""
+"""Socket buffer in bytes, if the kernel allows it."""
 
-_LEAST = 1 << 17
-"""Fast DDS refuses sockets that hold less than one datagram."""
+_MIN_BUFFER = 1 << 17
+"""Fast DDS refuses socket buffers smaller than one datagram."""
 
 _PROFILE = """\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -63,19 +60,19 @@ def profile(allowed: str) -> str:
     """The profile, as XML.
 
     Args:
-        allowed: What the kernel says it lets a socket hold, bytes; when that is no number,
-            sockets are not asked for much.
+        allowed: Limit of the kernel for socket buffers, bytes; if it is not a number, the
+            buffer has the minimum size.
     """
-    most = int(allowed) if allowed.strip().isdigit() else _LEAST
-    return _PROFILE.format(size=max(_LEAST, min(BUFFER, most)))
+    limit = int(allowed) if allowed.strip().isdigit() else _MIN_BUFFER
+    return _PROFILE.format(size=max(_MIN_BUFFER, min(BUFFER, limit)))
 
 
 def is_set_up(environment: MutableMapping[str, str], folder: Path) -> bool:
-    """Whether the user has a profile, or has chosen how Fast DDS transports messages.
+    """Tells whether the user has chosen a profile or a transport of Fast DDS.
 
     Args:
-        environment: Variables.
-        folder: Where the child runs: Fast DDS reads profiles there without being told.
+        environment: Environment variables.
+        folder: Working directory of the child, where Fast DDS looks for profiles.
     """
     named = any(environment.get(name) for name in (*VARIABLES, *_OTHERS))
     return named or any((folder / name).exists() for name in _FILES)
@@ -83,22 +80,22 @@ def is_set_up(environment: MutableMapping[str, str], folder: Path) -> bool:
 
 @contextmanager
 def default_profile(environment: MutableMapping[str, str] = os.environ) -> Iterator[bool]:
-    """Lets Fast DDS find the profile while it comes up; whether it does.
+    """Provides the profile while Fast DDS starts; yields False if it does not apply.
 
     Args:
-        environment: Where the variables are set, and taken away at the end.
+        environment: Variables, which are set meanwhile.
     """
     if is_set_up(environment, Path.cwd()):
         yield False
         return
     try:
-        allowed = _MAX_ALLOWED.read_text(encoding="ascii")
+        allowed = _KERNEL_LIMIT.read_text(encoding="ascii")
     except OSError:
         allowed = ""
     try:
         number, name = tempfile.mkstemp(prefix="hybridlog-", suffix=".xml")
     except OSError:
-        # No folder can be written to. Fast DDS does without, and may lose more.
+        # No folder is writable. Fast DDS starts without the profile, and may lose more.
         yield False
         return
     try:

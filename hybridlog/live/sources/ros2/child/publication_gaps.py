@@ -1,19 +1,16 @@
-"""Gaps in the numbers that publishers give their messages.
+"""Lost messages of ROS 2, found by the publication sequence numbers of the middleware.
 
-A publisher numbers what it sends, one by one. A number that never comes is a message
-that was lost on the way, or between the middleware's queue and us. The rules, which
-accuse nobody wrongly:
+The middleware of each publisher numbers its messages one by one. A number that never comes
+is a message that was lost in transport or in a queue. Unlike `header.seq` of ROS 1 these
+numbers can be trusted from the first, but messages may come late. The rules:
 
-* Numbers are told apart by publisher. Where the middleware does not name the publisher
-  of a message, they are judged only while the topic has had one and the same publisher.
-* The first number of a publisher is where its count begins, whatever it is: what was
-  sent before we listened is not lost.
-* A publisher that loses messages and goes may have lost its last ones too. No number
-  follows them, so how many is not known.
-* A gap waits for two looks at the graph before it is told of: a late message fills it.
-* A number that falls back is a count that begins anew.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+* Numbers belong to a publisher. If messages do not name their publisher, numbers count
+  only while the topic has had the same single publisher.
+* The first number of a publisher starts its count: earlier messages are not lost.
+* A publisher that has lost messages and disappears may have lost its last ones too. No
+  number follows them, so their number is unknown.
+* A gap waits for two looks at the graph before it is reported: a late message fills it.
+* A number that goes back restarts the count.
 """
 
 from __future__ import annotations
@@ -24,32 +21,32 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 MAX_GAPS = 4096
-"""Gaps that wait; when there are more, the older half is told of at once."""
+"""Maximum number of waiting gaps; beyond it the older half is reported at once."""
 
 MAX_STEP = 1 << 32
-"""A jump from here on is no loss that anyone could count."""
+"""A gap of this width or more has no meaningful count."""
 
 MAX_PUBLISHERS = 1024
 
 MOMENT_NS = 1_000_000_000
-"""Who has been silent for longer may be silent for long."""
+"""A publisher that has been silent for longer may stay silent."""
 
-WELL = 10
-"""Messages without a gap after which a publisher is taken to be heard well again."""
+RECOVERED_AFTER = 10
+"""Messages without a gap after which reception counts as good again."""
 
 SUSPICIOUS_NS = 5_000_000_000
-"""Between a publisher's last gap and its last message, when more may be missing."""
+"""Maximum time from a last gap to the last message that makes further losses likely."""
 
 
 class Loss(NamedTuple):
-    """Messages of one publisher that never came.
+    """Lost messages of one publisher.
 
     Attributes:
-        publisher: Its id, as the middleware spells it.
-        missing: How many, None when its numbers make no sense.
-        first: When the last one before them was received, ns since the epoch.
-        last: When the first one after them was received.
-        place: Where they were, for people; empty for a gap.
+        publisher: Its id in the middleware.
+        missing: Number of messages, None if unknown.
+        first: Receive time of the last message before them, ns since the epoch.
+        last: Receive time of the first message after them.
+        place: Their place for the user; empty for a gap.
     """
 
     publisher: bytes
@@ -60,7 +57,7 @@ class Loss(NamedTuple):
 
 
 class _Gap:
-    """PublicationGapDetector `[start, end)` of a publisher that have not come."""
+    """Missing numbers `[start, end)` of a publisher."""
 
     __slots__ = ("end", "first", "last", "looks", "publisher", "start")
 
@@ -74,11 +71,11 @@ class _Gap:
 
 
 class PublicationGapDetector:
-    """The numbers of one topic.
+    """Finds gaps in the publication sequence numbers of one topic.
 
     Attributes:
-        is_doubled: Two subscriptions get the same messages, or did a moment ago, so a
-            number that has been seen is a message that has been taken.
+        is_doubled: Two subscriptions get, or got a moment ago, the same messages. Then a
+            repeated number is a repeated message.
     """
 
     def __init__(self) -> None:
@@ -89,15 +86,15 @@ class PublicationGapDetector:
         self._sure: dict[bytes, Loss] = {}
 
     def see(self, publisher: bytes, number: int, received: int) -> bool:
-        """Notes a message.
+        """Takes the number of a message.
 
         Args:
-            publisher: Who sent it, `in` these numbers when it has been heard before.
-            number: The publisher's number.
-            received: When, ns since the epoch.
+            publisher: Id of its publisher.
+            number: Its sequence number.
+            received: Its receive time, ns since the epoch.
 
         Returns:
-            Whether it is to be kept; False when it has been seen before.
+            False if the message is a repetition.
         """
         last = self._last.get(publisher)
         if last is None or number == last[0] + 1:
@@ -118,42 +115,42 @@ class PublicationGapDetector:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nobody has been heard since they were begun."""
+        """True before the first message."""
         return not self._last
 
     @property
     def last_received(self) -> int:
-        """When the last message was received, ns since the epoch; 0 when there was none."""
+        """Receive time of the last message, ns since the epoch; 0 before the first."""
         return max((received for _, received in self._last.values()), default=0)
 
     @property
     def waiting(self) -> int:
-        """How many are missing that `losses` has not told of."""
+        """Missing messages that `losses` has not returned yet."""
         sure = sum(loss.missing or 0 for loss in self._sure.values())
         return sure + sum(gap.end - gap.start for gap in self._gaps)
 
     def has_caught_up(self, since: int) -> bool:
-        """Whether all who spoke a moment ago have spoken after a time.
+        """Tells whether all publishers that were active just before a time have sent after it.
 
         Args:
-            since: ns since the epoch.
+            since: The time, ns since the epoch.
         """
         return not any(since - MOMENT_NS <= at < since for _, at in self._last.values())
 
     def suspect(self, publisher: bytes, since: int) -> Loss | None:
-        """A publisher's loss of its last messages, if that is to be feared.
+        """The probable loss of a publisher's last messages, None if it is unlikely.
 
         Args:
-            publisher: It has gone, or nobody listens any more.
-            since: From when on it does not matter any more, ns since the epoch.
+            publisher: A publisher that has disappeared, or whose subscription ends.
+            since: Time of its end, ns since the epoch.
         """
         last = self._last.get(publisher)
         jumped = self._jumped.pop(publisher, None)
         if last is None or jumped is None or last[1] >= since:
             return None
-        if last[0] - jumped[0] >= WELL or last[1] - jumped[1] > SUSPICIOUS_NS:
+        if last[0] - jumped[0] >= RECOVERED_AFTER or last[1] - jumped[1] > SUSPICIOUS_NS:
             return None
-        return Loss(publisher, None, last[1], since, "after its last message, after others")
+        return Loss(publisher, None, last[1], since, "after its last message, probably")
 
     def _jump(self, publisher: bytes, last: tuple[int, int], number: int, received: int) -> None:
         self._last[publisher] = number, received
@@ -161,7 +158,7 @@ class PublicationGapDetector:
         if number - last[0] > MAX_STEP:
             self._confirm(publisher, None, last[1], received)
             return
-        # What came in pieces has the time of its first one, and others may be between.
+        # A message in fragments has the time of the first one, and others may come between.
         first, after = sorted((last[1], received))
         self._gaps.append(_Gap(publisher, last[0] + 1, number, first, after))
         if len(self._gaps) > MAX_GAPS:
@@ -171,13 +168,13 @@ class PublicationGapDetector:
             del self._gaps[:half]
 
     def _fill(self, publisher: bytes, number: int) -> bool:
-        """Takes a late number out of the gap that waits for it."""
+        """Removes a late number from its waiting gap."""
         for at, gap in enumerate(self._gaps):
             if gap.publisher == publisher and gap.start <= number < gap.end:
                 rest = _Gap(publisher, number + 1, gap.end, gap.first, gap.last)
                 rest.looks = gap.looks
                 gap.end = number
-                # It speaks out of order, which need not be a loss.
+                # Messages come out of order, which need not be a loss.
                 self._jumped.pop(publisher, None)
                 self._gaps[at : at + 1] = [part for part in (gap, rest) if part.start < part.end]
                 return True
@@ -191,10 +188,10 @@ class PublicationGapDetector:
         self._sure[publisher] = Loss(publisher, count, first, last)
 
     def losses(self, *, final: bool = False) -> list[Loss]:
-        """What is lost for sure since the last call; to be called at each look.
+        """Confirmed losses since the last call; call it at each look at the graph.
 
         Args:
-            final: Nothing more will come: gaps do not wait any longer.
+            final: No further message follows, so gaps do not wait any longer.
         """
         waiting = []
         for gap in self._gaps:
@@ -209,13 +206,13 @@ class PublicationGapDetector:
         return found
 
     def reset(self) -> None:
-        """Forgets all numbers, and the gaps that nobody can be sure of any more."""
+        """Forgets all numbers and waiting gaps."""
         self._last.clear()
         self._jumped.clear()
         self._gaps.clear()
 
     def keep_only(self, publishers: Collection[bytes]) -> None:
-        """Forgets publishers that have gone, when there have been very many."""
+        """Forgets other publishers if there have been very many."""
         if len(self._last) > MAX_PUBLISHERS:
             self._last = {key: value for key, value in self._last.items() if key in publishers}
             self._jumped = {key: at for key, at in self._jumped.items() if key in publishers}

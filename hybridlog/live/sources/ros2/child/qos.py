@@ -1,8 +1,6 @@
-"""Quality of service: what publishers offer, what we ask for, whether both fit.
+"""Quality of service: offers of publishers, requests of subscriptions, conflicts.
 
-Policies are the numbers that rmw has for them, durations nanoseconds.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+Policies are the numbers of rmw, durations are nanoseconds.
 """
 
 from __future__ import annotations
@@ -18,19 +16,19 @@ TRANSIENT_LOCAL, VOLATILE = 1, 2
 AUTOMATIC, MANUAL_BY_TOPIC = 1, 3
 
 FOREVER = 2**63 - 1
-"""Duration that rmw takes for no limit, ns."""
+"""Duration that means no limit in rmw, ns."""
 
 DEPTH = 10_000
-"""Messages that the middleware keeps for us: a burst, while we are about something else.
+"""Messages that the middleware queues for a subscription, enough for a burst.
 
-It takes memory for those that are there only.
+The queue takes memory only for messages that it holds.
 """
 
 DEPTH_OF_ARRAYS = 1000
-"""The same for types that may be large: with arrays of any length."""
+"""The same for types with arrays of any length, which may be large."""
 
 DEPTH_OF_BYTES = 256
-"""The same for types that are large: with arrays of bytes, images and point clouds."""
+"""The same for types with byte arrays, such as images and point clouds, which are large."""
 
 _SECOND = 1_000_000_000
 
@@ -40,14 +38,14 @@ class Profile(NamedTuple):
 
     Attributes:
         history: `KEEP_LAST`, `KEEP_ALL`, or 0 or 3 when unknown.
-        depth: Messages that are kept, for `KEEP_LAST`.
+        depth: Length of the queue, for `KEEP_LAST`.
         reliability: `RELIABLE`, `BEST_EFFORT`, or another number that is unknown.
         durability: `TRANSIENT_LOCAL`, `VOLATILE`, or another number.
-        deadline: ns between two messages at most, 0 or `FOREVER` for no such promise.
-        lifespan: ns for which a message is worth being delivered.
+        deadline: Maximum time between two messages, ns; 0 or `FOREVER` for none.
+        lifespan: Time for which a message is delivered, ns.
         liveliness: `AUTOMATIC`, `MANUAL_BY_TOPIC`, or another number.
-        liveliness_lease_duration: ns until a silent publisher counts as dead.
-        avoid_ros_namespace_conventions: The topic has its plain name in DDS.
+        liveliness_lease_duration: Time after which a silent publisher counts as dead, ns.
+        avoid_ros_namespace_conventions: The DDS topic has the plain name.
     """
 
     history: int = KEEP_LAST
@@ -65,15 +63,15 @@ DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
 def request(offers: Sequence[Profile], depth: int, override: Mapping[str, Any]) -> Profile:
-    """What to ask for, so that all publishers are heard.
+    """A request that is compatible with all publishers.
 
-    The reliability and durability that all of them offer; no deadline, no lease, which
-    would only exclude some.
+    It has the reliability and durability that all of them offer. A deadline or a lease
+    would only exclude publishers.
 
     Args:
-        offers: What the publishers offer, at least one.
-        depth: Messages to keep.
-        override: Fields of `Profile` that the user wants otherwise.
+        offers: Profiles of the publishers, at least one.
+        depth: Length of the queue.
+        override: Fields of `Profile` that the user has set.
     """
     reliable = all(offer.reliability == RELIABLE for offer in offers)
     lasting = all(offer.durability == TRANSIENT_LOCAL for offer in offers)
@@ -86,7 +84,7 @@ def request(offers: Sequence[Profile], depth: int, override: Mapping[str, Any]) 
 
 
 def conflicts(offer: Profile, wanted: Profile) -> list[str]:
-    """Names of the policies because of which a publisher is not heard.
+    """Names of the policies that make a publisher incompatible.
 
     Args:
         offer: The publisher's.
@@ -107,12 +105,12 @@ def conflicts(offer: Profile, wanted: Profile) -> list[str]:
 
 
 def _limit(duration: int) -> int:
-    """A duration, where none is the longest of all."""
+    """A duration, with `FOREVER` for none."""
     return FOREVER if duration <= 0 else duration
 
 
 def offered_text(offers: Sequence[Profile]) -> str:
-    """What publishers offer, as the metadata of bags have it: a list in YAML."""
+    """Profiles of publishers as a YAML list, as in the metadata of bags."""
     lines: list[str] = []
     for offer in offers:
         mark = "- "

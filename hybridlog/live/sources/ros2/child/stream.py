@@ -1,9 +1,7 @@
-"""One topic and type that is recorded: its subscription, its channel, its gaps.
+"""The messages of one recorded topic and type: subscription, channel, lost messages.
 
-When a publisher comes that the subscription does not fit, a second one is made that
-fits all; for a while both run, and what both get is taken once.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+A new publisher may be incompatible with the subscription. Then a second subscription is
+made that is compatible with all. For a while both run, and repeated messages are dropped.
 """
 
 from __future__ import annotations
@@ -26,17 +24,17 @@ _AT_ONCE = 1000
 _BYTES_AT_ONCE = 8 << 20
 
 _DOUBT_S = 30.0
-"""So long after a subscription was made, kept messages may come that came before."""
+"""Time after a new subscription in which durable messages may come again, seconds."""
 
 _REPAIR_NS = 4_000_000_000
-"""So long after its last message a reliable publisher has said how many there were.
+"""Time in which a reliable publisher announces the number of its messages, ns.
 
-Fast DDS says so every three seconds.
+Fast DDS does so every three seconds.
 """
 
-_SAYS = "the middleware says so"
+_COUNTED = "as the middleware counts"
 _HEAD = "before the first message that came"
-_BEYOND = "before the first message that came or after the last, as the middleware says"
+_OUTSIDE = "before the first message that came or after the last, as the middleware counts"
 
 _OLDEST = 60_000_000_000
 _NEWEST = 1_000_000_000
@@ -44,17 +42,17 @@ _MAX_INT = 2**63 - 1
 
 
 class Stream:
-    """A stream of messages, from the middleware into the outbox.
+    """Moves the messages of a topic from the middleware into the outbox.
 
     Args:
-        subscription: Where they come from.
-        channel: Number of the channel that they belong to.
-        offers: The publishers that there are.
+        subscription: The subscription.
+        channel: Number of the channel.
+        offers: The present publishers.
 
     Attributes:
-        named: Messages tell their publisher; True until one does not.
-        numbered: Messages have gaps; True until one does not.
-        alone: The topic has had one and the same publisher since its gaps were begun.
+        named: Messages name their publisher; True until one does not.
+        numbered: Messages have numbers; True until one does not.
+        alone: The topic has had the same single publisher since its count began.
     """
 
     def __init__(self, subscription: Subscription, channel: int, offers: Sequence[Offer]) -> None:
@@ -74,20 +72,20 @@ class Stream:
 
     @property
     def subscriptions(self) -> list[Subscription]:
-        """All that are open, the older first: its messages must be taken before."""
+        """Open subscriptions, the older one first: its messages are taken first."""
         return [sub for sub in (self._old, self.subscription) if sub is not None]
 
     def replace(self, subscription: Subscription, seconds: float) -> None:
-        """Goes over to another subscription.
+        """Changes to another subscription.
 
         Args:
-            subscription: The new one, open already.
-            seconds: For how long the old one runs beside it. Where messages do not tell
-                who sent them, or have no gaps, nobody can say which of them come
-                twice: there it is closed as soon as it is empty.
+            subscription: The new, open subscription.
+            seconds: Time for which the old one runs beside it. If messages lack publisher
+                or number, repetitions cannot be detected; then the old one is closed as
+                soon as it is empty.
         """
         self.close_old()
-        self._hear()
+        self._count_losses()
         self._old, self.subscription = self.subscription, subscription
         now = time.monotonic()
         tells_twice = self.named and self.numbered
@@ -96,28 +94,28 @@ class Stream:
         self._doubt_until = now + _DOUBT_S
 
     def close_old(self) -> None:
-        """Closes the subscription that was gone over from."""
+        """Closes the old subscription."""
         if self._old is not None:
-            self._hear()
+            self._count_losses()
             self._old.close()
             self._old = None
 
-    def _hear(self) -> int:
-        """Hears what the middleware says it has lost; how many since the last call."""
-        told = self.subscription.losses()
-        # What two subscriptions have lost may have come through the other one.
+    def _count_losses(self) -> int:
+        """Adds the losses that the middleware counts; returns those since the last call."""
+        counted = self.subscription.losses()
+        # A message that one of two subscriptions lost may have come through the other.
         if self._old is None and self.subscription.tells_all:
-            self._middleware_losses.add(told)
-        return told
+            self._middleware_losses.add(counted)
+        return counted
 
     def take(self, outbox: Outbox) -> tuple[int, int]:
-        """Takes what is there, but no more than others can wait for.
+        """Takes available messages, up to a limit for the sake of other topics.
 
         Returns:
-            Messages and bytes.
+            Number of messages and bytes.
 
         Raises:
-            Exception: Whatever rclpy has against a message.
+            Exception: Any error of rclpy.
         """
         if self._old is not None:
             count, size = self._take(self._old, outbox)
@@ -143,26 +141,26 @@ class Stream:
             gid = info.get("publisher_gid")
             if gid is None:
                 self.named = False
-                publisher, judged = b"", self.alone and number >= 0
+                publisher, is_usable = b"", self.alone and number >= 0
             else:
-                publisher, judged = publisher_id(gid["data"]), number >= 0
-            if judged and publisher not in gaps:
+                publisher, is_usable = publisher_id(gid["data"]), number >= 0
+            if is_usable and publisher not in gaps:
                 self._begin(publisher, number, received)
-            if not judged or gaps.see(publisher, number, received):
+            if not is_usable or gaps.see(publisher, number, received):
                 sent = info["source_timestamp"]
                 put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
         return count, size
 
     def _begin(self, publisher: bytes, number: int, received: int) -> None:
-        """Looks for losses before the first message of a publisher."""
-        self._hear()
+        """Counts losses before the first message of a publisher."""
+        self._count_losses()
         if number > 1 and self._gaps.is_empty:
             lost = self._middleware_losses.before_first(number - 1)
             if lost:
                 self._heads.append(Loss(publisher, lost, received, received, _HEAD))
 
     def _number(self, info: dict[str, Any]) -> int:
-        """The publisher's number of a message, -1 when there is none."""
+        """The sequence number of a message, -1 without one."""
         number = info.get("publication_sequence_number")
         if number is None or not 0 <= number <= _MAX_INT:
             self.numbered = False
@@ -170,27 +168,27 @@ class Stream:
         return int(number)
 
     def has_caught_up(self, since: int) -> bool:
-        """Whether all publishers that spoke a moment before a time have spoken after it."""
+        """Tells whether all publishers that were active just before a time have sent after it."""
         return self._gaps.has_caught_up(since)
 
     def look(self, offers: list[Offer], *, final: int | None = None) -> list[Loss]:
-        """What has been lost for sure; to be called with each look at the graph.
+        """Confirmed losses since the last call; call it at each look at the graph.
 
         Args:
-            offers: The publishers that there are now.
-            final: When listening ended, ns since the epoch; None when it goes on.
+            offers: The present publishers.
+            final: End of the recording, ns since the epoch; None while it goes on.
         """
         now = time.time_ns()
-        told = self._hear()
+        counted = self._count_losses()
         if self.numbered:
             losses = self._losses(offers, now, final)
         else:
-            losses = [Loss(b"", told, now, now, _SAYS)] if told else []
+            losses = [Loss(b"", counted, now, now, _COUNTED)] if counted else []
         self._follow(offers)
         return losses
 
     def _losses(self, offers: list[Offer], now: int, final: int | None) -> list[Loss]:
-        """What the gaps show, and what the middleware knows besides."""
+        """Losses that the numbers show, and others that the middleware counts."""
         gaps, is_final = self._gaps, final is not None
         losses, self._heads = self._heads, []
         losses += self._suspects(offers, now if final is None else final, is_final=is_final)
@@ -200,21 +198,21 @@ class Stream:
             )
             if missing != 0:
                 losses.append(gap._replace(missing=missing))
-        beyond = self._middleware_losses.unexplained(gaps.waiting, final=is_final)
-        if beyond:
+        unexplained = self._middleware_losses.unexplained(gaps.waiting, final=is_final)
+        if unexplained:
             first = min(now, gaps.last_received or now)
-            # Gaps are looked for where it is known whose they are.
-            place = _BEYOND if self.named or self.alone else _SAYS
-            losses.append(Loss(b"", beyond, first, now, place))
+            # Gaps are found only if the publisher of messages is known.
+            place = _OUTSIDE if self.named or self.alone else _COUNTED
+            losses.append(Loss(b"", unexplained, first, now, place))
         return losses
 
     def _suspects(self, offers: list[Offer], silent: int, *, is_final: bool) -> list[Loss]:
-        """Losses of unknown number behind the last messages of those that have gone.
+        """Probable losses after the last messages of publishers that have disappeared.
 
         Args:
-            offers: The publishers that there are now.
-            silent: Since when the others are not heard any more, ns since the epoch.
-            is_final: None of them is.
+            offers: The present publishers.
+            silent: Time of their end, ns since the epoch.
+            is_final: The subscription ends, so all publishers count as gone.
         """
         gaps = self._gaps
         present = {offer.publisher for offer in offers}
@@ -231,7 +229,7 @@ class Stream:
         return found
 
     def _follow(self, offers: list[Offer]) -> None:
-        """Follows a change of publishers."""
+        """Updates the publishers."""
         if self._old is None and time.monotonic() >= self._doubt_until:
             self._gaps.is_doubled = False
         publishers = frozenset(offer.publisher for offer in offers)
@@ -245,21 +243,20 @@ class Stream:
         self._gaps.keep_only(publishers)
 
     def close(self) -> None:
-        """Closes its subscriptions."""
+        """Closes the subscriptions."""
         self.close_old()
         self.subscription.close()
 
 
 def _reliable(offers: Sequence[Offer]) -> frozenset[bytes]:
-    """Publishers that repeat what is lost, and say what they cannot repeat."""
+    """Reliable publishers, which repeat lost messages or announce them as lost."""
     return frozenset(o.publisher for o in offers if o.profile.reliability == RELIABLE)
 
 
 def _received(info: dict[str, Any]) -> int:
-    """When a message was received, ns since the epoch.
+    """Receive time of a message, ns since the epoch.
 
-    Not every middleware says so, and a clock that was set makes it say nonsense: then it
-    is now.
+    It is the present if the middleware does not provide it or the clock was set.
     """
     now = time.time_ns()
     received = info["received_timestamp"]

@@ -1,7 +1,4 @@
-"""Follows the graph: which topics there are, whom we listen to, with what quality.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
-"""
+"""Follows the ROS graph: topics, their publishers, and subscriptions to them."""
 
 from __future__ import annotations
 
@@ -29,24 +26,24 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
 
 MAX_TOPICS = 10_000
-"""Topics and types that are looked at; a graph with more is out of its mind."""
+"""Maximum number of topics and types; further ones are ignored."""
 
 _OVERLAP_S = 1.0
-_REMIND_S = 10.0
+_REPORT_S = 10.0
 
 
 class Topic:
-    """A topic and type that have, or had, publishers.
+    """A topic and type that has, or had, publishers.
 
     Attributes:
-        offers: The publishers.
-        is_wanted: The recorder wants it.
-        definition: Its definition, None before it is wanted, and when there is none.
-        stream: Its messages, None when it is not subscribed to.
-        nodes: Names of publishers' nodes, those that have gone too.
-        profiles: What publishers have offered while the channel was the same.
-        trouble: Why it cannot be subscribed to, empty when it can.
-        reminded: When the trouble was told last, by the monotonic clock.
+        offers: The present publishers.
+        is_wanted: The recorder wants the topic.
+        definition: Definition of the type, None if unknown.
+        stream: The messages, None without a subscription.
+        nodes: Names of the nodes of present and past publishers.
+        profiles: Profiles that publishers have offered for the current channel.
+        problem: The reason why it cannot be subscribed to, or an empty string.
+        reported_at: Monotonic time of the last report of the problem.
     """
 
     def __init__(self, name: str, kind: str) -> None:
@@ -58,22 +55,22 @@ class Topic:
         self.stream: Stream | None = None
         self.nodes: dict[bytes, str] = {}
         self.profiles: set[Profile] = set()
-        self.trouble = ""
-        self.reminded = 0.0
+        self.problem = ""
+        self.reported_at = 0.0
 
 
 class Topics:
-    """All topics, and what to do when they change.
+    """All topics of the graph; follows its changes.
 
     Args:
         middleware: ROS.
-        events: Who tells the recorder.
-        definitions: Where types are defined.
-        overrides: Fields of `Profile` by topic that the user wants otherwise.
+        events: Sends events to the recorder.
+        definitions: Definitions of types.
+        overrides: Fields of `Profile` by topic that the user has set.
 
     Attributes:
-        owners: By subscription, whose it is.
-        doubled: Those that have two subscriptions at the moment.
+        owners: Topic of each subscription.
+        doubled: Topics with two subscriptions.
     """
 
     def __init__(
@@ -94,28 +91,28 @@ class Topics:
         self._ended: int | None = None
 
     def end(self) -> None:
-        """The recorder wants what was sent until now, and no more."""
+        """Ends the recording: later messages do not matter."""
         self._ended = time.time_ns()
 
     def has_caught_up(self) -> bool:
-        """Whether, since the end, a message has come of all that spoke just before.
+        """Tells whether each publisher that was active at the end has sent once more.
 
-        Only the next message shows what is missing before it.
+        Only the next message shows a gap before it.
         """
         since = self._ended
         streams = [topic.stream for topic in self._live if topic.stream is not None]
         return since is None or all(stream.has_caught_up(since) for stream in streams)
 
     def look(self) -> None:
-        """Looks at the graph, follows its changes, and tells what has been lost."""
+        """Looks at the graph, follows its changes, and reports losses."""
         found = self._middleware.publishers()
-        for name, reason in self._middleware.odd.items():
-            self._events.say(f"{name!r} is left out, ROS cannot subscribe to it: {reason}")
+        for name, reason in self._middleware.invalid.items():
+            self._events.say(f"{name!r} is ignored, ROS cannot subscribe to it: {reason}")
         for key, offers in found.items():
             topic = self._topics.get(key)
             if topic is None:
                 if len(self._topics) >= MAX_TOPICS:
-                    self._events.say(f"more than {MAX_TOPICS} topics; the rest is left out")
+                    self._events.say(f"more than {MAX_TOPICS} topics; the rest is ignored")
                     continue
                 topic = self._topics[key] = Topic(*key)
                 self._events.candidate(*key)
@@ -128,7 +125,7 @@ class Topics:
         self.account()
 
     def _without_publishers(self, topic: Topic) -> None:
-        """A subscription stays: it hears the next publisher from its first message on."""
+        """Handles a topic without publishers; its subscription stays for the next one."""
         had, topic.offers = bool(topic.offers), []
         if topic.stream is None:
             del self._topics[topic.name, topic.kind]
@@ -138,57 +135,57 @@ class Topics:
                 self._events.gone(topic.name)
 
     def _update(self, topic: Topic, before: list[Offer]) -> None:
-        """Follows a change of a wanted topic's publishers."""
+        """Handles the publishers of a wanted topic."""
         if len(before) != len(topic.offers):
             self._events.publishers(topic.name, topic.kind, len(topic.offers))
         stream = topic.stream
         if stream is None:
-            self._remind(topic)
+            self._report_problem(topic)
             return
         known = {offer.publisher for offer in before}
         if any(offer.publisher not in known for offer in topic.offers):
-            self._fit(topic, stream, is_first=not before)
+            self._adapt(topic, stream, is_first=not before)
         self._check(topic, stream, known)
 
-    def _fit(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
-        """Fits a subscription to new publishers."""
+    def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
+        """Adapts a subscription to new publishers."""
         asked, wanted = stream.subscription.profile, self._wanted(topic)
-        unheard = any(conflicts(offer.profile, asked) for offer in topic.offers)
-        if wanted != asked and (unheard or is_first):
-            self._go_over(topic, stream, wanted)
+        is_incompatible = any(conflicts(offer.profile, asked) for offer in topic.offers)
+        if wanted != asked and (is_incompatible or is_first):
+            self._resubscribe(topic, stream, wanted)
         if not {offer.profile for offer in topic.offers} <= topic.profiles:
             stream.channel = self._open_channel(topic)
 
-    def _go_over(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
-        """Subscribes anew, with what fits all publishers."""
+    def _resubscribe(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
+        """Subscribes again, with a profile that is compatible with all publishers."""
         try:
             found = self._middleware.subscribe(topic.name, parse_type(topic.kind), wanted)
         except Exception as error:
-            self._events.say(f"{topic.name}: new publishers cannot be heard: {error}")
+            self._events.say(f"{topic.name}: cannot subscribe to new publishers: {error}")
             return
         stream.replace(found, _OVERLAP_S)
         self._list()
 
     def _check(self, topic: Topic, stream: Stream, known: Collection[bytes]) -> None:
-        """Says who is not heard, and whose messages may not be what they seem.
+        """Reports incompatible publishers and different versions of the type.
 
         Args:
-            topic: Which.
+            topic: The topic.
             stream: Its messages.
-            known: Publishers that were there at the last look: names come late.
+            known: Publishers of the last look; names of new ones come late.
         """
         for offer in topic.offers:
             reasons = conflicts(offer.profile, stream.subscription.profile)
             if reasons and offer.publisher in known:
                 self._events.say(
-                    f"{topic.name}: {offer.node or 'a publisher'} cannot be heard, its "
-                    f"{' and '.join(reasons)} is less than the QoS overrides ask for; "
-                    "take that out of the file"
+                    f"{topic.name}: {offer.node or 'a publisher'} is incompatible: its "
+                    f"{' and '.join(reasons)} does not satisfy the QoS overrides; change that "
+                    "in the file"
                 )
         if len(_hashes(topic)) > 1:
             self._events.say(
                 f"{topic.name}: its publishers have different versions of {topic.kind}; "
-                "the definition is the one that is installed here"
+                "the installed definition is recorded"
             )
 
     def _wanted(self, topic: Topic) -> Profile:
@@ -199,7 +196,7 @@ class Topics:
         return request([offer.profile for offer in topic.offers], depth, override)
 
     def subscribe(self, name: str, kind: str) -> None:
-        """The recorder wants a topic."""
+        """Subscribes to a topic that the recorder wants."""
         topic = self._topics.get((name, kind))
         if topic is None or topic.is_wanted:
             return
@@ -212,7 +209,7 @@ class Topics:
             self._refuse(topic, str(error))
             return
         except Exception as error:
-            # rclpy has errors of many kinds; each leaves this topic out and no other.
+            # rclpy raises errors of many kinds; each concerns only this topic.
             self._refuse(topic, f"rclpy cannot subscribe: {error or type(error).__name__}")
             return
         topic.stream = Stream(found, self._open_channel(topic), topic.offers)
@@ -220,7 +217,7 @@ class Topics:
         self._list()
 
     def _list(self) -> None:
-        """Notes which subscriptions there are."""
+        """Updates `owners` and `doubled`."""
         self.owners.clear()
         self.doubled.clear()
         for topic in self._live:
@@ -231,7 +228,7 @@ class Topics:
                 self.doubled.append(topic)
 
     def _open_channel(self, topic: Topic) -> int:
-        """Tells of a channel; the number that its messages have."""
+        """Announces a channel, and returns its number."""
         assert topic.definition is not None
         profiles = [offer.profile for offer in topic.offers]
         topic.profiles.update(profiles)
@@ -240,24 +237,24 @@ class Topics:
         offered = offered_text(profiles)
         return self._events.channel(topic.name, topic.kind, topic.definition, offered, type_hash)
 
-    def _refuse(self, topic: Topic, trouble: str) -> None:
-        topic.trouble = trouble
-        topic.reminded = -_REMIND_S
-        self._events.say(f"{topic.name}: {topic.kind} cannot be recorded: {trouble}")
-        self._remind(topic)
+    def _refuse(self, topic: Topic, problem: str) -> None:
+        topic.problem = problem
+        topic.reported_at = -_REPORT_S
+        self._events.say(f"{topic.name}: {topic.kind} cannot be recorded: {problem}")
+        self._report_problem(topic)
 
-    def _remind(self, topic: Topic) -> None:
-        """What a topic says that cannot be read is lost as long as it has publishers."""
+    def _report_problem(self, topic: Topic) -> None:
+        """Reports, now and then, that the messages of a topic without subscription are lost."""
         now = time.monotonic()
-        if topic.trouble and now - topic.reminded >= _REMIND_S:
-            topic.reminded = now
-            self._events.lost(topic.name, "unreadable", None, detail=topic.trouble)
+        if topic.problem and now - topic.reported_at >= _REPORT_S:
+            topic.reported_at = now
+            self._events.lost(topic.name, "unreadable", None, detail=topic.problem)
 
     def account(self, *, final: bool = False) -> None:
-        """Tells what has been lost on the way and at our own door.
+        """Reports losses in transport and in the outbox.
 
         Args:
-            final: Nothing more will come.
+            final: The recording ends.
         """
         self._list()
         ended = (self._ended or time.time_ns()) if final else None
@@ -279,12 +276,12 @@ class Topics:
             self._events.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
         if not (stream.numbered or stream.subscription.tells_losses):
             self._events.say(
-                "this ROS gives messages no numbers, so losses on the way cannot be counted"
+                "this ROS does not number messages, so losses in transport cannot be counted"
             )
         if not stream.named and stream.numbered and len(topic.offers) > 1:
             self._events.say(
-                f"{topic.name}: this rclpy does not tell the messages of its publishers apart, so "
-                "losses on the way cannot be counted there; ROS 2 Kilted does"
+                f"{topic.name}: this rclpy does not name the publishers of messages, so losses "
+                "in transport cannot be counted; ROS 2 Kilted names them"
             )
 
 

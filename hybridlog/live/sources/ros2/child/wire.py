@@ -1,12 +1,10 @@
-"""How the child in the ROS environment and the recorder speak with each other.
+"""Protocol between the child in the ROS environment and the recorder.
 
-Both ends are from one installation, on one machine, over one socket. From the child come
-frames: kind and length, then the body. Messages are packed by the hundred, large ones go
-alone, so that the reader can take a payload from the socket without a copy in between.
-All else is an object in JSON. To the child go lines of JSON; the end of its input is its
-order to hand over what it has, and to end.
-
-Runs under Python 3.10 as well, with nothing but the standard library.
+Both ends come from one installation and share one socket. The child sends frames: kind and
+length, then the body. Small messages are packed by the hundred. Large ones have their own
+frame, so that the reader can receive a payload without a copy. Everything else is a JSON
+object. The recorder sends lines of JSON. At the end of its input the child passes on its
+remaining messages and ends.
 """
 
 from __future__ import annotations
@@ -16,65 +14,65 @@ import struct
 from typing import Any
 
 EVENT = 1
-"""Body: an object in JSON; its `event` says what it tells."""
+"""Body: a JSON object; its `event` names the kind of event."""
 
 MESSAGES = 2
-"""Body: how many (uint32), an `ENTRY` for each, then their payloads one after the other."""
+"""Body: number of messages (uint32), an `ENTRY` for each, then their payloads."""
 
 MESSAGE = 3
-"""Body: one `ENTRY`, then its payload."""
+"""Body: one `ENTRY`, then the payload."""
 
 HEADER = struct.Struct("<II")
-"""Kind and length of the body, bytes."""
+"""Kind of the frame, and length of its body in bytes."""
 
 COUNT = struct.Struct("<I")
 
 ENTRY = struct.Struct("<IIqqq")
-"""Channel, bytes of payload, received and sent (ns since the epoch), the sender's number.
+"""Channel, payload bytes, receive and send time (ns since the epoch), sequence number.
 
-`sent` is 0 and the number -1 where the middleware knows none.
+The send time is 0 and the number -1 if the middleware does not know them.
 """
 
 MAX_PAYLOAD = 1 << 30
-"""Bytes of the largest message that is handed over."""
+"""Bytes of the largest payload."""
 
 MAX_BATCH = 16 << 20
-"""Bytes of the largest body of a frame that holds many messages or an event."""
+"""Bytes of the largest body of a frame with several messages or an event."""
 
 LARGE = 32 << 10
-"""Payloads from this many bytes on travel alone."""
+"""Payloads from this size on have their own frame, bytes."""
 
 
 class WireError(Exception):
-    """The other end says what it must not."""
+    """The other end violates the protocol."""
 
 
 def event_frame(event: dict[str, Any]) -> bytes:
-    """An event as it travels."""
+    """The frame of an event."""
     body = json.dumps(event).encode("ascii")
     return HEADER.pack(EVENT, len(body)) + body
 
 
 def parse_object(body: bytes) -> dict[str, Any]:
-    """The object that a line or the body of an event is.
+    """Parses a JSON object.
 
     Raises:
-        WireError: It is none.
+        WireError: The text is not a JSON object.
     """
     try:
         found = json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise WireError(f"what should be JSON is not: {error}") from error
+        raise WireError(f"invalid JSON: {error}") from error
     if not isinstance(found, dict):
-        raise WireError("a JSON value that is no object")
+        raise WireError("a JSON value that is not an object")
     return found
 
 
 def check_frame(kind: int, length: int) -> None:
-    """Believes a frame's header, or not.
+    """Checks the header of a frame.
 
     Raises:
-        WireError: No such kind, or a body that cannot be so short or so long.
+        WireError: The kind is unknown, or the length is impossible.
     """
     if kind == EVENT:
         low, high = 2, MAX_BATCH
@@ -83,6 +81,6 @@ def check_frame(kind: int, length: int) -> None:
     elif kind == MESSAGE:
         low, high = ENTRY.size, ENTRY.size + MAX_PAYLOAD
     else:
-        raise WireError(f"a frame of kind {kind}, which does not exist")
+        raise WireError(f"a frame of unknown kind {kind}")
     if not low <= length <= high:
-        raise WireError(f"a frame of kind {kind} and {length} bytes, more or less than can be")
+        raise WireError(f"a frame of kind {kind} with an impossible length of {length} bytes")
