@@ -54,9 +54,7 @@ _INDEX_DELAY = 4  # flush intervals for which small chunks wait to be indexed to
 _INDEX_DELAY_S = 4.0  # at most so many seconds
 _LARGE_AT_WORK = 3  # large chunks in normal operation: two in compression, one being written
 _INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
-_SKIP_COMPRESSION_AT = (
-    8 << 20
-)  # unwritten bytes above which only chunks that shrink a lot are packed
+_SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
 _DELAY_INDEX_AT = 32 << 20  # above it the index waits, and later reads chunks again
 _MAX_COPYING = 2  # threads that copy large messages at the same time
 _NO_LIMIT = nullcontext()
