@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class Backpressure:
     """What whoever cannot wait asks of segments and index.
 
     Attributes:
@@ -77,7 +77,7 @@ class Capture:
         tags: Kept with it.
         source: What its messages come from, as the catalog shows it.
         settings: How segments are cut and packed.
-        pace: Of whoever appends, if it cannot wait for compression, disk and index.
+        pressure: Of whoever appends, if it cannot wait for compression, disk and index.
         check: Called with the catalog before anything is made, while nobody else can
             start a recording; raises to refuse.
 
@@ -97,7 +97,7 @@ class Capture:
         tags: Mapping[str, str],
         source: Mapping[str, Any],
         settings: SegmentSettings,
-        pace: Pace | None = None,
+        pressure: Backpressure | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = catalog
@@ -114,7 +114,9 @@ class Capture:
             self._held = self._held.pop_all()
         self.indexer = ChunkIndexer(self.entry.id)
         recording = directory.recording(self.entry.label)
-        lag = Lag(recording, pace.behind, pace.has_room, pace.renew, pace.spare) if pace else None
+        lag = None
+        if pressure:
+            lag = Lag(recording, pressure.behind, pressure.has_room, pressure.renew, pressure.spare)
         self._tables = TableWriter(directory.path, self.entry.id)
         self.index = IndexWriter(self.indexer, database, lag=lag, tables=self._tables)
         self._held.callback(self.index.release)
@@ -124,10 +126,10 @@ class Capture:
             self.index.submit,
             settings,
             on_sealing=self._announce,
-            hurry=pace.hurry if pace else None,
-            next_chunk_size=pace.next_chunk_size if pace else None,
-            spare=pace.spare if pace else None,
-            on_written=pace.on_written if pace else None,
+            hurry=pressure.hurry if pressure else None,
+            next_chunk_size=pressure.next_chunk_size if pressure else None,
+            spare=pressure.spare if pressure else None,
+            on_written=pressure.on_written if pressure else None,
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:

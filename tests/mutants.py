@@ -145,7 +145,7 @@ MUTANTS = [
         "hybridlog/live/recording.py",
         (
             "chunks-flushed-three-intervals-late",
-            "flush_older(interval * _FLUSHED - 2 * tick)",
+            "flush_older(interval * _FLUSH_AT - 2 * tick)",
             "flush_older(3 * interval)",
             "tests/live/test_recording.py::test_chunks_are_flushed_within_the_interval",
         ),
@@ -173,30 +173,30 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/live_sources/foxglove_session.py",
+        "hybridlog/live/sources/foxglove/session.py",
         (
             "gaps-are-dropped-when-a-server-leaves",
-            "                numbers.finish()\n",
+            "                self._report(channel.topic, gaps.finish())\n",
             "                pass\n",
-            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+            "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
     ),
     *_of(
-        "hybridlog/live_sources/foxglove_numbers.py",
+        "hybridlog/live/sources/sequence_gaps.py",
         (
             "a-gap-of-a-server-begins-at-its-end",
-            "self._first = self._time",
-            "self._first = received",
-            "tests/live_sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
+            "self.jump(number, self._received, received)",
+            "self.jump(number, received, received)",
+            "tests/live/sources/test_foxglove.py::test_gaps_of_header_numbers_are_rows",
         ),
     ),
     *_of(
-        "hybridlog/live_sources/ros1_stream.py",
+        "hybridlog/live/sources/ros1/stream.py",
         (
             "a-gap-of-a-publisher-begins-at-its-end",
-            "                count,\n                first=self._last,\n",
-            "                count,\n                first=now,\n",
-            "tests/live_sources/test_ros1_parts.py::test_dropped_messages_are_counted",
+            "                    gaps.jump(number, self._last, now)\n",
+            "                    gaps.jump(number, now, now)\n",
+            "tests/live/sources/test_ros1_parts.py::test_dropped_messages_are_counted",
         ),
     ),
     *_of(

@@ -183,11 +183,11 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
         store.topic("/imu/data").fields("header.seq").to_pandas()
 
     def record_live(store: hl.Store) -> None:
-        from hybridlog.live.door import Door, running
+        from hybridlog.live.control_server import ControlServer, running
 
         running(path)
         with suppress(StoreError):
-            Door(path, "live", {}).close()
+            ControlServer(path, "live", {}).close()
         store.start("live").close()
 
     def record(store: hl.Store) -> None:

@@ -22,7 +22,7 @@ def complete_recording(context: typer.Context, incomplete: str) -> list[str]:
 
 def complete_running(context: typer.Context, incomplete: str) -> list[str]:
     """Recorders that run now, by the beginning of their id."""
-    from hybridlog.live.door import running
+    from hybridlog.live.control_server import running
 
     with _nothing_on_error():
         return [name for name in running(_store(context).path) if name.startswith(incomplete)]

@@ -13,7 +13,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.live.snapshots import SnapshotOptions
-    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.live.sources.base import LiveSource
     from hybridlog_storage.segment_writer import SegmentSettings
 
 _SOURCES: Final = frozenset({"ros1", "ros2", "foxglove", "replay"})
@@ -114,7 +114,7 @@ def recorder_options(
         UsageError: An option that makes no sense.
         TopicError: A pattern that is malformed.
     """
-    from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
+    from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
@@ -137,9 +137,9 @@ def recorder_options(
         max_messages=live.max_messages,
         max_bytes=None if live.max_size is None else _size("--max-size", live.max_size, 1),
         reserve_bytes=_size("--reserve", live.reserve),
-        budget_bytes=usual_budget()
+        budget_bytes=default_budget()
         if live.budget is None
-        else _size("--budget", live.budget, LEAST_ASKED_FOR),
+        else _size("--budget", live.budget, MIN_USER_BUDGET),
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(live),
@@ -215,19 +215,19 @@ def sources_of(live: LiveChoices) -> list[LiveSource]:
     """
     found: list[LiveSource] = []
     if live.ros1:
-        from hybridlog.live_sources.ros1 import Ros1Source
+        from hybridlog.live.sources.ros1.source import Ros1Source
 
         found.append(Ros1Source(live.master))
     if live.ros2:
-        from hybridlog.live_sources.ros2 import Ros2Source
+        from hybridlog.live.sources.ros2.source import Ros2Source
 
         found.append(Ros2Source(qos_overrides=live.qos))
     if live.foxglove is not None:
-        from hybridlog.live_sources.foxglove import FoxgloveSource
+        from hybridlog.live.sources.foxglove.source import FoxgloveSource
 
         found.append(FoxgloveSource(live.foxglove))
     if live.replay is not None:
-        from hybridlog.live_sources.replay import ReplaySource
+        from hybridlog.live.sources.replay import ReplaySource
 
         found.append(ReplaySource(live.replay, speed=live.speed))
     return found

@@ -22,7 +22,7 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from hybridlog.live.policy import Rule
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
-    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.live.sources.base import LiveSource
     from hybridlog.recorder import RecordReport
 
 _MOST_ROWS = 10  # of the ledger that are told at the end; `losses` has all

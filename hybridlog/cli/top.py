@@ -45,7 +45,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Show a recorder's state until it ends, or Ctrl-C; once, where nobody watches."""
-    from hybridlog.live.door import choose, states
+    from hybridlog.live.control_server import choose, states
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
 
@@ -137,14 +137,14 @@ def _values_of_ring(
     span: int,
 ) -> list[dict[str, Any]]:
     """The same out of the memory of a recorder that stores nothing until it must."""
-    from hybridlog.live.door import visit
+    from hybridlog.live.control_server import request
 
     since = time.time_ns() - span
     return [
         {
             "topic": topic,
             "field": field.path,
-            **visit(store, recorder, "numbers", topic=topic, path=field.path, begin=since),
+            **request(store, recorder, "numbers", topic=topic, path=field.path, begin=since),
         }
         for topic, field in _resolved(state, fields)
     ]

@@ -1,4 +1,4 @@
-"""Recording a running robot: what is taken, what is given up, and how that is told."""
+"""The recorder of a running robot: policies, snapshots, statistics, control socket, sources."""
 
 from hybridlog.live.recording import LiveOptions, LiveRecording
 

@@ -1,4 +1,4 @@
-"""How much memory a live recording may use for what is not written yet."""
+"""The default memory budget of a live recording."""
 
 from __future__ import annotations
 
@@ -8,39 +8,38 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-LEAST = 64 << 20
-MOST = 2 << 30
-LEAST_ASKED_FOR = 1 << 20
-"""Bytes that whoever says a budget must give."""
+MIN_BUDGET = 64 << 20
+MAX_BUDGET = 2 << 30
+MIN_USER_BUDGET = 1 << 20
+"""Smallest budget that a user may choose, bytes."""
 _SHARE = 16
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 @cache
-def usual_budget() -> int:
-    """Bytes: a sixteenth of the memory there is, `LEAST` at least and `MOST` at most.
+def default_budget() -> int:
+    """A sixteenth of the machine's memory in bytes, from `MIN_BUDGET` to `MAX_BUDGET`.
 
-    A disk that is slower than what comes for some seconds then costs nothing, and whatever
-    else runs on the robot keeps its memory. A limit of the container or service counts as
-    the memory there is.
+    It bridges some seconds of a slow disk, and leaves memory to other programs of the
+    robot. A memory limit of the container or service counts as the machine's memory.
     """
-    return min(max(memory_bytes() // _SHARE, LEAST), MOST)
+    return min(max(memory_bytes() // _SHARE, MIN_BUDGET), MAX_BUDGET)
 
 
 def memory_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUPS) -> int:
-    """Bytes of memory that this process may use, of the machine or of its control group.
+    """Bytes of memory that the machine has, or that this process's control group allows.
 
     Args:
-        root: Where control groups (version 2) are mounted.
-        own: What names the group of this process.
+        root: Mount point of control groups (version 2).
+        own: File that names the group of this process.
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min([machine, *_limits(root, own)])
 
 
 def _limits(root: Path, own: Path) -> Iterator[int]:
-    """Memory limits of the group and of those that it is in; none where there are no groups."""
+    """Memory limits of the group and its parents; nothing on a system without groups."""
     try:
         lines = own.read_text().splitlines()
     except OSError:

@@ -1,7 +1,7 @@
-"""What to keep when not everything can be kept, or is wanted.
+"""Policies for dropping messages or payloads: throttles and priorities.
 
-A throttle thins a topic out at all times. Priorities say who gives up payloads first when
-the memory budget fills, which happens when more comes than the disk takes.
+A throttle limits a topic's rate at all times. Priorities decide which topics drop payloads
+first when the memory budget fills, because messages come faster than the disk writes.
 """
 
 from __future__ import annotations
@@ -15,61 +15,61 @@ from enum import IntEnum
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog_storage.errors import UsageError
 
-SMALL = 4096
-"""Payload bytes up to which a message is never reduced: that would save next to nothing."""
+SMALL_BYTES = 4096
+"""Messages up to this payload size stay whole: reducing them saves next to nothing."""
 
-EVERY = 5
-"""Of the payloads of a topic that is thinned out, one in so many is kept."""
+PAYLOAD_STRIDE = 5
+"""A topic under pressure keeps one payload in so many."""
 
 _RATE = re.compile(r"(\d+(?:\.\d+)?)\s*(?:hz)?", re.IGNORECASE)
 _HIGHEST_HZ = 1e6
 
 
 class Priority(IntEnum):
-    """How long a topic keeps its payloads while the memory budget fills."""
+    """Priority of a topic's payloads while the memory budget fills."""
 
     LOW = 0
     NORMAL = 1
     HIGH = 2
 
 
-class Keep(IntEnum):
-    """What is kept of a message."""
+class Retention(IntEnum):
+    """The parts of a message that are stored: all, all of every nth message, or fields only."""
 
     ALL = 0
     EVERY_NTH = 1
     FIELDS = 2
 
 
-# Share of the budget from which each priority keeps one payload in `EVERY`, then none.
-_STEPS = {
+# Shares of the budget above which a priority keeps one payload in `PAYLOAD_STRIDE`, then none.
+_THRESHOLDS = {
     Priority.LOW: (0.50, 0.70),
     Priority.NORMAL: (0.70, 0.85),
     Priority.HIGH: (0.85, 0.95),
 }
 
 
-def step(priority: Priority, filled: float) -> Keep:
-    """What is kept of large messages of a priority.
+def retention(priority: Priority, filled: float) -> Retention:
+    """The parts of large messages that are stored.
 
     Args:
-        priority: Their topic's.
-        filled: Share of the memory budget that is spent.
+        priority: Priority of their topic.
+        filled: Used share of the memory budget.
     """
-    thin, none = _STEPS[priority]
+    thin, none = _THRESHOLDS[priority]
     if filled < thin:
-        return Keep.ALL
-    return Keep.EVERY_NTH if filled < none else Keep.FIELDS
+        return Retention.ALL
+    return Retention.EVERY_NTH if filled < none else Retention.FIELDS
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Something that holds for topics that fit a pattern.
+    """A setting for the topics that match a pattern.
 
     Attributes:
         pattern: As the user wrote it.
-        fits: Says whether a topic fits.
-        value: What holds.
+        fits: Tells whether a topic matches.
+        value: A rate in Hz, or a `Priority`.
     """
 
     pattern: str
@@ -78,66 +78,66 @@ class Rule:
 
 
 def throttle_rule(pattern: str, rate: str) -> Rule:
-    """At most so many messages a second, as `5Hz`, `0.5`.
+    """A rule that limits topics to a rate such as `5Hz` or `0.5`.
 
     Raises:
-        UsageError: It is no rate.
+        UsageError: The rate is malformed.
         TopicError: The pattern is malformed.
     """
     found = _RATE.fullmatch(rate.strip())
     hz = float(found[1]) if found else 0.0
     if not 0 < hz <= _HIGHEST_HZ:
-        raise UsageError(f"{rate!r} is no rate: write how many messages a second, such as 5Hz.")
+        raise UsageError(f"{rate!r} is no rate: give messages a second, such as 5Hz.")
     return Rule(pattern, matcher([pattern]), hz)
 
 
 def priority_rule(pattern: str, word: str) -> Rule:
-    """`low`, `normal` or `high` for topics that fit.
+    """A rule that gives topics the priority `low`, `normal` or `high`.
 
     Raises:
-        UsageError: Another word.
+        UsageError: The priority is unknown.
         TopicError: The pattern is malformed.
     """
     try:
         return Rule(pattern, matcher([pattern]), Priority[word.strip().upper()])
     except KeyError:
-        raise UsageError(f"{word!r} is no priority: low, normal and high there are.") from None
+        raise UsageError(f"Unknown priority {word!r}; choose low, normal or high.") from None
 
 
 def first_fit(rules: Sequence[Rule], topic: str) -> float | None:
-    """The value of the first rule that a topic fits, None when it fits none."""
+    """The value of the first rule that matches a topic, None if none does."""
     found = [rule.value for rule in rules if rule.fits(topic)]
     return found[0] if found else None
 
 
 class Throttle:
-    """Lets through at most so many messages a second, evenly.
+    """Limits a topic to a rate, with even intervals between messages.
 
-    The time is the messages' own receive time. A message may come half an interval early,
-    so that a topic of 10 Hz that jitters gives 5 Hz, and not 3.3.
+    Time is the messages' receive time. A message may come a quarter of an interval early.
+    Without that tolerance a jittering topic of 10 Hz gives 3.3 Hz instead of 5.
 
     Args:
-        hz: How many.
+        hz: The rate.
     """
 
     def __init__(self, hz: float) -> None:
         self._interval = math.ceil(1e9 / hz)
         self._slack = self._interval // 4
-        self._due = self._anew = -2 * self._interval  # long ago: the next one is kept
+        self._due = self._reset = -2 * self._interval  # long ago: the next message passes
         self._last = 0
 
     def lets_through(self, received: int) -> bool:
-        """Whether a message is kept.
+        """Tells whether a message is stored.
 
         Args:
-            received: When it came, ns since the epoch.
+            received: Its receive time, ns since the epoch.
         """
         if received < self._last - self._interval:
-            self._due = self._anew  # the clock was set back
+            self._due = self._reset  # the clock was set back
         self._last = received
         if received < self._due - self._slack:
             return False
-        # From when it was due, not from when it came, or the rate would sag.
+        # The interval starts when the message was due: from its arrival the rate would sag.
         late = received - self._due
         self._due = (self._due if late < self._interval else received) + self._interval
         return True

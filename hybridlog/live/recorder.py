@@ -1,8 +1,7 @@
-"""The recorder of a running robot: what sources hand over becomes a recording.
+"""The recorder of a running robot: writes the messages of live sources into a recording.
 
-`Recorder` is the sink of its sources. It counts every message before anything can happen
-to it, so that at the end, for each topic, what was received is what was stored, and what
-the ledger says.
+`Recorder` is the sink of its sources. It counts every message on arrival. So for each
+topic the received messages are the stored ones plus those in the loss ledger.
 """
 
 from __future__ import annotations
@@ -16,9 +15,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.live.budget import usual_budget
-from hybridlog.live.door import Door
-from hybridlog.live.policy import EVERY, SMALL, Keep, Priority, Rule, Throttle, first_fit, step
+from hybridlog.live.budget import default_budget
+from hybridlog.live.control_server import ControlServer
+from hybridlog.live.policy import (
+    PAYLOAD_STRIDE,
+    SMALL_BYTES,
+    Priority,
+    Retention,
+    Rule,
+    Throttle,
+    first_fit,
+    retention,
+)
 from hybridlog.live.recording import LiveOptions, LiveRecording, indexed_within_s
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
@@ -30,37 +38,37 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
-    from hybridlog.live_sources.base import LiveSource
+    from hybridlog.live.sources.base import LiveSource
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordReport
     from hybridlog.store import Store
 
 _LOOK_S = 1.0
 _JUMP_S = 0.5
-_MOST_SAID = 1000
-_MOST_LANES = 4096  # channel objects whose lane is found at once
-_MOST_EXPECTED = 1000  # channels that get a collection before they have said anything
+_MAX_REPORTS = 1000
+_MAX_CACHED = 4096  # channel objects that are found without comparing their content
+_MAX_EXPECTED = 1000  # channels that get a collection before their first message
 _SEQUENCES = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderOptions:
-    """What to record of a robot, and how.
+    """Options of a recorder.
 
     Attributes:
         name: Name of the recording.
-        tags: Kept with it.
-        matcher: Which topics; None for all.
-        throttles: Topics that are thinned out, Hz; the first that fits counts.
-        priorities: Who keeps payloads longest under pressure; the first that fits counts.
-        duration_s: Stop after so long.
-        max_messages: Stop when so many are stored.
-        max_bytes: Stop when payloads of so many bytes are stored.
-        reserve_bytes: Stop when the disk has less than this left.
+        tags: Tags of the recording.
+        matcher: Selects topics; None for all.
+        throttles: Maximum rates of topics, Hz; the first matching rule applies.
+        priorities: Priorities of topics under pressure; the first matching rule applies.
+        duration_s: Stop after this time.
+        max_messages: Stop after this number of messages.
+        max_bytes: Stop after this number of payload bytes.
+        reserve_bytes: Stop when the disk has less free space.
         budget_bytes: Payload bytes that may be in memory.
-        flush_interval_s: What a `kill -9` can cost, seconds.
-        settings: How segments are cut and packed.
-        snapshots: Keep only what lies around triggers; None to keep everything.
+        flush_interval_s: Seconds of messages that a `kill -9` can cost.
+        settings: Settings of segments and chunks.
+        snapshots: Store only messages around triggers; None to store everything.
     """
 
     name: str = "live"
@@ -72,13 +80,13 @@ class RecorderOptions:
     max_messages: int | None = None
     max_bytes: int | None = None
     reserve_bytes: int = 1 << 30
-    budget_bytes: int = field(default_factory=usual_budget)
+    budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
     snapshots: SnapshotOptions | None = None
 
     def __post_init__(self) -> None:
-        """Refuse bounds that would stop before the start."""
+        """Refuse limits that would stop the recorder at once."""
         for name in ("duration_s", "max_messages", "max_bytes"):
             bound = getattr(self, name)
             if bound is not None and not bound > 0:
@@ -87,22 +95,22 @@ class RecorderOptions:
 
 @dataclass(frozen=True, slots=True)
 class RecorderState:
-    """A recorder at one look.
+    """State of a recorder at one time.
 
     Attributes:
-        name: Of the recorder: the label of its recording.
-        elapsed_s: Since it was started.
-        topics: Each topic that has publishers or has said something, by name.
-        messages: Received so far.
+        name: Name of the recorder: the label of its recording.
+        elapsed_s: Seconds since its start.
+        topics: Topics with publishers or messages, by name.
+        messages: Messages received so far.
         stored: Messages in chunks, or on their way to the disk.
         lost: Messages lost so far, by cause, as far as they can be counted.
-        filled: Share of the memory budget that is spent, 0 to 1.
-        lag: Messages that are not in the index yet.
-        late: Of these, those that have waited longer than messages of slow topics do.
-        index_failure: Why the index does not go on; empty while it does.
-        free_bytes: What the disk has left.
+        filled: Used share of the memory budget, 0 to 1.
+        lag: Messages that are not indexed yet.
+        late: Of these, the overdue ones: they wait longer than messages of slow topics do.
+        index_failure: The error that stopped the index; empty while it works.
+        free_bytes: Free space of the disk.
         stored_bytes: Payload bytes stored so far.
-        snapshots: Snapshots so far; None when everything is kept.
+        snapshots: Snapshots so far; None when everything is stored.
     """
 
     name: str
@@ -121,8 +129,8 @@ class RecorderState:
 
 
 @dataclass(slots=True)
-class _Lane:
-    """What the recorder knows of one channel."""
+class _RecordedChannel:
+    """A channel, with its policies and counters."""
 
     channel: Channel
     tally: Tally
@@ -130,17 +138,17 @@ class _Lane:
     priority: Priority
     reduced: Channel | None = None
     thinned: int = 0
-    keep: Keep = Keep.ALL
+    retention: Retention = Retention.ALL
 
 
 class Recorder:
-    """Records what sources hand over, until it is told to stop or has reached a bound.
+    """Records the messages of its sources until it is stopped or reaches a limit.
 
     Args:
-        store: Where to.
-        sources: Started with `start`, stopped with `stop`.
-        options: What and how.
-        say: Called with what the user should know, a line each; from any thread.
+        store: The store that gets the recording.
+        sources: The sources; `start` starts them, `stop` stops them.
+        options: Options.
+        say: Shows a line to the user; called from any thread.
     """
 
     def __init__(
@@ -154,8 +162,8 @@ class Recorder:
         self._options = options
         self._tell = say
         self._store_path = store.directory.path
-        self._lanes: dict[Channel, _Lane] = {}
-        self._lanes_by_content: dict[tuple[object, ...], _Lane] = {}
+        self._recorded: dict[Channel, _RecordedChannel] = {}
+        self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
         self._topics: dict[str, TopicRates] = {}
         self._present: dict[str, int] = {}
         self._lock = threading.Lock()
@@ -190,7 +198,7 @@ class Recorder:
                 self._tell,
             )
         try:
-            self._door = Door(
+            self._control = ControlServer(
                 store.directory.path,
                 self.name,
                 {
@@ -222,14 +230,15 @@ class Recorder:
             ),
         )
 
-    # For whoever runs it.
+    # Methods for the program that runs the recorder.
 
     def start(self) -> None:
-        """Begin to listen.
+        """Start the sources.
 
         Raises:
-            SourceError: A source can never work; nothing is kept.
-            MissingDependencyError: What a source needs is not installed; nothing is kept.
+            SourceError: A source can never work; the recording is removed.
+            MissingDependencyError: A source needs a package that is not installed; the
+                recording is removed.
         """
         try:
             for source in self._sources:
@@ -237,29 +246,32 @@ class Recorder:
         except BaseException:
             for source in self._sources:
                 source.stop()
-            self._door.close()
+            self._control.close()
             self._target.abort()
             raise
 
     def wait(self, seconds: float) -> bool:
-        """Wait for the end, at most so long; returns whether it has come."""
+        """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
 
     @property
     def reason(self) -> str:
-        """Why it came to its end by itself; empty while it has not."""
+        """The reason for the end; empty while the recorder runs."""
         return self._reason
 
     def stop(self) -> list[RecordReport]:
-        """Stop listening; flush, index and seal everything. How each recording went.
+        """Stop the sources; flush, index and seal everything.
+
+        Returns:
+            A report for each recording.
 
         Raises:
-            DiskFullError: No space; what was flushed before stays.
+            DiskFullError: The disk is full; flushed messages stay.
         """
         for source in self._sources:
             source.stop()
         self._over.set()
-        self._door.close()
+        self._control.close()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
         else:
@@ -272,15 +284,15 @@ class Recorder:
 
     @property
     def stopped_for_disk(self) -> bool:
-        """Whether the disk ended it: it is full, or its reserve was reached."""
+        """Tells whether a full disk or its reserve ended the recording."""
         return self._refused is not None and self._refused[0] is Cause.DISK
 
     def look(self) -> RecorderState:
-        """How it is doing. Also sees to the bounds; call it about once a second."""
+        """Compute the state, and check the limits; call it about once a second."""
         now = time.monotonic()
         elapsed = max(now - self._looked, 1e-3)
         self._looked = now
-        self._see_clock(now)
+        self._check_clock(now)
         missing: dict[tuple[str, bool], int] = {}
         lost: dict[str, int] = {}
         if isinstance(self._target, Snapshots):
@@ -321,26 +333,26 @@ class Recorder:
             stored_bytes,
             self._target.count if isinstance(self._target, Snapshots) else None,
         )
-        self._see_bounds(state)
+        self._check_limits(state)
         self._state = state
         return state
 
     def mark(self, text: str, tags: Mapping[str, str]) -> None:
-        """Set a mark: a message on `MARKS` that questions and triggers can use."""
+        """Set a mark: a message on the topic of marks, for queries and triggers."""
         self.take(self._marks, mark_payload(text, tags), received=time.time_ns())
 
     def fire(self, reason: str) -> None:
-        """Write a snapshot.
+        """Start a snapshot.
 
         Raises:
-            UsageError: Everything is kept already.
+            UsageError: The recorder stores everything.
         """
         if not isinstance(self._target, Snapshots):
-            raise UsageError("this recorder keeps everything: triggers are for --ring")
+            raise UsageError("this recorder stores everything: triggers need --ring")
         self._target.fire(reason)
 
     def silent(self) -> list[str]:
-        """Topics that had publishers and never said anything."""
+        """Topics that had publishers and never sent a message."""
         with self._lock:
             return sorted(
                 topic
@@ -360,10 +372,10 @@ class Recorder:
     def expect(self, channel: Channel) -> None:
         """See `Sink.expect`."""
         if isinstance(self._target, Snapshots):
-            return  # what is in the ring goes into no index before a trigger
+            return  # messages in the ring are not indexed before a trigger
         with self._lock:
             self._expected += 1
-            too_many = self._expected > _MOST_EXPECTED
+            too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
 
@@ -377,26 +389,26 @@ class Recorder:
         sequence: int | None = None,
     ) -> None:
         """See `Sink.take`."""
-        lane = self._lanes.get(channel) or self._meet(channel)
+        recorded = self._recorded.get(channel) or self._meet(channel)
         size = len(payload)
-        through = lane.throttle is None or lane.throttle.lets_through(received)
+        through = recorded.throttle is None or recorded.throttle.lets_through(received)
         if through and not self._claim(size):
-            return  # what comes after the end is not part of the recording
-        lane.tally.add(size, received)
+            return  # messages after the end are not part of the recording
+        recorded.tally.add(size, received)
         if not through:
-            self._lose(lane, Cause.THROTTLE, "", received)
+            self._lose(recorded, Cause.THROTTLE, "", received)
             return
         if self._refused is not None:
-            self._lose(lane, *self._refused, received)
+            self._lose(recorded, *self._refused, received)
             return
         whole = True
-        if size > SMALL:
-            keep = step(lane.priority, self._target.filled)
-            whole = keep is Keep.ALL or self._keeps(lane, keep)
+        if size > SMALL_BYTES:
+            found = retention(recorded.priority, self._target.filled)
+            whole = found is Retention.ALL or self._keeps_payload(recorded, found)
         number = 0 if sequence is None else sequence % _SEQUENCES
         try:
             if whole and self._target.write(
-                lane.channel,
+                recorded.channel,
                 payload,
                 log_time=received,
                 publish_time=sent,
@@ -404,15 +416,15 @@ class Recorder:
                 wait=False,
             ):
                 return
-            if size > SMALL:
-                # Its fields find room where its payload does not.
-                self._keep_fields(lane, payload, received, sent, number)
+            if size > SMALL_BYTES:
+                # Its fields may fit where its payload does not.
+                self._keep_fields(recorded, payload, received, sent, number)
             else:
-                self._lose_for_room(lane, received)
+                self._lose_for_room(recorded, received)
         except HybridlogError as error:
             cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
             self._refuse(cause, str(error))
-            self._lose(lane, cause, str(error), received)
+            self._lose(recorded, cause, str(error), received)
 
     def lost(
         self,
@@ -441,8 +453,8 @@ class Recorder:
     def say(self, text: str) -> None:
         """See `Sink.say`."""
         with self._lock:
-            # A peer that always finds new words must not fill the memory.
-            if text in self._said or len(self._said) >= _MOST_SAID:
+            # A peer with ever new messages must not fill the memory.
+            if text in self._said or len(self._said) >= _MAX_REPORTS:
                 return
             self._said.add(text)
         self._tell(text)
@@ -455,9 +467,9 @@ class Recorder:
             self._unended -= 1
             last = self._unended <= 0
         if last:
-            self._end(reason or "all has been played")
+            self._end(reason or "all sources have ended")
 
-    # Visitors.
+    # Requests of other processes.
 
     def _ask_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         state = self._state
@@ -466,26 +478,26 @@ class Recorder:
     def _ask_mark(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         text, tags = request.get("text"), request.get("tags")
         if not isinstance(text, str) or not isinstance(tags, dict):
-            raise UsageError("a mark is a text, and tags that are texts")
+            raise UsageError("a mark needs a text and tags")
         if not all(isinstance(word, str) for pair in tags.items() for word in pair):
-            raise UsageError("tags of a mark are texts")
+            raise UsageError("names and values of tags must be texts")
         self.mark(text, tags)
         return {"recording": self.name}
 
     def _ask_trigger(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         reason = request.get("reason")
         if not isinstance(reason, str) or not reason:
-            raise UsageError("a trigger has a reason")
+            raise UsageError("a trigger needs a reason")
         self.fire(reason)
         return {"recording": self.name}
 
     def _ask_numbers(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Least, mean and greatest of a field lately, out of the ring."""
+        """Minimum, mean and maximum of a field in the ring."""
         topic, path, begin = request.get("topic"), request.get("path"), request.get("begin")
         if not isinstance(topic, str) or not isinstance(path, str) or not isinstance(begin, int):
-            raise UsageError("a field has a topic, a path and a time to begin at")
+            raise UsageError("a field needs a topic, a path and a time to begin at")
         if not isinstance(self._target, Snapshots):
-            raise UsageError("this recorder keeps everything: its index has the fields")
+            raise UsageError("this recorder stores everything: ask its index for fields")
         found = self._target.numbers(topic, path, begin)
         if not found:
             return {"n": 0}
@@ -497,16 +509,16 @@ class Recorder:
         }
 
     def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        self._end("it was told to stop")
+        self._end("stopped by a request")
         return {"recording": self.name}
 
-    # How.
+    # Parts of `take`.
 
-    def _meet(self, channel: Channel) -> _Lane:
-        """A message of a channel that is new.
+    def _meet(self, channel: Channel) -> _RecordedChannel:
+        """Look up a channel object by its content, or add it.
 
-        A publisher that connects again makes a new channel of the same content: that is
-        the old one, or a robot with a bad cable would run out of channels in a day.
+        A publisher that reconnects makes a new channel object with the same content. It
+        shares the old channel: a robot with a bad cable would otherwise use up all numbers.
         """
         content = (
             channel.topic,
@@ -516,29 +528,29 @@ class Recorder:
             channel.has_publish_time,
         )
         with self._lock:
-            lane = self._lanes_by_content.get(content)
-            if lane is None:
+            recorded = self._recorded_by_content.get(content)
+            if recorded is None:
                 topic = channel.topic
                 type_name = channel.schema.name if channel.schema is not None else ""
                 rates = self._topics.setdefault(topic, TopicRates(topic, type_name))
                 rates.type = rates.type or type_name
                 hz = first_fit(self._options.throttles, topic)
                 priority = first_fit(self._options.priorities, topic)
-                lane = _Lane(
+                recorded = _RecordedChannel(
                     channel,
                     Tally(),
                     None if hz is None else Throttle(hz),
                     Priority.NORMAL if priority is None else Priority(int(priority)),
                 )
-                rates.tallies.append(lane.tally)
-                self._lanes_by_content[content] = lane
-            if len(self._lanes) >= _MOST_LANES:
-                self._lanes.clear()  # they are found again by their content
-            self._lanes[channel] = lane
-        return lane
+                rates.tallies.append(recorded.tally)
+                self._recorded_by_content[content] = recorded
+            if len(self._recorded) >= _MAX_CACHED:
+                self._recorded.clear()  # they are found again by content
+            self._recorded[channel] = recorded
+        return recorded
 
     def _claim(self, size: int) -> bool:
-        """Whether another message belongs to the recording; counts it, where that matters."""
+        """Tells whether a message is within the limits, and counts it."""
         if self._refused is not None or (self._left is None and self._room is None):
             return not self._closed
         with self._lock:
@@ -551,50 +563,55 @@ class Recorder:
             self._closed = self._left == 0 or (self._room is not None and self._room <= 0)
             is_last = self._closed
         if is_last:
-            self._end(f"as many {'messages' if self._left == 0 else 'bytes'} as wanted")
+            self._end(f"the limit of {'messages' if self._left == 0 else 'bytes'} is reached")
         return True
 
-    def _keeps(self, lane: _Lane, keep: Keep) -> bool:
-        """Whether this one of a thinned topic keeps its payload."""
-        if lane.keep is not keep:
-            lane.keep = keep
-            what = "one payload in five" if keep is Keep.EVERY_NTH else "fields only"
+    def _keeps_payload(self, recorded: _RecordedChannel, found: Retention) -> bool:
+        """Tells whether a message of a topic under pressure keeps its payload."""
+        if recorded.retention is not found:
+            recorded.retention = found
+            what = "one payload in five" if found is Retention.EVERY_NTH else "fields only"
             self.say(
-                f"{lane.channel.topic}: more comes than can be written; {what} while that "
-                "lasts (see the loss ledger)"
+                f"{recorded.channel.topic}: messages come faster than the disk writes; stored "
+                f"meanwhile: {what} (see the loss ledger)"
             )
-        if keep is Keep.FIELDS:
+        if found is Retention.FIELDS:
             return False
-        lane.thinned += 1
-        return lane.thinned % EVERY == 1
+        recorded.thinned += 1
+        return recorded.thinned % PAYLOAD_STRIDE == 1
 
     def _keep_fields(
-        self, lane: _Lane, payload: bytes, received: int, sent: int | None, number: int
+        self,
+        recorded: _RecordedChannel,
+        payload: bytes,
+        received: int,
+        sent: int | None,
+        number: int,
     ) -> None:
-        """Keep what can be kept of a message whose payload is given up."""
-        if lane.reduced is None:
-            lane.reduced = reduced_channel(lane.channel)
+        """Store the fields of a message without its payload."""
+        if recorded.reduced is None:
+            recorded.reduced = reduced_channel(recorded.channel)
         if self._target.write(
-            lane.reduced,
-            reduce(lane.channel, payload),
+            recorded.reduced,
+            reduce(recorded.channel, payload),
             log_time=received,
             publish_time=sent,
             sequence=number,
             wait=False,
         ):
-            self._lose(lane, Cause.DEGRADE, "payload given up, fields kept", received)
+            self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
         else:
-            self._lose_for_room(lane, received)
+            self._lose_for_room(recorded, received)
 
-    def _lose_for_room(self, lane: _Lane, received: int) -> None:
+    def _lose_for_room(self, recorded: _RecordedChannel, received: int) -> None:
         self.say(
-            f"{lane.channel.topic}: the memory budget is spent, so messages are lost while that "
-            "lasts (see the loss ledger); --budget gives more"
+            f"{recorded.channel.topic}: the memory budget is used up and messages are lost "
+            "(see the loss ledger); raise it with --budget"
         )
-        self._lose(lane, Cause.QUEUE, "the memory budget was spent", received)
+        self._lose(recorded, Cause.QUEUE, "the memory budget was used up", received)
 
-    def _lose(self, lane: _Lane, cause: Cause, detail: str, received: int) -> None:
-        self._note(lane.channel.topic, cause, 1, first=received, last=received, detail=detail)
+    def _lose(self, recorded: _RecordedChannel, cause: Cause, detail: str, received: int) -> None:
+        self._note(recorded.channel.topic, cause, 1, first=received, last=received, detail=detail)
 
     def _note(
         self, topic: str, cause: Cause, count: int | None, *, first: int, last: int, detail: str
@@ -607,7 +624,7 @@ class Recorder:
             self._lost[topic, cause] = self._lost.get((topic, cause), 0) + count
 
     def _refuse(self, cause: Cause, reason: str) -> None:
-        """Nothing more can be stored; what still comes is counted."""
+        """Stop storing; further messages are counted as lost."""
         self._refused = cause, reason
         self._end(reason)
 
@@ -617,13 +634,13 @@ class Recorder:
             self._closed = self._closed or self._refused is None
         self._over.set()
 
-    def _see_bounds(self, state: RecorderState) -> None:
+    def _check_limits(self, state: RecorderState) -> None:
         options = self._options
         if options.duration_s is not None and state.elapsed_s >= options.duration_s:
             self._end("the duration is over")
             return
         grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
-        # What waits in memory will be written, and as much again before the next look.
+        # Messages in memory will be written, and as many new ones before the next check.
         coming = state.filled * options.budget_bytes + grown
         if state.free_bytes - coming < options.reserve_bytes:
             self._refuse(
@@ -637,8 +654,8 @@ class Recorder:
         elif failure is not None:
             self._end("the recording failed")
 
-    def _see_clock(self, now: float) -> None:
-        """Tell when the machine's clock was set: log times then jump, too."""
+    def _check_clock(self, now: float) -> None:
+        """Report that the machine's clock was set: log times jump with it."""
         jump = time.time() - now - self._offset
         if abs(jump) >= _JUMP_S:
             self._offset += jump
@@ -653,7 +670,7 @@ def _megabytes(count: float) -> str:
 
 
 def summary_of(state: RecorderState) -> dict[str, Any]:
-    """A state as JSON, for scripts and for other processes."""
+    """A state as JSON, for scripts and other processes."""
     return {
         **{k: v for k, v in asdict(state).items() if k != "topics"},
         "lost": dict(state.lost),
@@ -662,10 +679,10 @@ def summary_of(state: RecorderState) -> dict[str, Any]:
 
 
 def state_of(summary: Mapping[str, Any]) -> RecorderState:
-    """The state that `summary_of` has made JSON of.
+    """The state of a summary; the inverse of `summary_of`.
 
     Raises:
-        TypeError: It is none.
+        TypeError: The summary has other fields.
     """
     topics = [TopicState(**topic) for topic in summary["topics"]]
     return RecorderState(**{**summary, "topics": topics})

@@ -1,11 +1,10 @@
 """Recording messages as they come, from any number of threads.
 
-`LiveRecording.write` lays a large message into its chunk at once, and only puts a small
-one down; one thread of the recording's own takes those that have come since it looked
-last, lays them into chunks together and sees old chunks closed. The index has the lowest
-rank: while messages come faster than they can be written, it waits, and makes up for it
-from the segments. So what bounds a recording is the disk, and what bounds its memory is
-the budget: when that is spent, `write` waits.
+`LiveRecording.write` copies a large message into its chunk at once, and queues a small
+one. A writing thread moves queued messages into chunks in batches, and closes old chunks.
+The index has the lowest priority: it waits while messages come faster than the disk
+writes, and later catches up from the segments. So the disk limits the rate, and the
+budget limits the memory: when it is used up, `write` waits.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog.capture import Capture, Pace
-from hybridlog.live.budget import LEAST_ASKED_FOR, usual_budget
-from hybridlog.live.collector import spared_objects
-from hybridlog.live.policy import SMALL
-from hybridlog.live.provision import Provision
-from hybridlog.live.turns import Turns
+from hybridlog.capture import Backpressure, Capture
+from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
+from hybridlog.live.fair_semaphore import FairSemaphore
+from hybridlog.live.frozen_objects import frozen_objects
+from hybridlog.live.memory_reservation import MemoryReservation
+from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.losses import Cause, Ledger
 from hybridlog.processors import processors
 from hybridlog.recorder import RecordReport
@@ -45,51 +44,51 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
-_LARGE = 1 << 17  # bytes from which a payload is laid down at once
-_MOST_LAID = 8 << 20  # bytes that are laid down together: then whoever waits for room hears of it
-_ENOUGH = 4 << 20  # bytes that are worth waking the writing thread for: each batch has its price
-_TICK_S = 0.1  # the writing thread looks so often when little comes, or it has no batches
-_FEW = 10  # messages for a chunk: below it, laid down one by one they cost less than as a batch
-_FLUSHED = 0.95  # of the flush interval, when chunks are closed: then they are written
-_PATIENCE = 4  # flush intervals for which chunks of few messages wait to be indexed together,
-_PATIENCE_S = 4.0  # and seconds at most
-_LARGE_AT_WORK = 3  # large chunks on their way without anything being late: two packed, one written
-_MAKING_S = 2.0  # that packing, writing, making documents and sending them may take
-_HURRY = 8 << 20  # bytes that wait from which only what shrinks to little is compressed
-_BEHIND = 32 << 20  # and from which the index waits: what it has let go it must read again
-_COPYING = 2  # threads that copy large messages at the same time
-_NO_TURN = nullcontext()
-_CALM_S = 1.0  # both for so long afterwards, or they would be the cause of the next delay
-_LATE_S = 0.01  # a large message that waits so long to be laid down is late: both happen, too,
-_LATE_TIMES = 20  # for so many times as long as it has waited
-_LOOK_S = 0.25  # how often one looks how much comes
-_MOST_NS = 1 << 63
+_LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once
+_MAX_LAID = 8 << 20  # bytes of one batch: after it, writers that wait for room are notified
+_WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has a fixed cost
+_TICK_S = 0.1  # interval of the writing thread when little comes
+_MIN_BATCH = 10  # messages per chunk: fewer cost less one by one than as a batch
+_FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
+_INDEX_DELAY = 4  # flush intervals for which small chunks wait to be indexed together,
+_INDEX_DELAY_S = 4.0  # at most so many seconds
+_LARGE_AT_WORK = 3  # large chunks in normal operation: two in compression, one being written
+_INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
+_SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
+_DELAY_INDEX_AT = 32 << 20  # above it the index waits, and later reads chunks again
+_MAX_COPYING = 2  # threads that copy large messages at the same time
+_NO_LIMIT = nullcontext()
+_CALM_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
+_LATE_S = 0.01  # a large message that waits longer for its copy starts both measures,
+_LATE_TIMES = 20  # for this multiple of its waiting time
+_RATE_S = 0.25  # interval at which the incoming rate is measured
+_MAX_NS = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """How to record what comes.
+    """Options of a live recording.
 
     Attributes:
-        tags: Kept with the recording.
-        source: What its messages come from, as the catalog shows it.
+        tags: Tags of the recording.
+        source: Origin of the messages, as the catalog shows it.
         budget_bytes: Payload bytes that may be in memory, not written yet.
-        flush_interval_s: Seconds after which a message is in the segment at the latest:
-            what a `kill -9` can cost.
-        settings: How segments are cut and packed.
+        flush_interval_s: Seconds after which a message is in the segment at the latest. A
+            `kill -9` can cost the messages of this time.
+        settings: Settings of segments and chunks.
     """
 
     tags: Mapping[str, str] = field(default_factory=dict)
     source: Mapping[str, Any] = field(default_factory=dict)
-    budget_bytes: int = field(default_factory=usual_budget)
+    budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
 
     def __post_init__(self) -> None:
-        if self.budget_bytes < LEAST_ASKED_FOR:
+        if self.budget_bytes < MIN_USER_BUDGET:
             raise UsageError("the memory budget must be at least 1 MiB")
         if not 0 < self.flush_interval_s <= 3600:
-            raise UsageError("the flush interval must lie between 0 and 3600 seconds")
+            raise UsageError("the flush interval must be between 0 and 3600 seconds")
 
 
 class _Message(NamedTuple):
@@ -100,40 +99,40 @@ class _Message(NamedTuple):
     payload: Buffer
 
 
-class _Strain:
-    """Whether more waits to be written than a bound, or did a moment ago."""
+class _PressureTimer:
+    """Tells whether unwritten bytes exceed a bound, or did so a moment ago."""
 
     def __init__(self, bound: int) -> None:
         self._bound = bound
-        self._calm = 0.0
+        self._high_until = 0.0
 
-    def go_on(self, seconds: float) -> None:
-        """Be felt for some time, whatever waits to be written."""
-        self._calm = max(self._calm, time.monotonic() + seconds)
+    def hold(self, seconds: float) -> None:
+        """Keep the pressure high for some time, whatever is unwritten."""
+        self._high_until = max(self._high_until, time.monotonic() + seconds)
 
-    def is_felt(self, unwritten: int) -> bool:
+    def is_high(self, unwritten: int) -> bool:
         if unwritten > self._bound:
-            self.go_on(_CALM_S)
-        return time.monotonic() < self._calm
+            self.hold(_CALM_S)
+        return time.monotonic() < self._high_until
 
 
 class LiveRecording:
-    """A recording that messages are written to as they come.
+    """A recording that takes messages as they come.
 
-    What whoever writes could not take, or had to give up, is noted in `ledger`; its rows
-    are written into the segments with the messages.
+    The caller notes lost messages in `ledger`; its rows are written into the segments with
+    the messages.
 
-    Get one from `Store.start`. As a context manager it is closed at the end of the
-    block, after an error too: what was received is worth keeping.
+    Get one from `Store.start`. As a context manager it is closed at the end of the block,
+    even after an error: the received messages are worth storing.
 
     Args:
         directory: The store.
-        catalog: Its catalog.
+        catalog: The store's catalog.
         database: The index.
         name: Name of the recording.
-        options: How.
-        renew: Gives another connection to the index when one has failed.
-        on_close: Called with the report when the recording has come to its end.
+        options: Options.
+        renew: Makes a new connection to the index after a failure.
+        on_close: Called with the report at the end of the recording.
     """
 
     def __init__(
@@ -156,30 +155,30 @@ class LiveRecording:
         self._taken: list[int] = []  # messages, by index of the channel
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
-        self._worth_waking = min(_ENOUGH, options.budget_bytes // 4)
-        self._taken_bytes = 0  # taken, and not laid into a chunk yet
-        self._beyond = 0  # bytes closed beyond those, as last counted; `write` asks each time
+        self._worth_waking = min(_WAKE_BYTES, options.budget_bytes // 4)
+        self._taken_bytes = 0  # taken, and not in a chunk yet
+        self._beyond = 0  # bytes of closed chunks that wait, as last counted; `write` reads it
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
-        self._laying = threading.Lock()  # held by who lays into chunks, and taken before `_lock`
-        self._turns = Turns(_COPYING)
-        # No event: who is interrupted while setting one may leave it locked for ever.
+        self._laying = threading.Lock()  # guards the open chunks; taken before `_lock`
+        self._copying = FairSemaphore(_MAX_COPYING)
+        # No event: a thread that is interrupted in `set` may leave it locked forever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._ended = False
         self._closing = threading.RLock()
         self._is_closing = False
-        self._hurry = _Strain(_HURRY)
-        self._behind = _Strain(_BEHIND)
+        self._compression_pressure = _PressureTimer(_SKIP_COMPRESSION_AT)
+        self._index_pressure = _PressureTimer(_DELAY_INDEX_AT)
         self._failure: BaseException | None = None
         self._report: RecordReport | None = None
         self.ledger = Ledger()
-        """What is missing from this recording."""
+        """Messages that are missing from this recording."""
         self.cut_off: Counter[str] = Counter()
-        """Messages that were taken and found no room on the disk, by topic; known at the end."""
-        self._provision = Provision(options.settings.chunk_size, options.budget_bytes)
-        self._held = ExitStack()
-        with self._held:
-            self._held.enter_context(spared_objects)
+        """Messages that a full disk cost, by topic; known after the end."""
+        self._reservation = MemoryReservation(options.settings.chunk_size, options.budget_bytes)
+        self._frozen = ExitStack()
+        with self._frozen:
+            self._frozen.enter_context(frozen_objects)
             self._capture = Capture(
                 directory,
                 catalog,
@@ -188,17 +187,17 @@ class LiveRecording:
                 tags=options.tags,
                 source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
-                pace=Pace(
-                    hurry=lambda: self._is_under(self._hurry),
-                    behind=lambda: self._is_under(self._behind),
-                    has_room=self._provision.has_room,
-                    next_chunk_size=self._provision.next_chunk_size,
+                pressure=Backpressure(
+                    hurry=lambda: self._is_under_pressure(self._compression_pressure),
+                    behind=lambda: self._is_under_pressure(self._index_pressure),
+                    has_room=self._reservation.has_room,
+                    next_chunk_size=self._reservation.next_chunk_size,
                     spare=threading.BoundedSemaphore(_spare_processors()),
                     on_written=self._make_room,
                     renew=renew,
                 ),
             )
-            self._held = self._held.pop_all()
+            self._frozen = self._frozen.pop_all()
         self.id = self._capture.entry.id
         """Recording id."""
         self.label = self._capture.entry.label
@@ -216,7 +215,7 @@ class LiveRecording:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close it, unless that was tried already."""
+        """Close the recording, unless that was tried already."""
         with self._closing:
             if not self._is_closing:
                 self.close()
@@ -224,12 +223,12 @@ class LiveRecording:
     def expect(self, *channels: Channel) -> None:
         """Prepare for channels before their first message.
 
-        To understand a definition and to make a collection takes some ten milliseconds
-        each, which are better spent while nothing comes yet.
+        Parsing a definition and creating a collection take some ten milliseconds each.
+        It is better to spend them before messages come.
 
         Raises:
             UsageError: A channel cannot be stored, or the recording was closed.
-            DiskFullError: As `write` does.
+            DiskFullError: The disk is full.
         """
         with self._lock:
             self._check()
@@ -247,53 +246,53 @@ class LiveRecording:
         sequence: int = 0,
         wait: bool = True,
     ) -> bool:
-        """Take a message; waits while the memory budget is spent. Thread safe.
+        """Take a message; waits while the memory budget is used up. Thread safe.
 
         Args:
             channel: The same object for all messages of a channel.
-            payload: The serialized message, of any size: bytes, or memory that holds some and
+            payload: The serialized message, of any size: bytes or another buffer, which
                 must not change afterwards.
-            log_time: When it was received, ns since the epoch; None for now.
-            publish_time: When it was sent, ns since the epoch; None for the log time, which
-                is what a channel without publish times has.
+            log_time: Receive time, ns since the epoch; None for now.
+            publish_time: Send time, ns since the epoch; None for the log time. Channels
+                without publish times always have the log time.
             sequence: The sender's number, 0 to 2³²-1.
             wait: False to refuse the message instead of waiting for the budget. Messages of
-                up to `SMALL` bytes may go beyond it by a quarter: fields land when payloads
-                cannot.
+                up to `SMALL_BYTES` may exceed it by a quarter, so that fields are stored when
+                payloads cannot be.
 
         Returns:
-            Whether it was taken.
+            True if the message was taken.
 
         Raises:
-            UsageError: The payload is not bytes, the channel cannot be stored, a number is not
-                whole or out of its range, or the recording was closed.
-            DiskFullError: No space; what was flushed before stays.
+            UsageError: The payload is not bytes, the channel cannot be stored, a number is
+                out of range or not an integer, or the recording was closed.
+            DiskFullError: The disk is full; flushed messages stay.
         """
-        # Found out later, it would end the recording of everything else.
+        # An error that shows up later would end the whole recording.
         if type(payload) is not bytes:
-            payload = _held_fast(payload)
+            payload = _pinned(payload)
         try:
             now = time.time_ns() if log_time is None else index_of(log_time)
             sent = now if publish_time is None else index_of(publish_time)
             sequence = index_of(sequence)
         except TypeError as error:
             raise UsageError(
-                f"a time or the sequence number of a message is no whole number: {error}"
+                f"times and the sequence number of a message must be integers: {error}"
             ) from error
-        if not (0 <= now < _MOST_NS and 0 <= sent < _MOST_NS and 0 <= sequence < 1 << 32):
-            raise UsageError("a time or the sequence number of a message is out of its range")
+        if not (0 <= now < _MAX_NS and 0 <= sent < _MAX_NS and 0 <= sequence < 1 << 32):
+            raise UsageError("a time or the sequence number of a message is out of range")
         size = len(payload)
-        # Ctrl-C may come at any place of the main thread, and a chunk has no half messages.
+        # Ctrl-C may interrupt the main thread anywhere, and must not leave half a message.
         at_once = size >= _LARGE and threading.current_thread() is not threading.main_thread()
         with self._lock:
-            bound = self._small_bound if size <= SMALL else self._options.budget_bytes
+            bound = self._small_bound if size <= SMALL_BYTES else self._options.budget_bytes
             while (unwritten := self._taken_bytes + self._beyond) and unwritten + size > bound:
                 self._check()
                 if not wait:
                     return False
                 self._wake()
                 self._room.wait()
-            self._room.notify()  # there may be room for another
+            self._room.notify()  # there may be room for another writer
             self._check()
             index = self._ids.get(channel) if isinstance(channel, Channel) else None
             if index is None:
@@ -316,42 +315,42 @@ class LiveRecording:
 
     @property
     def filled(self) -> float:
-        """How much of the memory budget is spent, 0 to 1."""
-        # An open chunk counts when it is closed, and may then be more than there is room for.
+        """Used share of the memory budget, 0 to 1."""
+        # An open chunk counts once it is closed, and may then exceed the budget.
         return min(self._unwritten() / self._options.budget_bytes, 1.0)
 
     @property
     def stored(self) -> tuple[int, int]:
-        """Messages that were laid into chunks, and the bytes of their payloads."""
+        """Messages in chunks, and the bytes of their payloads."""
         totals = self._capture.writer.totals
         return totals.messages, totals.payload_bytes
 
     @property
     def lag(self) -> int:
-        """Messages that are not in the index yet."""
+        """Messages that are not indexed yet."""
         return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)
 
     @property
     def index_failure(self) -> HybridlogError | None:
-        """Why the index does not go on, None while it does."""
+        """The error that stopped the index, None while it works."""
         return self._capture.index.failure
 
     @property
     def failure(self) -> BaseException | None:
-        """Why nothing more can be taken, None while it can."""
+        """The error that stopped the recording, None while it works."""
         return self._failure
 
     def close(self) -> RecordReport:
-        """Write, index and seal everything; tells how the recording went.
+        """Write, index and seal everything, and return a report.
 
-        On a full disk what was flushed is sealed, and the rest is in the ledger. Thread safe;
-        who closes it once more gets the same report.
+        On a full disk the flushed messages are sealed, and the rest is in the ledger. Thread
+        safe; a second call returns the same report.
 
         Raises:
-            DiskFullError: There is no room even for that; what was flushed before stays, and
-                the next opening of the store seals it.
-            UsageError: To close it has failed before, or the same thread does it already, as
-                where a signal is handled meanwhile.
+            DiskFullError: The disk has no room even to seal; flushed messages stay, and the
+                next opening of the store seals them.
+            UsageError: Closing has failed before, or the same thread is closing already, as
+                in a signal handler.
         """
         with self._closing:
             if self._report is None:
@@ -361,17 +360,17 @@ class LiveRecording:
             return self._report
 
     def _end(self) -> None:
-        """Begin to close or to abort, by who holds `_closing`; that is done once."""
+        """Begin to close or to abort, once; the caller holds `_closing`."""
         if self._is_closing:
             raise UsageError(
-                f"The recording {self.label!r} is being closed, or that was broken off; the next "
-                "opening of the store seals what was flushed."
+                f"The recording {self.label!r} is being closed, or closing it was interrupted; "
+                "the next opening of the store seals the flushed messages."
             )
         self._is_closing = True
         self._stop()
 
     def _close_once(self) -> RecordReport:
-        with self._held:
+        with self._frozen:
             try:
                 end = {"status": "complete", "losses": []}
                 if isinstance(self._failure, DiskFullError):
@@ -395,14 +394,14 @@ class LiveRecording:
         )
 
     def _close_whole(self, end: Mapping[str, Any]) -> DatabaseError | None:
-        """Write everything; on a disk that is full only now, what there is room for."""
+        """Write everything; if the disk fills up now, as much as fits."""
         try:
             return self._capture.close(end)
         except DiskFullError:
             return self._capture.give_up(end, self._cut_off())
 
     def _cut_off(self) -> list[dict[str, Any]]:
-        """Rows of the ledger, with what was taken and is in no file."""
+        """Rows of the ledger, with the messages that were taken but not written."""
         now = time.time_ns()
         for channel, taken in zip(self._channels, self._taken, strict=True):
             count = taken - self._capture.writer.written_of(channel)
@@ -419,35 +418,35 @@ class LiveRecording:
         return self.ledger.take(everything=True)
 
     def abort(self) -> None:
-        """Take the whole recording back.
+        """Remove the whole recording.
 
         Raises:
-            UsageError: It was closed, or is being closed.
+            UsageError: The recording was closed, or is being closed.
         """
         with self._closing:
             self._end()
-            with self._held:
+            with self._frozen:
                 self._capture.forget()
 
     def _closed_beyond(self) -> int:
-        """Bytes in closed chunks beyond those at work."""
+        """Bytes of closed chunks beyond those in normal operation."""
         usual = AT_WORK * self._options.settings.chunk_size
-        at_work = max(usual, _LARGE_AT_WORK * self._provision.chunk_size)
+        at_work = max(usual, _LARGE_AT_WORK * self._reservation.chunk_size)
         return max(self._capture.writer.waiting - at_work, 0)
 
     def _unwritten(self) -> int:
-        """Bytes that wait: taken and not laid down, or in chunks beyond those at work."""
+        """Unwritten bytes: those not in chunks yet, and those of waiting chunks."""
         return self._taken_bytes + self._closed_beyond()
 
     def _make_room(self, laid: int = 0) -> None:
-        """See how much waits now that a chunk was closed or written, or so much was laid down."""
+        """Update the unwritten bytes: a chunk was closed or written, or bytes were copied."""
         with self._lock:
             self._taken_bytes -= laid
             self._beyond = self._closed_beyond()
             self._room.notify()
 
     def _wake(self) -> None:
-        """See that the writing thread looks."""
+        """Wake the writing thread."""
         if self._calls.empty():
             self._calls.put(None)
 
@@ -457,21 +456,21 @@ class LiveRecording:
         if self._ended:
             raise UsageError(f"The recording {self.label!r} was closed.")
 
-    def _is_under(self, strain: _Strain) -> bool:
-        return strain.is_felt(self._unwritten()) and not self._ended
+    def _is_under_pressure(self, timer: _PressureTimer) -> bool:
+        return timer.is_high(self._unwritten()) and not self._ended
 
     def _stop(self) -> None:
-        # Who lays down a message at this moment has it in the recording.
+        # A message that is being copied at this moment is part of the recording.
         with self._laying, self._lock:
             self._ended = True
             self._room.notify_all()
         self._wake()
         self._thread.join()
-        self._provision.close()
+        self._reservation.close()
 
     def _run(self) -> None:
-        """What the writing thread does."""
-        flushed = told = looked = time.monotonic()
+        """The writing thread."""
+        flushed = reported = measured = time.monotonic()
         seen = 0
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 10)
@@ -487,23 +486,23 @@ class LiveRecording:
                         return
                     now = time.monotonic()
                     if now - flushed >= tick:
-                        # As late as can be: of slow topics a chunk costs more than what is in
-                        # it. What is laid down has waited for a tick, and does so once more.
-                        self._capture.writer.flush_older(interval * _FLUSHED - 2 * tick)
+                        # As late as possible: a chunk of a slow topic costs more than its
+                        # content. A message has waited for one tick, and waits for another.
+                        self._capture.writer.flush_older(interval * _FLUSH_AT - 2 * tick)
                         self._make_room()
                         flushed = now
-                    if now - told >= interval / 4:
+                    if now - reported >= interval / 4:
                         self._write_losses()
-                        self._capture.index.nudge(_patience(interval))
-                        told = now
-                if now - looked >= _LOOK_S:
+                        self._capture.index.nudge(_index_delay(interval))
+                        reported = now
+                if now - measured >= _RATE_S:
                     stored = self._capture.writer.totals.payload_bytes
-                    self._provision.look((stored - seen) / (now - looked))
-                    looked, seen = now, stored
+                    self._reservation.observe((stored - seen) / (now - measured))
+                    measured, seen = now, stored
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
-        """Whatever goes wrong: those who write and close must hear of it, or wait for ever."""
+        """Pass any error on to the threads that write and close, which would wait forever."""
         try:
             yield
         except BaseException as error:
@@ -518,20 +517,19 @@ class LiveRecording:
             self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
     def _lay_now(self, message: _Message) -> None:
-        """Lay a message into its chunk, and before it what has come before it.
+        """Copy a message into its chunk, after the queued ones.
 
-        By the thread that brings it: handed on, it would wait in memory of its own, and new
-        memory is what a machine may be slow to give. What takes long to copy goes by turns,
-        a few at a time: many that run leave those that write the chunks no turn at the
-        interpreter.
+        The thread that brings the message copies it. In a queue it would need memory of
+        its own, and new memory may be slow to get. Only a few threads copy large messages
+        at a time: many would keep the interpreter from the threads that write chunks.
         """
-        # What is copied at once keeps the interpreter, and others with it, until it is laid.
-        turn = self._turns if len(message.payload) >= COPIED_AT_ONCE else _NO_TURN
+        # A small copy holds the interpreter anyway, and no other thread can run.
+        limit = self._copying if len(message.payload) >= COPIED_AT_ONCE else _NO_LIMIT
         since = time.monotonic()
         try:
-            with turn:
+            with limit:
                 with self._laying:
-                    self._be_on_time(time.monotonic() - since)
+                    self._relieve(time.monotonic() - since)
                     self._check()
                     with self._failing():
                         self._take()
@@ -544,24 +542,24 @@ class LiveRecording:
         finally:
             self._make_room(len(message.payload))
 
-    def _be_on_time(self, waited: float) -> None:
-        """Spare the processors and the disk when a message has waited long to be laid down."""
+    def _relieve(self, waited: float) -> None:
+        """Relieve processors and disk after a message has waited long for its copy."""
         if waited > _LATE_S:
-            for strain in (self._hurry, self._behind):
-                strain.go_on(min(_LATE_TIMES * waited, _CALM_S))
+            for timer in (self._compression_pressure, self._index_pressure):
+                timer.hold(min(_LATE_TIMES * waited, _CALM_S))
 
     def _take(self) -> None:
-        """Lay what was put down into chunks; by who holds `_laying`."""
+        """Move queued messages into chunks; the caller holds `_laying`."""
         with self._lock:
             inbox, size = self._inbox, self._inbox_bytes
             self._inbox, self._inbox_bytes = deque(), 0
         if inbox:
-            for group in [inbox] if size <= _MOST_LAID else _groups(inbox):
+            for group in [inbox] if size <= _MAX_LAID else _groups(inbox):
                 self._make_room(self._lay_down(group))
 
     def _lay_down(self, group: Sequence[_Message]) -> int:
-        """Give some messages to the writer; returns the bytes of their payloads."""
-        if len(group) >= _FEW * self._count_chunks(group):
+        """Write some messages into chunks; returns their payload bytes."""
+        if len(group) >= _MIN_BATCH * self._count_chunks(group):
             batch = _batch(group)
             self._capture.writer.append(batch, self._channels)
             return batch.payload_bytes
@@ -570,12 +568,12 @@ class LiveRecording:
         return sum(len(message.payload) for message in group)
 
     def _count_chunks(self, group: Sequence[_Message]) -> int:
-        """In how many chunks some messages will lie, about."""
+        """Approximate number of chunks that some messages go to."""
         channels = [self._channels[index] for index in {message.channel for message in group}]
         return self._capture.writer.count_chunks(channels)
 
     def _place(self, message: _Message) -> Callable[[], None]:
-        """Give a message its place in a chunk; what comes back copies it there."""
+        """Reserve a message's place in a chunk; the returned function copies it there."""
         return self._capture.writer.place_one(
             self._channels[message.channel],
             message.payload,
@@ -586,62 +584,62 @@ class LiveRecording:
 
 
 def _spare_processors() -> int:
-    """For what can wait: one is left to those that bring messages, if it can be."""
+    """Processors for background work: one is left for incoming messages if possible."""
     return min(PACKERS + 1, max(processors() - 1, 1))
 
 
-def _held_fast(payload: object) -> memoryview:
-    """What is no plain `bytes`, so that it cannot be resized or released until it is laid down."""
+def _pinned(payload: object) -> memoryview:
+    """A view of a buffer that keeps it from being resized or released."""
     if isinstance(payload, bytes | bytearray | memoryview):
-        held = memoryview(payload)
-        if held.c_contiguous and held.ndim == 1 and held.format == "B":
-            return held
+        view = memoryview(payload)
+        if view.c_contiguous and view.ndim == 1 and view.format == "B":
+            return view
     kind = type(payload).__name__
-    raise UsageError(f"the payload of a message is a {kind}, and must be bytes")
+    raise UsageError(f"the payload of a message must be bytes, not {kind}")
 
 
 def _check_channel(channel: object) -> None:
-    """Refuse what no segment could hold."""
+    """Refuse a channel that no segment can hold."""
     if not isinstance(channel, Channel):
-        raise UsageError(f"{channel!r} is no Channel")
+        raise UsageError(f"{channel!r} is not a Channel")
     schema = channel.schema
     if not (schema is None or isinstance(schema, Schema)):
-        raise UsageError(f"the schema of the channel {channel.topic!r} is no Schema")
+        raise UsageError(f"the schema of the channel {channel.topic!r} must be a Schema")
     if schema is not None and not isinstance(schema.data, bytes):
         kind = type(schema.data).__name__
-        raise UsageError(f"the schema of the channel {channel.topic!r} is a {kind}, not bytes")
+        raise UsageError(f"the schema of the channel {channel.topic!r} must be bytes, not {kind}")
     if not isinstance(channel.metadata, Mapping):
-        raise UsageError(f"the metadata of the channel {channel.topic!r} is no mapping")
+        raise UsageError(f"the metadata of the channel {channel.topic!r} must be a mapping")
     texts = [channel.topic, channel.message_encoding, *channel.metadata, *channel.metadata.values()]
     if schema is not None:
         texts += [schema.name, schema.encoding]
     for text in texts:
         if not isinstance(text, str):
-            raise UsageError(f"the channel {channel.topic!r} has {text!r} where text must be")
+            raise UsageError(f"the channel {channel.topic!r} has {text!r} instead of text")
         try:
             text.encode()
         except UnicodeEncodeError as error:
             raise UsageError(
-                f"the channel {channel.topic!r} has {text!r}, which UTF-8 cannot hold"
+                f"the channel {channel.topic!r} has {text!r}, which UTF-8 cannot encode"
             ) from error
 
 
-def _patience(flush_interval_s: float) -> float:
-    """Seconds for which chunks of few messages may wait to be indexed together."""
-    return min(_PATIENCE * flush_interval_s, _PATIENCE_S)
+def _index_delay(flush_interval_s: float) -> float:
+    """Seconds for which small chunks may wait to be indexed together."""
+    return min(_INDEX_DELAY * flush_interval_s, _INDEX_DELAY_S)
 
 
 def indexed_within_s(flush_interval_s: float) -> float:
-    """Seconds after which an index that keeps up has a message, at the latest."""
-    return flush_interval_s + _patience(flush_interval_s) + _MAKING_S
+    """Seconds in which an index that keeps up receives a message."""
+    return flush_interval_s + _index_delay(flush_interval_s) + _INDEXING_S
 
 
 def _groups(inbox: deque[_Message]) -> Iterator[Sequence[_Message]]:
-    """Take messages that are laid down together; those before them are forgotten."""
+    """Split the queue into batches, and empty it."""
     while inbox:
         group = [inbox.popleft()]
         size = len(group[0].payload)
-        while inbox and size < _MOST_LAID:
+        while inbox and size < _MAX_LAID:
             group.append(inbox.popleft())
             size += len(group[-1].payload)
         yield group

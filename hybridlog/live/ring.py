@@ -1,4 +1,4 @@
-"""The last minute of what a robot said, in bounded memory."""
+"""A ring buffer of a robot's latest messages, in bounded memory."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import NamedTuple
 from hybridlog.latching import depth_of
 from hybridlog_storage.messages import Channel
 
-_MOST_LATCHED = 32 << 20  # payload bytes of one channel; its last message stays in any case
+_MAX_LATCHED = 32 << 20  # payload bytes of one channel; its last message always stays
 
 
-class Held(NamedTuple):
-    """A message that may be wanted."""
+class BufferedMessage(NamedTuple):
+    """A message in the ring."""
 
     channel: Channel
     payload: bytes
@@ -22,72 +22,73 @@ class Held(NamedTuple):
 
 
 class Ring:
-    """Keeps messages for so long, or as many as fit.
+    """Holds the messages of a time span, or as many as fit.
 
-    Latched messages stay until they are replaced, however old they are: without them what
-    follows cannot be understood.
+    Latched messages stay until newer ones replace them, whatever their age: later messages
+    cannot be understood without them.
 
     Args:
-        span_ns: How long; the time is the messages' own log time.
-        most_bytes: Payload bytes that are kept at most.
+        span_ns: The span, by the messages' log time.
+        max_bytes: Limit for the payload bytes in the ring.
     """
 
-    def __init__(self, span_ns: int, most_bytes: int) -> None:
+    def __init__(self, span_ns: int, max_bytes: int) -> None:
         self._span = span_ns
-        self._most = most_bytes
-        self._messages: deque[Held] = deque()
-        self._latched: dict[Channel, deque[Held]] = {}
+        self._max_bytes = max_bytes
+        self._messages: deque[BufferedMessage] = deque()
+        self._latched: dict[Channel, deque[BufferedMessage]] = {}
         self._bytes = 0
         self._cut = False
 
-    def add(self, message: Held) -> None:
-        """Keep a message, and let go of those that are too old or too many."""
+    def add(self, message: BufferedMessage) -> None:
+        """Add a message, and drop those that are too old or too many."""
         depth = depth_of(message.channel)
         if depth:
             self._latch(message, depth)
         self._messages.append(message)
         self._bytes += len(message.payload)
         oldest = message.log_time - self._span
-        while self._bytes > self._most or (self._messages and self._messages[0].log_time < oldest):
-            self._cut |= self._bytes > self._most
+        while (is_full := self._bytes > self._max_bytes) or (
+            self._messages and self._messages[0].log_time < oldest
+        ):
+            self._cut |= is_full
             self._bytes -= len(self._messages.popleft().payload)
 
-    def since(self, begin: int) -> list[Held]:
-        """What is kept from a log time on, ns, in the order in which it came.
+    def since(self, begin: int) -> list[BufferedMessage]:
+        """The messages from a log time on, ns, in arrival order.
 
-        Latched messages from before stand in front, with the log time `begin`: so a slice
-        spans no more than was asked for. Their publish time keeps saying when they were
-        sent.
+        Older latched messages come first, with the log time `begin`, so that the slice
+        spans no more than requested. Their publish time still tells when they were sent.
         """
-        found = [held for held in self._messages if held.log_time >= begin]
-        there = {id(held) for held in found}
+        found = [message for message in self._messages if message.log_time >= begin]
+        present = {id(message) for message in found}
         front = [
-            held._replace(log_time=begin, publish_time=held.publish_time or held.log_time)
+            message._replace(log_time=begin, publish_time=message.publish_time or message.log_time)
             for latched in self._latched.values()
-            for held in latched
-            if id(held) not in there and held.log_time < begin
+            for message in latched
+            if id(message) not in present and message.log_time < begin
         ]
         return front + found
 
-    def latest(self, topic: str, begin: int, most: int) -> list[Held]:
-        """The latest messages of a topic since a log time, ns, at most so many."""
-        found: list[Held] = []
-        for held in reversed(self._messages):
-            if held.log_time < begin or len(found) == most:
+    def latest(self, topic: str, begin: int, limit: int) -> list[BufferedMessage]:
+        """The latest messages of a topic since a log time, ns, at most `limit`."""
+        found: list[BufferedMessage] = []
+        for message in reversed(self._messages):
+            if message.log_time < begin or len(found) == limit:
                 break
-            if held.channel.topic == topic:
-                found.append(held)
+            if message.channel.topic == topic:
+                found.append(message)
         return found
 
-    def _latch(self, message: Held, depth: int) -> None:
+    def _latch(self, message: BufferedMessage, depth: int) -> None:
         latched = self._latched.setdefault(message.channel, deque(maxlen=depth))
         latched.append(message)
-        while len(latched) > 1 and sum(len(h.payload) for h in latched) > _MOST_LATCHED:
+        while len(latched) > 1 and sum(len(h.payload) for h in latched) > _MAX_LATCHED:
             latched.popleft()
 
     @property
     def payload_bytes(self) -> int:
-        """Bytes that are kept now."""
+        """Payload bytes in the ring."""
         return self._bytes
 
     @property
@@ -99,5 +100,5 @@ class Ring:
 
     @property
     def is_short(self) -> bool:
-        """Whether memory has not sufficed for the whole span."""
+        """Tells whether memory did not suffice for the whole span."""
         return self._cut

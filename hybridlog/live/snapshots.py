@@ -1,8 +1,8 @@
-"""Snapshot mode: the last minute in memory, written out when something happens.
+"""Snapshot mode: a ring of the latest messages, stored when a trigger fires.
 
-`Snapshots` stands where a recording stands otherwise. A trigger starts a recording with
-what the ring holds; what comes in the time after it follows, and then the recording is
-closed, while the ring goes on.
+`Snapshots` takes the place of a recording. A trigger starts a recording with the content
+of the ring. Messages of the time after the trigger follow; then the recording is closed,
+and the ring goes on.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hybridlog.live.ring import Held, Ring
+from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.losses import Cause, Ledger
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import numbers_at, to_bool
@@ -36,19 +36,19 @@ if TYPE_CHECKING:
     from hybridlog.recorder import RecordReport
     from hybridlog_storage.messages import Channel
 
-_MOST_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
-_MOST_WATCHED = 1000  # messages of which somebody looks at a field
-_HALF = 0.5  # of a recording's budget, left for what comes while the ring is written
+_MAX_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
+_MAX_WATCHED = 1000  # messages whose field `numbers` reads
+_RING_SHARE = 0.5  # of a recording's budget; the rest is for messages that come meanwhile
 
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """When to write a snapshot.
+    """A condition that starts a snapshot.
 
     Attributes:
         text: As the user wrote it.
-        fits: Which topics.
-        predicate: What must hold for a message; None for any message.
+        fits: Tells whether a topic matches.
+        predicate: Condition for a message; None for any message.
     """
 
     text: str
@@ -57,12 +57,12 @@ class Trigger:
 
     @classmethod
     def of(cls, text: str) -> Trigger:
-        """`/diagnostics: status[*].level >= 2`, or a topic alone.
+        """Parse `/diagnostics: status[*].level >= 2`, or a topic alone.
 
         Raises:
-            UsageError: No topic.
+            UsageError: The topic is missing.
             TopicError: The pattern is malformed.
-            WhereError: The predicate is.
+            WhereError: The predicate is malformed.
         """
         topic, _, predicate = text.partition(": ")
         topic = topic.strip().removesuffix(":")
@@ -73,20 +73,20 @@ class Trigger:
         for path in [] if asked is None else asked.fields():
             if path.split(".", 1)[0] in {"_id", "_meta"}:
                 raise WhereError(
-                    f"a trigger is asked of a message before it is stored: {path} is not there yet"
+                    f"a trigger sees messages before they are stored: {path} does not exist yet"
                 )
         return cls(text, fits, asked)
 
 
 @dataclass(frozen=True, slots=True)
 class SnapshotOptions:
-    """What a snapshot holds.
+    """Content and triggers of snapshots.
 
     Attributes:
-        ring_s: How long the ring remembers.
-        before_s: Seconds before the trigger; None for all that the ring holds.
-        after_s: Seconds after it.
-        triggers: When; others come by signal, or from another process.
+        ring_s: Time span of the ring, seconds.
+        before_s: Seconds before the trigger; None for the whole ring.
+        after_s: Seconds after the trigger.
+        triggers: Conditions; signals and other processes can trigger as well.
     """
 
     ring_s: float
@@ -95,22 +95,22 @@ class SnapshotOptions:
     triggers: tuple[Trigger, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what the ring cannot hold."""
+        """Refuse spans that the ring cannot hold."""
         if not 0 < self.ring_s <= 86_400:
-            raise UsageError("the ring must last between 0 and a day")
+            raise UsageError("--ring must be between 0 and a day")
         if self.before_s is not None and not 0 <= self.before_s <= self.ring_s:
             raise UsageError("--before cannot be longer than --ring")
         if not 0 <= self.after_s <= 86_400:
-            raise UsageError("--after must last between 0 and a day")
+            raise UsageError("--after must be between 0 and a day")
 
 
 class _Watch(NamedTuple):
-    """A trigger as it is asked of the messages of one channel.
+    """A trigger, compiled for the messages of one channel.
 
     Attributes:
         reason: The trigger's text.
-        test: Of a message; None when any message fires it.
-        names: Fields at the top of the message that the test looks at.
+        test: Condition for a message's fields; None if any message fires it.
+        names: Top-level fields that the condition needs.
     """
 
     reason: str
@@ -119,17 +119,17 @@ class _Watch(NamedTuple):
 
 
 class Snapshots:
-    """Takes messages as a recording does, and keeps those around triggers.
+    """Takes messages like a recording, and stores those around triggers.
 
     Args:
-        options: What a snapshot holds.
+        options: Content and triggers.
         budget_bytes: Payload bytes that the ring may hold.
-        start: Starts a recording, by the reason for it.
-        again: Called with the reason for a trigger that finds a snapshot being written.
-        say: Called with what the user should know.
+        start: Starts a recording; its argument is the trigger's reason.
+        again: Called with the reason of a trigger that fires during a snapshot.
+        say: Shows a line to the user.
 
     Attributes:
-        cut_off: Messages of snapshots that found no room on the disk, by topic.
+        cut_off: Messages of snapshots that a full disk cost, by topic.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Snapshots:
         self._start = start
         self._say = say
         self._ledger = Ledger()
-        self._lost: deque[dict[str, Any]] = deque(maxlen=_MOST_ROWS)
+        self._lost: deque[dict[str, Any]] = deque(maxlen=_MAX_ROWS)
         self._lock = threading.Lock()
         self._active: LiveRecording | None = None
         self._until = 0
@@ -159,10 +159,10 @@ class Snapshots:
         self._stored = (0, 0)
         self._failure: HybridlogError | None = None
         self._watched: dict[Channel, tuple[_Watch, ...]] = {}
-        self._told_short = False
+        self._has_reported_short = False
 
     id = ""
-    """There is no one recording."""
+    """Empty: there is no single recording."""
 
     def write(
         self,
@@ -175,12 +175,12 @@ class Snapshots:
         wait: bool = True,
     ) -> bool:
         """Take a message; see `LiveRecording.write`."""
-        held = Held(channel, payload, log_time, publish_time, sequence)
+        message = BufferedMessage(channel, payload, log_time, publish_time, sequence)
         watches = self._watched.get(channel)
         if watches is None:
             watches = self._watched[channel] = tuple(self._watches(channel))
         with self._lock:
-            self._ring.add(held)
+            self._ring.add(message)
             active = self._active
             if active is not None and log_time >= self._until:
                 self._end(active)
@@ -196,16 +196,16 @@ class Snapshots:
                     sequence=sequence,
                     wait=wait,
                 )
-        for reason in _happened(watches, held):
+        for reason in _happened(watches, message):
             self.fire(reason, log_time)
         return taken
 
     def fire(self, reason: str, at: int | None = None) -> None:
-        """Write a snapshot, or go on with the one that is being written.
+        """Start a snapshot, or extend the one that is being written.
 
         Args:
-            reason: A part of the recording's name, and its tag `trigger`.
-            at: When it happened, ns since the epoch; None for now.
+            reason: Part of the recording's name, and its tag `trigger`.
+            at: Time of the event, ns since the epoch; None for now.
         """
         now = time.time_ns() if at is None else at
         until = now + round(self._options.after_s * 1e9)
@@ -224,22 +224,22 @@ class Snapshots:
             self._again(reason)
 
     def look(self) -> None:
-        """End a snapshot whose time is over although nothing comes any more."""
+        """End a snapshot whose time is over, even without further messages."""
         with self._lock:
             if self._active is not None and time.time_ns() >= self._until:
                 self._end(self._active)
             self._lost.extend(self._ledger.take(everything=True))
-            short = self._ring.is_short and not self._told_short
-            self._told_short |= short
-            held = self._ring.held_s
+            short = self._ring.is_short and not self._has_reported_short
+            self._has_reported_short |= short
+            held_s = self._ring.held_s
         if short:
             self._say(
-                f"the ring holds {held:.0f} s of {self._options.ring_s:.0f}: more does not fit "
-                "into the memory budget (--budget)"
+                f"the ring holds only {held_s:.0f} of {self._options.ring_s:.0f} s: more does not "
+                "fit into the memory budget (--budget)"
             )
 
     def close(self) -> list[RecordReport]:
-        """Close the snapshot that is being written; reports of all.
+        """Close the snapshot that is being written, and return the reports of all.
 
         Raises:
             DiskFullError: A snapshot could not be written.
@@ -251,13 +251,13 @@ class Snapshots:
                 self._end(self._active)
         self._worker.shutdown(wait=True)
         for text in self._unmet:
-            self._say(f"no topic fits the trigger {text!r}")
+            self._say(f"no topic matches the trigger {text!r}")
         if self._failure is not None:
             raise self._failure
         return self._reports
 
     def abort(self) -> None:
-        """Let go of everything; snapshots that are complete stay."""
+        """Drop the snapshot that is being written; complete snapshots stay."""
         self._worker.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             active, self._active = self._active, None
@@ -266,13 +266,13 @@ class Snapshots:
 
     @property
     def ledger(self) -> Ledger:
-        """Of the snapshot that is being written; else of the ring."""
+        """Ledger of the snapshot that is being written, else of the ring."""
         active = self._active
         return self._ledger if active is None else active.ledger
 
     @property
     def filled(self) -> float:
-        """How much of its memory budget the snapshot has spent, 0 to 1."""
+        """Used share of the snapshot's memory budget, 0 to 1."""
         active = self._active
         return 0.0 if active is None else active.filled
 
@@ -285,39 +285,39 @@ class Snapshots:
 
     @property
     def lag(self) -> int:
-        """Messages of the snapshot that are not in the index yet."""
+        """Messages of the snapshot that are not indexed yet."""
         active = self._active
         return 0 if active is None else active.lag
 
     @property
     def index_failure(self) -> HybridlogError | None:
-        """Why the index does not go on, None while it does."""
+        """The error that stopped the index, None while it works."""
         active = self._active
         return None if active is None else active.index_failure
 
     @property
     def failure(self) -> BaseException | None:
-        """Why nothing more can be taken, None while it can."""
+        """The error that stopped the recording, None while it works."""
         active = self._active
         return self._failure or (None if active is None else active.failure)
 
     @property
     def count(self) -> int:
-        """Snapshots so far, the one that is being written included."""
+        """Number of snapshots, including the one that is being written."""
         return len(self._reports) + (self._active is not None)
 
     def numbers(self, topic: str, path: str, begin: int) -> list[float]:
-        """What a field has been in the ring's latest messages since a log time, ns."""
+        """Values of a field in the ring's latest messages since a log time, ns."""
         with self._lock:
-            latest = self._ring.latest(topic, begin, _MOST_WATCHED)
+            latest = self._ring.latest(topic, begin, _MAX_WATCHED)
         return [
             number
-            for held in latest
-            for number in numbers_at(codec_for(held.channel).fields(held.payload), path)
+            for message in latest
+            for number in numbers_at(codec_for(message.channel).fields(message.payload), path)
         ]
 
     def _watches(self, channel: Channel) -> Iterator[_Watch]:
-        """The triggers for a channel; says which of them can never fire."""
+        """The triggers for a channel; reports those that can never fire on it."""
         for trigger in self._options.triggers:
             if not trigger.fits(channel.topic):
                 continue
@@ -335,18 +335,18 @@ class Snapshots:
                 yield _Watch(trigger.text, to_bool(trigger.predicate, types), names)
 
     def _write_out(self, reason: str, at: int) -> None:
-        """Start a recording with what the ring holds; runs on the worker."""
+        """Start a recording with the content of the ring; runs on the worker."""
         before = self._options.before_s
         begin = 0 if before is None else at - round(before * 1e9)
         try:
             recording = self._start(reason)
         except HybridlogError as error:
             self._failure = error
-            self._say(f"no snapshot of {reason!r} could be started: {error}")
+            self._say(f"the snapshot for {reason!r} could not be started: {error}")
             return
         with self._lock:
-            # From here on, what comes goes into the ring and into the recording.
-            kept = self._ring.since(begin)
+            # From here on new messages go into the ring and into the recording.
+            messages = self._ring.since(begin)
             lost = [*self._lost, *self._ledger.take(everything=True)]
             self._lost.clear()
             self._active = recording
@@ -362,22 +362,22 @@ class Snapshots:
                 )
         self._say(f"snapshot {recording.label} because of {reason!r}")
         try:
-            for held in kept:
-                while recording.filled > _HALF and recording.failure is None:
+            for message in messages:
+                while recording.filled > _RING_SHARE and recording.failure is None:
                     time.sleep(0.001)
                 recording.write(
-                    held.channel,
-                    held.payload,
-                    log_time=held.log_time,
-                    publish_time=held.publish_time,
-                    sequence=held.sequence,
+                    message.channel,
+                    message.payload,
+                    log_time=message.log_time,
+                    publish_time=message.publish_time,
+                    sequence=message.sequence,
                 )
         except HybridlogError as error:
             self._failure = error
             self._say(f"snapshot {recording.label} is not complete: {error}")
 
     def _end(self, recording: LiveRecording) -> None:
-        """Let the worker close a snapshot. Holds the lock."""
+        """Let the worker close a snapshot; the caller holds the lock."""
         self._active = None
         self._dumping = None
         self._worker.submit(self._close, recording)
@@ -395,15 +395,15 @@ class Snapshots:
         self._stored = (self._stored[0] + stored[0], self._stored[1] + stored[1])
 
 
-def _happened(watches: tuple[_Watch, ...], held: Held) -> Iterator[str]:
-    """The triggers that fire for a message."""
+def _happened(watches: tuple[_Watch, ...], message: BufferedMessage) -> Iterator[str]:
+    """Reasons of the triggers that fire for a message."""
     names = frozenset[str]().union(*(watch.names for watch in watches))
-    message: Mapping[str, object] | None = None
+    fields: Mapping[str, object] | None = None
     for reason, test, _ in watches:
-        if test is not None and message is None:
+        if test is not None and fields is None:
             try:
-                message = codec_for(held.channel).plain(held.payload, names)
+                fields = codec_for(message.channel).plain(message.payload, names)
             except (PayloadError, DefinitionError):
-                message = {}  # it has no fields, as in an answer
-        if test is None or (message is not None and test(message)):
+                fields = {}  # it has no fields, as in an answer
+        if test is None or (fields is not None and test(fields)):
             yield reason

@@ -1,7 +1,8 @@
-"""How a robot's topics are doing: counted at the seam, before anything can be given up.
+"""Statistics of a robot's topics: counts, rates, jitter and silence.
 
-A message costs a few additions. Once a second the sums since the last look become rates,
-and the rates of the last minute say what to expect.
+Messages are counted as sources deliver them, before any can be dropped. A message costs a
+few additions. Once a second the sums become rates; the rates of the last minute give the
+expected rate.
 """
 
 from __future__ import annotations
@@ -11,21 +12,21 @@ from collections import deque
 from dataclasses import dataclass, field
 from statistics import median
 
-_REMEMBERED = 60  # looks whose rates say what is usual
+_RATES = 60  # so many past rates give the expected rate
 _NS = 1e9
 
 
 @dataclass(slots=True)
 class Tally:
-    """What has come on one channel; all of it is written by one thread at a time.
+    """Counters of one channel; one thread at a time updates them.
 
     Attributes:
         messages: Received so far.
         payload_bytes: Received so far.
-        last: When the last one was received, ns since the epoch, 0 before the first.
+        last: Receive time of the last message, ns since the epoch; 0 before the first.
         gaps: Sum of the times between messages since the last look, ns.
         squares: Sum of their squares, ns².
-        counted: How many they are.
+        counted: Number of these times.
     """
 
     messages: int = 0
@@ -49,20 +50,20 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class TopicState:
-    """A topic as it was at one look.
+    """Statistics of a topic at one time.
 
     Attributes:
         topic: Its name.
         type: Its type.
         messages: Received so far.
         payload_bytes: Received so far.
-        hz: Messages a second since the look before.
-        expected_hz: What is usual: the median of the last minute; None when too new.
-        bytes_per_s: Payload bytes a second since the look before.
+        hz: Messages a second since the previous look.
+        expected_hz: Median rate of the last minute; None for a new topic.
+        bytes_per_s: Payload bytes a second since the previous look.
         jitter_ms: Standard deviation of the time between messages, None for too few.
         silent_s: Seconds since the last message, None before the first.
-        thinned: Messages left out because the user wants fewer.
-        lost: Messages lost so far otherwise, as far as they can be counted.
+        thinned: Messages dropped by a throttle.
+        lost: Messages lost otherwise, as far as they can be counted.
     """
 
     topic: str
@@ -80,12 +81,12 @@ class TopicState:
 
 @dataclass(slots=True)
 class TopicRates:
-    """What a topic's tallies become when they are looked at.
+    """Turns the counters of a topic into rates.
 
     Attributes:
         topic: Its name.
         type: Its type.
-        tallies: One a channel.
+        tallies: Counters, one per channel.
     """
 
     topic: str
@@ -93,16 +94,16 @@ class TopicRates:
     tallies: list[Tally] = field(default_factory=list)
     _messages: int = 0
     _bytes: int = 0
-    _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))
 
     def look(self, elapsed_s: float, now: int, *, thinned: int, lost: int) -> TopicState:
-        """The topic now.
+        """The topic's statistics since the last call.
 
         Args:
-            elapsed_s: Since the last look.
-            now: ns since the epoch.
-            thinned: Messages left out by wish so far.
-            lost: Messages lost so far.
+            elapsed_s: Seconds since the last call.
+            now: Current time, ns since the epoch.
+            thinned: Messages dropped by a throttle so far.
+            lost: Messages lost otherwise so far.
         """
         messages = sum(tally.messages for tally in self.tallies)
         size = sum(tally.payload_bytes for tally in self.tallies)
@@ -127,10 +128,10 @@ class TopicRates:
         )
 
     def _jitter(self) -> float | None:
-        """Deviation of the gaps of the channel that has most of them, ms."""
+        """Largest standard deviation of the time between messages of a channel, ms."""
         worst: float | None = None
         for tally in self.tallies:
-            # A message that comes between these lines is counted at the next look.
+            # A message that arrives between these lines counts at the next call.
             count, total, squares = tally.counted, tally.gaps, tally.squares
             tally.counted = tally.gaps = tally.squares = 0
             if count >= 2:
@@ -140,10 +141,10 @@ class TopicRates:
 
 
 class Lateness:
-    """Tells messages that the index should have by now from those that came a moment ago.
+    """Counts the messages that the index should contain by now, and does not.
 
     Args:
-        within_s: Seconds after which the index has a message that came.
+        within_s: Seconds in which an index that keeps up receives a message.
     """
 
     def __init__(self, within_s: float) -> None:
@@ -151,12 +152,12 @@ class Lateness:
         self._seen: deque[tuple[float, int]] = deque()
 
     def late(self, now: float, stored: int, lag: int) -> int:
-        """Messages that are not in the index, and should be.
+        """Number of messages that are overdue in the index.
 
         Args:
-            now: Monotonic, seconds.
-            stored: Messages so far.
-            lag: Of these, those that are not in the index.
+            now: Monotonic clock, seconds.
+            stored: Messages stored so far.
+            lag: Number of these that are not in the index.
         """
         self._seen.append((now, stored))
         due = now - self._within_s

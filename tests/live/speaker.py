@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from hybridlog.live_sources.base import LiveSource, Sink
+from hybridlog.live.sources.base import LiveSource, Sink
 from hybridlog_storage.messages import Channel, Schema
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")

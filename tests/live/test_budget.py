@@ -42,10 +42,10 @@ def test_no_limit_is_the_machine(tmp_path: Path) -> None:
 )
 def test_a_sixteenth(monkeypatch: pytest.MonkeyPatch, memory: int, want: int) -> None:
     monkeypatch.setattr(budget, "memory_bytes", lambda: memory)
-    budget.usual_budget.cache_clear()
+    budget.default_budget.cache_clear()
     try:
-        assert budget.usual_budget() == want
+        assert budget.default_budget() == want
         assert LiveOptions().budget_bytes == RecorderOptions().budget_bytes == want
     finally:
         monkeypatch.undo()
-        budget.usual_budget.cache_clear()
+        budget.default_budget.cache_clear()

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.live.policy import (
-    Keep,
     Priority,
+    Retention,
     Throttle,
     first_fit,
     priority_rule,
-    step,
+    retention,
     throttle_rule,
 )
 from hybridlog_storage.errors import TopicError, UsageError
@@ -68,12 +68,12 @@ def test_a_clock_that_is_set_back_does_not_silence_a_topic() -> None:
 
 @given(filled=st.floats(0, 2))
 def test_who_has_the_higher_priority_never_keeps_less(filled: float) -> None:
-    low, normal, high = (step(priority, filled) for priority in Priority)
+    low, normal, high = (retention(priority, filled) for priority in Priority)
     assert low >= normal >= high
     if filled < 0.5:
-        assert low is Keep.ALL
+        assert low is Retention.ALL
     if filled >= 0.95:
-        assert high is Keep.FIELDS
+        assert high is Retention.FIELDS
 
 
 def test_rules() -> None:
@@ -91,7 +91,7 @@ def test_a_rate_that_is_none(rate: str) -> None:
 
 
 def test_a_priority_that_is_none() -> None:
-    with pytest.raises(UsageError, match="low, normal and high"):
+    with pytest.raises(UsageError, match="low, normal or high"):
         priority_rule("/scan", "urgent")
     with pytest.raises(TopicError):
         priority_rule("re:(", "low")

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
-from hybridlog.live.door import choose, running, visit
+from hybridlog.live.control_server import choose, request, running
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveRecording
@@ -428,21 +428,21 @@ def test_visitors(store: hl.Store) -> None:
         one.recorder.name,
         other.recorder.name,
     }
-    with pytest.raises(UsageError, match="Several recordings"):
+    with pytest.raises(UsageError, match="Several recorders"):
         choose(here, [])
-    with pytest.raises(UsageError, match="not being recorded now"):
+    with pytest.raises(UsageError, match="No running recorder matches"):
         choose(here, ["nothing"])
     one.speaker.say(text_channel(), text("a"))
     one.recorder.look()
-    state = visit(here, name, "state")
+    state = request(here, name, "state")
     assert state["topics"][0]["messages"] == 1
     assert recorder_module.summary_of(recorder_module.state_of(state)) == state
-    visit(here, name, "mark", text="here", tags={})
+    request(here, name, "mark", text="here", tags={})
     for bad in ({"text": 1, "tags": {}}, {"text": "a", "tags": {"a": 1}}, {"text": "a"}):
         with pytest.raises(UsageError, match="tags"):
-            visit(here, name, "mark", **bad)
+            request(here, name, "mark", **bad)
     with pytest.raises(UsageError, match="mark, numbers, state, stop, trigger"):
-        visit(here, name, "dance")
+        request(here, name, "dance")
     # Who says nothing, or nonsense, or does not stop, is let go, and keeps nobody out.
     path = json.loads((here / "recorders" / f"{name}.json").read_text())["socket"]
     assert Path(path).stat().st_uid == os.geteuid()
@@ -451,13 +451,13 @@ def test_visitors(store: hl.Store) -> None:
         silent.connect(path)
         wild.connect(path)
         wild.sendall(b"[" * 100_000 + b"\n")
-        assert b"no such request" in wild.recv(1000)
-        assert visit(here, name, "state")
-    visit(here, name, "stop")
+        assert b"unknown request" in wild.recv(1000)
+        assert request(here, name, "state")
+    request(here, name, "stop")
     assert one.recorder.wait(1)
     one.recorder.stop()
-    with pytest.raises(StoreError, match="No recorder answers"):
-        visit(here, name, "state")
+    with pytest.raises(StoreError, match="does not answer"):
+        request(here, name, "state")
     assert not Path(path).parent.exists()
     assert running(here) == [other.recorder.name]
     other.recorder.stop()
@@ -559,7 +559,7 @@ def test_the_reserve_holds_for_what_waits_in_memory(
 def test_what_is_expected_is_ready_before_its_first_message(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_module, "_MOST_EXPECTED", 2)
+    monkeypatch.setattr(recorder_module, "_MAX_EXPECTED", 2)
     database = store.database_for("This")
     robot = Running(store)
     channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]

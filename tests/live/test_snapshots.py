@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.live.door import visit
+from hybridlog.live.control_server import request
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.ring import Held, Ring
+from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Trigger
 from hybridlog.losses import Cause
 from hybridlog.marks import MARKS
@@ -35,12 +35,12 @@ LATCHED = Channel("/map", "ros1", TEXT, {"latching": "1"}, has_publish_time=Fals
 )
 def test_a_ring_is_the_end_of_what_came(steps: list[tuple[int, int]], back: int) -> None:
     ring = Ring(20 * SECOND, 2000)
-    came: list[Held] = []
+    came: list[BufferedMessage] = []
     now = T
     channel = text_channel()
     for step, size in steps:
         now += step * SECOND
-        came.append(Held(channel, bytes(size), now, None, len(came)))
+        came.append(BufferedMessage(channel, bytes(size), now, None, len(came)))
         ring.add(came[-1])
         assert ring.payload_bytes <= 2000
     kept = ring.since(now - back * SECOND)
@@ -58,10 +58,10 @@ def test_a_ring_is_the_end_of_what_came(steps: list[tuple[int, int]], back: int)
 
 def test_latched_messages_stay_and_stand_in_front() -> None:
     ring = Ring(10 * SECOND, 1 << 20)
-    ring.add(Held(LATCHED, b"old", T - 100 * SECOND, None, 0))
-    ring.add(Held(LATCHED, b"map", T, None, 0))
+    ring.add(BufferedMessage(LATCHED, b"old", T - 100 * SECOND, None, 0))
+    ring.add(BufferedMessage(LATCHED, b"map", T, None, 0))
     for second in range(60):
-        ring.add(Held(text_channel(), b"x", T + second * SECOND, None, 0))
+        ring.add(BufferedMessage(text_channel(), b"x", T + second * SECOND, None, 0))
     front, *rest = ring.since(T + 55 * SECOND)
     assert (front.payload, front.log_time, front.publish_time) == (b"map", T + 55 * SECOND, T)
     assert len(rest) == 5
@@ -191,7 +191,7 @@ def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
     assert "'/scan: nope == 1' can never fire on /scan: " in said
     assert "there is no field nope" in said
     assert """'/scan: near == "x"' can never fire on /scan: """ in said
-    assert "no topic fits the trigger '/nowhere: a == 1'" in said
+    assert "no topic matches the trigger '/nowhere: a == 1'" in said
     assert said.count("near > 1") == 1  # the snapshot itself
 
 
@@ -226,7 +226,7 @@ def test_fields_of_the_ring_can_be_watched(store: hl.Store) -> None:
         robot.speaker.say(scan_channel(), scan(number, 10), now + number)
 
     def asked(**content: object) -> dict[str, object]:
-        return visit(store.directory.path, robot.recorder.name, "numbers", **content)
+        return request(store.directory.path, robot.recorder.name, "numbers", **content)
 
     assert asked(topic="/scan", path="near", begin=now + 4) == {
         "n": 6,
@@ -237,6 +237,6 @@ def test_fields_of_the_ring_can_be_watched(store: hl.Store) -> None:
     assert asked(topic="/scan", path="data.max", begin=now)["greatest"] == 9
     assert asked(topic="/scan", path="nope", begin=now) == {"n": 0}
     assert asked(topic="/other", path="near", begin=now) == {"n": 0}
-    with pytest.raises(UsageError, match="a field has a topic"):
+    with pytest.raises(UsageError, match="a field needs a topic"):
         asked(topic="/scan", path=5, begin=now)
     robot.recorder.stop()

@@ -1,0 +1,284 @@
+"""Control socket of a running recorder: state, marks, triggers, stop.
+
+The server listens on a unix socket that only its owner can open. A client sends one JSON
+object on a line and gets one back. While the recorder runs, a socket file in the store's
+directory `recorders` holds the path of the socket.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hybridlog_storage import files
+from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.socket_directory import is_our_socket, new_socket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""Computes the answer to a request; raises `HybridlogError` to refuse it."""
+
+_ODD = re.compile(r"[^A-Za-z0-9._-]+")
+_SOCKET_FILES = "recorders"
+_SUFFIX = ".json"
+
+_MAX_SOCKET_FILE = 1 << 16  # bytes
+_MAX_REQUEST = 1 << 20  # bytes of a request; answers may be longer
+_MAX_ANSWER = 1 << 26
+_TIMEOUT_S = 5.0
+_MAX_CLIENTS = 8
+
+
+class ControlServer:
+    """Answers requests of other processes until it is closed.
+
+    Args:
+        store: The store's directory.
+        name: Name of the recorder, which is that of its recording.
+        requests: Handler of each kind of request.
+
+    Raises:
+        StoreError: The socket cannot be created.
+    """
+
+    def __init__(self, store: Path, name: str, requests: Mapping[str, Answer]) -> None:
+        self.name = name
+        self._requests = requests
+        self._socket_file = _socket_file(store, name)
+        self._path = new_socket(store, "control.sock")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._socket.bind(str(self._path))
+            self._socket.listen(_MAX_CLIENTS)
+        except OSError as error:
+            self.close()
+            raise StoreError(
+                f"The recorder's socket {self._path} cannot be created: {error.strerror}."
+            ) from error
+        try:
+            self._write_socket_file()
+        except OSError as error:
+            self.close()
+            raise StoreError(
+                f"The socket file {self._socket_file} cannot be created: {error.strerror}. "
+                f"Check the owner of {self._socket_file.parent}, and that it is a folder and "
+                "not a symlink."
+            ) from error
+        self._free_clients = threading.BoundedSemaphore(_MAX_CLIENTS)
+        self._thread = threading.Thread(target=self._serve, name="hybridlog-control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop answering, and remove socket and socket file."""
+        # Closing alone does not wake a thread in `accept`.
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        with suppress(OSError):
+            files.unlink(self._socket_file, depth=files.IN_FOLDER)
+        with suppress(OSError):
+            self._path.unlink()
+        with suppress(OSError):
+            self._path.parent.rmdir()
+
+    def _write_socket_file(self) -> None:
+        with suppress(FileExistsError):
+            files.make_folder(self._socket_file.parent, depth=files.IN_STORE)
+        content = json.dumps({"socket": str(self._path), "pid": os.getpid()}) + "\n"
+        files.write_file(self._socket_file, content.encode(), depth=files.IN_FOLDER, sync=False)
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                client, _ = self._socket.accept()
+            except OSError:
+                return  # closed
+            if self._free_clients.acquire(timeout=_TIMEOUT_S):
+                threading.Thread(target=self._handle, args=(client,), daemon=True).start()
+            else:
+                client.close()
+
+    def _handle(self, client: socket.socket) -> None:
+        """Answer one client, unless it is silent or its request is too long."""
+        try:
+            with client, suppress(OSError):
+                client.settimeout(_TIMEOUT_S)
+                line = _line(client, _MAX_REQUEST)
+                client.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+        finally:
+            self._free_clients.release()
+
+    def _answer(self, line: bytes) -> Mapping[str, Any]:
+        try:
+            request = json.loads(line)
+            answer = self._requests[request["ask"]]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            known = ", ".join(sorted(self._requests))
+            return {"error": f"unknown request; choose one of: {known}", "exit_code": 2}
+        try:
+            return answer(request)
+        except HybridlogError as error:
+            return {"error": str(error), "exit_code": error.exit_code}
+
+
+def running(store: Path) -> list[str]:
+    """Names of the recorders that run on a store, in the order of their start.
+
+    Args:
+        store: The store's directory.
+    """
+    found: list[tuple[float, str]] = []
+    try:
+        socket_files = files.names(store / _SOCKET_FILES, depth=files.IN_STORE)
+    except OSError:
+        return []
+    for file_name, about in socket_files.items():
+        name, suffix = os.path.splitext(file_name)  # noqa: PTH122 - not a path
+        if suffix != _SUFFIX or file_name[0] == ".":
+            continue
+        # A recorder that was killed leaves its socket file behind.
+        with suppress(OSError, StoreError):
+            _connect(store, name).close()
+            found.append((about.st_mtime, name))
+    return [name for _, name in sorted(found)]
+
+
+def request(store: Path, name: str, ask: str, **content: Any) -> dict[str, Any]:
+    """Send a request to a running recorder.
+
+    Args:
+        store: The store's directory.
+        name: The recorder's name.
+        ask: Kind of the request.
+        content: Further fields of the request.
+
+    Raises:
+        StoreError: The recorder does not answer.
+        UsageError: The recorder refuses.
+    """
+    try:
+        with _connect(store, name) as connection:
+            connection.sendall(json.dumps({"ask": ask, **content}).encode() + b"\n")
+            answer = json.loads(_line(connection, _MAX_ANSWER))
+    except (OSError, ValueError) as error:
+        raise StoreError(_gone(name)) from error
+    if not isinstance(answer, dict):
+        raise StoreError(_gone(name))
+    if "error" in answer:
+        raise UsageError(str(answer["error"]))
+    return answer
+
+
+def _socket_file(store: Path, name: str) -> Path:
+    return store / _SOCKET_FILES / f"{_as_id(name)}{_SUFFIX}"
+
+
+def _as_id(name: str) -> str:
+    """The name as it appears in ids and file names."""
+    return _ODD.sub("-", name).strip("-.") or "-"
+
+
+def _gone(name: str) -> str:
+    return f"The recorder {name!r} does not answer; it has ended or was killed."
+
+
+def _connect(store: Path, name: str) -> socket.socket:
+    """A connection to a recorder's socket.
+
+    Raises:
+        StoreError: No socket exists, or it belongs to another user.
+        OSError: The recorder does not answer.
+    """
+    try:
+        text = files.read_file(_socket_file(store, name), _MAX_SOCKET_FILE, depth=files.IN_FOLDER)
+        path = json.loads(text)["socket"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise StoreError(_gone(name)) from error
+    if not isinstance(path, str) or not is_our_socket(path):
+        raise StoreError(_gone(name))
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        connection.settimeout(_TIMEOUT_S)
+        connection.connect(path)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def states(store: Path, name: str, every_s: float) -> Iterator[dict[str, Any]]:
+    """Poll the state of a recorder until it ends."""
+    while True:
+        started = time.monotonic()
+        try:
+            yield request(store, name, "state")
+        except StoreError:
+            return
+        time.sleep(max(every_s - (time.monotonic() - started), 0))
+
+
+def _line(connection: socket.socket, max_bytes: int) -> bytes:
+    parts: list[bytes] = []
+    size = 0
+    while True:
+        part = connection.recv(1 << 16)
+        parts.append(part)
+        size += len(part)
+        if not part or part.endswith(b"\n"):
+            return b"".join(parts)
+        if size > max_bytes:
+            raise OSError("the message is too long")
+
+
+def choose(store: Path, named: Sequence[str]) -> list[str]:
+    """Resolve the names of running recorders; without names, the only one.
+
+    Args:
+        store: The store's directory.
+        named: Names by the user: id or name of a recording, or the beginning of the id. A
+            recorder with a ring has the name of its future snapshots.
+
+    Raises:
+        UsageError: No recorder runs, several run and no name is given, or a name matches
+            none or several.
+    """
+    names = running(store)
+    if named:
+        return list(dict.fromkeys(_resolve(name, names) for name in named))
+    if not names:
+        raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
+    if len(names) > 1:
+        raise UsageError(f"Several recorders run; name one of {', '.join(names)}.")
+    return names
+
+
+def _resolve(name: str, running_names: Sequence[str]) -> str:
+    """The running recorder that a user's name means.
+
+    Raises:
+        UsageError: No recorder matches, or several do.
+    """
+    wanted = _as_id(name)
+    ring = re.compile(rf"{re.escape(wanted)}-ring-\d+")
+    fitting = (
+        [one for one in running_names if one == name]
+        or [one for one in running_names if one == wanted]
+        or [one for one in running_names if ring.fullmatch(one)]
+        or [one for one in running_names if name and one.startswith(name)]
+    )
+    if len(fitting) > 1:
+        raise UsageError(f"{name!r} is ambiguous: it may be {', '.join(fitting)}.")
+    if not fitting:
+        known = ", ".join(running_names) or "none"
+        raise UsageError(f"No running recorder matches {name!r}; running: {known}.")
+    return fitting[0]

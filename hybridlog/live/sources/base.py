@@ -1,0 +1,172 @@
+"""Interface between a robot's middleware and the recorder: `LiveSource` and `Sink`.
+
+A source runs its own threads. It reports topics that appear and disappear to its sink, and
+passes on every message at once, as it was on the wire. A source that leaves a socket unread
+makes a publisher drop messages silently. So a sink may be called from any thread, and never
+waits for a disk or a database.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Protocol, Self
+
+from hybridlog.losses import Cause
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from hybridlog_storage.messages import Channel
+
+
+__all__ = ["Cause", "LiveSource", "Sink"]
+
+
+class Sink(Protocol):
+    """Receiver of a source's messages and events.
+
+    Thread safe; no method waits for disk or database.
+    """
+
+    def wants(self, topic: str, type_name: str) -> bool:
+        """Tells whether a topic is to be recorded. Costs microseconds.
+
+        A source asks for each new topic, and subscribes to nothing else.
+
+        Args:
+            topic: Name as the source spells it.
+            type_name: Type as the source spells it, empty if not known yet.
+        """
+        ...
+
+    def expect(self, channel: Channel) -> None:
+        """Prepare for a channel, before its first message. Takes some milliseconds.
+
+        Args:
+            channel: The object that `take` will get.
+        """
+        ...
+
+    def take(
+        self,
+        channel: Channel,
+        payload: bytes,
+        *,
+        received: int,
+        sent: int | None = None,
+        sequence: int | None = None,
+    ) -> None:
+        """Take a message. Messages of one channel come from one thread at a time.
+
+        Args:
+            channel: Topic, encoding and definition: the same object for all messages of
+                a connection. `has_publish_time` says whether `sent` is given.
+            payload: The serialized message; it must not change afterwards.
+            received: Receive time, ns since the epoch.
+            sent: Send time by the sender's clock, ns since the epoch, if known.
+            sequence: Sequence number of the sender, if known.
+        """
+        ...
+
+    def lost(
+        self,
+        topic: str,
+        cause: Cause,
+        count: int | None,
+        *,
+        first: int,
+        last: int,
+        detail: str = "",
+    ) -> None:
+        """Note messages that are lost.
+
+        Args:
+            topic: Their topic; empty if unknown.
+            cause: Cause of the loss.
+            count: Number of messages, None if unknown.
+            first: Begin of the loss by the recorder's clock, ns since the epoch.
+            last: End of the loss, likewise.
+            detail: Text for the user: a publisher's name, a reason.
+        """
+        ...
+
+    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
+        """Note the number of publishers of a wanted topic, at least one."""
+        ...
+
+    def topic_gone(self, topic: str) -> None:
+        """Note that a topic has no publishers left."""
+        ...
+
+    def say(self, text: str) -> None:
+        """Show the user a problem and its remedy; recording goes on.
+
+        Args:
+            text: One line. The same text is shown once.
+        """
+        ...
+
+    def ended(self, reason: str = "") -> None:
+        """Note that the source has ended by itself.
+
+        Args:
+            reason: The error that ended it; empty after a regular end.
+        """
+        ...
+
+
+class LiveSource(ABC):
+    """A source of messages. Start it once; as a context manager it stops at the end.
+
+    Attributes:
+        kind: `ROS 1`, `ROS 2`, `Foxglove`, `replay`.
+        address: Address of the peer, as the catalog shows it.
+        was_reached: The peer has answered at least once; always True without a peer.
+    """
+
+    kind: str
+    address: str
+    was_reached: bool = True
+
+    def check(self) -> None:  # noqa: B027 - most sources cannot check anything
+        """Raise the errors of `start` before a recording is created.
+
+        Raises:
+            UsageError: An address or another setting is invalid.
+            SourceError: The source can never work.
+            MissingDependencyError: A required package is not installed.
+        """
+
+    @abstractmethod
+    def start(self, sink: Sink) -> None:
+        """Begin to listen.
+
+        Temporary problems (a master that is not up yet, a publisher that dies) do not
+        raise: the source reports them, and retries with growing pauses.
+
+        Raises:
+            UsageError: An address or another setting is invalid.
+            SourceError: The source can never work, such as a file that is not a log.
+            MissingDependencyError: A required package is not installed.
+        """
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop listening. May be called more than once.
+
+        Passes on the messages received so far, and does not call the sink after it has
+        returned. Takes at most a few seconds, whatever the peers do.
+        """
+
+    def __enter__(self) -> Self:
+        """The source itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop."""
+        self.stop()

@@ -1,0 +1,1 @@
+"""Foxglove: a client of a Foxglove WebSocket server."""

@@ -1,0 +1,97 @@
+"""Recording from a Foxglove WebSocket server: foxglove_bridge, or a program with its SDK.
+
+Losses that can be detected, and those that cannot:
+
+* A server queues messages for each client (the SDK 1024, the bridge some megabytes), and
+  silently drops the oldest when a client is slow: the protocol has no sequence numbers.
+  So this source has a thread that only reads. At tens of thousands of messages a second a
+  queue of 1024 overflows within a moment: raise the server's `message_backlog_size`.
+* ROS 1 messages that begin with a header carry a sequence number (see `sequence_gaps`).
+  A gap is reported as lost in transport, wherever the messages were lost: in the
+  publisher, the bridge or its queue. Other messages have no numbers.
+* While the connection is down, the number of lost messages is unknown. Once the topic is
+  back, the loss ledger gets a row without a count.
+
+The server's log time of a message becomes its send time. With simulated time it may lie
+in another century.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Final
+
+from hybridlog.live.sources.base import LiveSource, Sink
+from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
+from hybridlog_storage.errors import MissingDependencyError, UsageError
+
+_JOIN_S: Final = 5.0
+_MIN_MESSAGE_BYTES: Final = 1 << 20
+
+
+class FoxgloveSource(LiveSource):
+    """A client of one Foxglove WebSocket server. TLS certificates are checked.
+
+    It reconnects with growing pauses. After that the server's channels may have other
+    numbers.
+
+    Args:
+        url: Address, such as `ws://robot:8765`, optionally with user and password. Proxies
+            of the environment are not used.
+        max_message_bytes: Largest payload, at least 1 MiB. Larger messages are skipped and
+            noted in the loss ledger.
+
+    Raises:
+        UsageError: The limit is too small.
+    """
+
+    kind = "Foxglove"
+
+    def __init__(self, url: str, *, max_message_bytes: int = 1 << 30) -> None:
+        if max_message_bytes < _MIN_MESSAGE_BYTES:
+            raise UsageError("the maximum message size must be at least 1 MiB")
+        self._url = url
+        self.address = without_user(url)
+        self.was_reached = False
+        self._limit = max_message_bytes
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def check(self) -> None:
+        """Check the address.
+
+        Raises:
+            UsageError: The address is invalid.
+        """
+        parse_address(self._url)
+
+    def start(self, sink: Sink) -> None:
+        """Begin to listen; the server need not be up yet.
+
+        Raises:
+            UsageError: The address is invalid.
+            MissingDependencyError: `websockets` is not installed.
+        """
+        address = parse_address(self._url)
+        try:
+            from hybridlog.live.sources.foxglove.client import Client
+        except ImportError as error:
+            raise MissingDependencyError(
+                "recording from Foxglove needs websockets: pip install 'hybridlog[foxglove]'"
+            ) from error
+        client = Client(sink, address, self._limit, self._stop, self._reached)
+        self._thread = threading.Thread(target=client.run, name="hybridlog-foxglove", daemon=True)
+        self._thread.start()
+
+    def _reached(self) -> None:
+        self.was_reached = True
+
+    def stop(self) -> None:
+        """Close the connection after the messages that are under way.
+
+        A hanging look-up of a host name may keep the thread alive longer; it then ends
+        without calling the sink.
+        """
+        self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_S)

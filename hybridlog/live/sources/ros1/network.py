@@ -1,0 +1,175 @@
+"""Addresses of peers, and connections that never block the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import threading
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import urlsplit
+
+from hybridlog.live.sources.text import one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Addresses = Sequence[tuple[int, tuple[object, ...]]]
+
+PATIENCE_S: Final = 5.0
+"""Time limit for a look-up, a connection or an answer."""
+
+_MAX_ADDRESSES = 8
+
+
+class PeerError(Exception):
+    """A peer is unreachable or violates the protocol; the message names the problem."""
+
+
+class UnreachedError(PeerError):
+    """A peer does not answer."""
+
+
+class Endpoint(NamedTuple):
+    """Host and port of a program.
+
+    Attributes:
+        host: Name or address, without brackets.
+        port: 1 to 65535.
+    """
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        """The endpoint as in a URI."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def endpoint_of(uri: str, default_port: int | None = None) -> Endpoint:
+    """Host and port of an `http` address.
+
+    Nodes on IPv6 may omit the brackets (`http://::1:4711/`): the last colon counts.
+
+    Raises:
+        PeerError: The address is invalid.
+    """
+    wrong = PeerError(f"{one_line(uri)!r} is not an address like http://host:port")
+    try:
+        parts = urlsplit(uri)
+    except ValueError as error:
+        raise wrong from error
+    place = parts.netloc
+    if parts.scheme != "http" or "@" in place or not uri.isascii() or not uri.isprintable():
+        raise wrong
+    if place.startswith("["):
+        host, _, port = place[1:].partition("]")
+        port = port.removeprefix(":")
+    else:
+        host, _, port = place.rpartition(":") if ":" in place else (place, "", "")
+    if not port and default_port is not None:
+        port = str(default_port)
+    if not host or not (port.isdecimal() and 0 < int(port[:6]) < 65536):
+        raise wrong
+    return Endpoint(host, int(port))
+
+
+def reason_of(error: Exception) -> str:
+    """The reason of an error, in a few words for the user."""
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    if isinstance(error, OSError) and error.errno and not isinstance(error, socket.gaierror):
+        return os.strerror(error.errno)
+    return one_line(getattr(error, "strerror", None) or str(error))
+
+
+class Network:
+    """Connects to peers. Belongs to one event loop.
+
+    Names are looked up in threads, one at a time per name, since a look-up cannot be
+    interrupted. One that takes too long ends with the resolver's own timeout.
+    """
+
+    def __init__(self) -> None:
+        self._lookups: dict[str, asyncio.Future[Addresses]] = {}
+
+    async def connect(self, endpoint: Endpoint) -> socket.socket:
+        """A connected socket that does not block.
+
+        Raises:
+            OSError: The connection is refused, the name is unknown, or the peer does not answer.
+        """
+        loop = asyncio.get_running_loop()
+        failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
+        addresses = await self.addresses_of(endpoint.host)
+        for family, (host, _, *scope) in addresses[:_MAX_ADDRESSES]:
+            made = socket.socket(family, socket.SOCK_STREAM)
+            try:
+                made.setblocking(False)
+                address = (host, endpoint.port, *scope)
+                async with asyncio.timeout(PATIENCE_S):
+                    await loop.sock_connect(made, address)
+                if made.getsockname() == made.getpeername():
+                    # The socket got the wanted port itself, and is connected to itself.
+                    raise ConnectionRefusedError("connection refused")
+            except OSError as error:
+                made.close()
+                failure = error
+            except BaseException:
+                made.close()
+                raise
+            else:
+                return made
+        raise failure
+
+    async def addresses_of(self, host: str) -> Addresses:
+        """Address families and addresses (with port 0) of a host.
+
+        Raises:
+            OSError: The name is unknown, or the resolver does not answer.
+        """
+        try:
+            return _look_up(host, socket.AI_NUMERICHOST)
+        except OSError:
+            pass  # a name
+        lookup = self._lookups.get(host)
+        if lookup is None:
+            lookup = self._lookups[host] = _in_thread(host)
+            lookup.add_done_callback(lambda _: self._lookups.pop(host))
+        async with asyncio.timeout(PATIENCE_S):
+            return await asyncio.shield(lookup)
+
+
+def _look_up(host: str, flags: int = 0) -> Addresses:
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM, flags=flags)
+    except ValueError as error:
+        raise OSError(f"{one_line(host)} is not a host name") from error
+    return [(int(family), address) for family, _, _, _, address in found]
+
+
+def _in_thread(host: str) -> asyncio.Future[Addresses]:
+    """Looks up a name in its own thread."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[Addresses] = loop.create_future()
+
+    def settle(found: Addresses | OSError) -> None:
+        if isinstance(found, OSError):
+            answer.set_exception(found)
+            answer.exception()  # retrieved, since its caller may be gone
+        else:
+            answer.set_result(found)
+
+    def work() -> None:
+        found: Addresses | OSError
+        try:
+            found = _look_up(host)
+        except OSError as error:
+            found = error
+        # The loop may have ended meanwhile.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(settle, found)
+
+    threading.Thread(target=work, name="ros1-look-up", daemon=True).start()
+    return answer

@@ -1,0 +1,251 @@
+"""XML-RPC client and server for ROS, in an event loop, bounded in time and memory.
+
+The client and server of the standard library block, trust any length and read without
+limit, but peers are untrusted. So this module implements HTTP 1.0 (one call a connection,
+no chunks), and uses the library only for XML.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import xmlrpc.client
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
+
+from hybridlog.live.sources.ros1.network import (
+    PATIENCE_S,
+    Endpoint,
+    Network,
+    PeerError,
+    UnreachedError,
+    endpoint_of,
+    reason_of,
+)
+from hybridlog.live.sources.text import one_line
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Mapping
+
+    Method = Callable[[tuple[object, ...]], list[object]]
+
+
+class RefusedError(PeerError):
+    """A peer refuses a valid call."""
+
+
+_MAX_ANSWER: Final = 32 << 20
+_MAX_REQUEST: Final = 4 << 20
+_MAX_HTTP_HEADER: Final = 64 << 10
+_MAX_CLIENTS: Final = 64
+
+
+# Calling.
+
+
+async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
+    """Calls a method of the master or of a node, and returns its value.
+
+    Raises:
+        UnreachedError: The peer does not answer within 10 s.
+        PeerError: The answer is malformed.
+        RefusedError: The peer refuses.
+    """
+    endpoint = endpoint_of(uri)
+    path = urlsplit(uri).path or "/RPC2"
+    body = xmlrpc.client.dumps(arguments, method).encode(errors="replace")
+    head = (
+        f"POST {path} HTTP/1.0\r\nHost: {endpoint}\r\nContent-Type: text/xml\r\n"
+        f"Content-Length: {len(body)}\r\n\r\n"
+    )
+    try:
+        async with asyncio.timeout(2 * PATIENCE_S):
+            with await network.connect(endpoint) as connected:
+                answer = await _exchange(connected, head.encode("ascii") + body)
+    except OSError as error:
+        raise UnreachedError(reason_of(error)) from error
+    values, _ = _parsed(answer)
+    return _value_of(values[0] if values else None)
+
+
+async def _exchange(connected: socket.socket, request: bytes) -> bytes:
+    """Sends a request, and returns the body of the answer."""
+    loop = asyncio.get_running_loop()
+    await loop.sock_sendall(connected, request)
+    got = bytearray()
+    total: int | None = None
+    body = -1
+    while total is None or len(got) < total:
+        data = await loop.sock_recv(connected, 64 << 10)
+        if not data:
+            break
+        got += data
+        if body < 0:
+            body = got.find(b"\r\n\r\n")
+            if body < 0 and len(got) > _MAX_HTTP_HEADER:
+                raise PeerError("it answers with an endless header")
+            if body >= 0:
+                body += 4
+                length = _content_length(bytes(got[:body]))
+                total = None if length is None else body + length
+        if body >= 0 and max(total or 0, len(got)) > body + _MAX_ANSWER:
+            raise PeerError(f"its answer is longer than {_MAX_ANSWER >> 20} MiB")
+    if body < 0:
+        raise PeerError("it does not speak HTTP")
+    if total is not None and len(got) < total:
+        raise PeerError("it closed in the middle of its answer")
+    status = bytes(got[: got.find(b"\r\n")]).split(None, 2)
+    if len(status) < 2 or not status[0].startswith(b"HTTP/"):
+        raise PeerError("it does not speak HTTP")
+    if status[1] != b"200":
+        raise PeerError(f"it answers {one_line(b' '.join(status[1:]))}")
+    return bytes(got[body:total])
+
+
+def _content_length(head: bytes) -> int | None:
+    """The content length in an HTTP header, None if it has none."""
+    for line in head.split(b"\r\n")[1:]:
+        name, _, value = line.partition(b":")
+        if name.strip().lower() == b"content-length":
+            value = value.strip()
+            if not value.isdigit() or len(value) > 12:
+                raise PeerError("it sends an invalid content length")
+            return int(value)
+        if name.strip().lower() == b"transfer-encoding":
+            raise PeerError("it answers in chunks, which HTTP 1.0 does not have")
+    return None
+
+
+def _parsed(body: bytes) -> tuple[tuple[object, ...], str | None]:
+    """Values and method name of an XML-RPC text."""
+    # ROS nodes send none, and entities let small texts expand.
+    if b"<!DOCTYPE" in body or b"<!ENTITY" in body:
+        raise PeerError("it sends XML with a document type")
+    try:
+        return xmlrpc.client.loads(body)
+    except xmlrpc.client.Fault as fault:
+        raise PeerError(f"it answers: {one_line(str(fault.faultString))}") from fault
+    except (
+        ExpatError,
+        xmlrpc.client.ResponseError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
+        # The library raises all of these for malformed XML-RPC.
+        raise PeerError("it sends malformed XML-RPC") from error
+
+
+def _value_of(answer: object) -> object:
+    """The value in a ROS answer, a list of status, text and value."""
+    if not isinstance(answer, list) or len(answer) != 3 or not isinstance(answer[0], int):
+        raise PeerError("its answer is not that of a ROS node")
+    if answer[0] != 1:
+        raise RefusedError(f"it refuses: {one_line(str(answer[1]))}")
+    value: object = answer[2]
+    return value
+
+
+# Being called.
+
+
+class RpcServer:
+    """Answers calls on one socket, which it owns.
+
+    Attributes:
+        endpoint: Its address.
+    """
+
+    def __init__(self, listening: socket.socket, methods: Mapping[str, Method]) -> None:
+        self._socket = listening
+        self._methods = methods
+        self._clients: set[asyncio.Task[None]] = set()
+        host, port = listening.getsockname()[:2]
+        self.endpoint = Endpoint(host, port)
+
+    async def serve(self) -> None:
+        """Answers calls until cancelled; then closes all sockets."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                while len(self._clients) >= _MAX_CLIENTS:
+                    await asyncio.wait(self._clients, return_when=asyncio.FIRST_COMPLETED)
+                await self._wait_for_call()
+                try:
+                    # The loop's `sock_accept` loses an accepted client if it is cancelled
+                    # at that moment. Here nothing waits after `accept`.
+                    client, _ = self._socket.accept()
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    # The client is gone already, or no descriptors are left.
+                    await asyncio.sleep(0.1)
+                    continue
+                client.setblocking(False)
+                task = loop.create_task(self._answer(client))
+                self._clients.add(task)
+                task.add_done_callback(self._clients.discard)
+                # Closes it even if the task is cancelled before it begins.
+                task.add_done_callback(partial(_close, client))
+        finally:
+            self._socket.close()
+            for task in tuple(self._clients):
+                task.cancel()
+            await asyncio.gather(*self._clients, return_exceptions=True)
+
+    async def _wait_for_call(self) -> None:
+        """Waits for a client."""
+        loop = asyncio.get_running_loop()
+        called = asyncio.Event()
+        loop.add_reader(self._socket, called.set)
+        try:
+            await called.wait()
+        finally:
+            loop.remove_reader(self._socket)
+
+    async def _answer(self, client: socket.socket) -> None:
+        """Answers one call; malformed calls close the connection."""
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(OSError, PeerError):
+            async with asyncio.timeout(PATIENCE_S):
+                values, method = _parsed(await self._request(client))
+                body = self._result(method, values).encode()
+                head = (
+                    "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\n"
+                    f"Content-Length: {len(body)}\r\n\r\n"
+                )
+                await loop.sock_sendall(client, head.encode() + body)
+
+    async def _request(self, client: socket.socket) -> bytes:
+        loop = asyncio.get_running_loop()
+        got = bytearray()
+        while (end := got.find(b"\r\n\r\n")) < 0:
+            data = await loop.sock_recv(client, 64 << 10)
+            if not data or len(got) > _MAX_HTTP_HEADER:
+                raise PeerError("it does not speak HTTP")
+            got += data
+        length = _content_length(bytes(got[:end]))
+        if not got.startswith(b"POST ") or length is None or length > _MAX_REQUEST:
+            raise PeerError("its call is malformed")
+        while len(got) < end + 4 + length:
+            data = await loop.sock_recv(client, 64 << 10)
+            if not data:
+                raise PeerError("it closed in the middle of its call")
+            got += data
+        return bytes(got[end + 4 : end + 4 + length])
+
+    def _result(self, method: str | None, values: tuple[object, ...]) -> str:
+        known = self._methods.get(method or "")
+        if known is None:
+            fault = xmlrpc.client.Fault(1, f"unknown method {one_line(method or '')}")
+            return xmlrpc.client.dumps(fault, methodresponse=True)
+        return xmlrpc.client.dumps((known(values),), methodresponse=True)
+
+
+def _close(client: socket.socket, _: asyncio.Task[None]) -> None:
+    client.close()

@@ -1,0 +1,251 @@
+"""One topic and the connections to its publishers, which reconnect after failures."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.live.sources.ros1.handshake import subscribe
+from hybridlog.live.sources.ros1.network import PeerError
+from hybridlog.live.sources.ros1.stream import Stream
+from hybridlog.live.sources.ros1.wire import ANY, channel_of
+from hybridlog.live.sources.text import one_line
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Coroutine, Iterable, Mapping
+
+    from hybridlog.live.sources.base import Sink
+    from hybridlog.live.sources.ros1.error_aggregator import ErrorAggregator
+    from hybridlog.live.sources.ros1.network import Network
+    from hybridlog.live.sources.ros1.reader import Reader
+    from hybridlog_storage.messages import Channel
+
+_FIRST_PAUSE_S: Final = 0.25
+_MAX_PAUSE_S: Final = 10.0
+_STABLE_S: Final = 10.0
+_MAX_CHANNELS: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """Parts that all subscriptions of a source share.
+
+    Attributes:
+        network: Makes connections.
+        caller: Name of this node.
+        sink: Takes the messages.
+        reader: Reads the connections.
+        max_message_bytes: Longest message.
+        spawn: Runs a coroutine until the source stops.
+        look_again: Asks the master for the publishers of a topic soon.
+        errors: Reports publishers that cannot be subscribed to.
+    """
+
+    network: Network
+    caller: str
+    sink: Sink
+    reader: Reader
+    max_message_bytes: int
+    spawn: Callable[[Coroutine[None, None, None]], None]
+    look_again: Callable[[str], None]
+    errors: ErrorAggregator
+
+
+class Subscription:
+    """A wanted topic.
+
+    Attributes:
+        topic: Name as the master spells it.
+        nodes: Names of its publishers at the last registration, None before.
+    """
+
+    def __init__(self, context: Context, topic: str) -> None:
+        self.topic = topic
+        self.nodes: frozenset[str] | None = None
+        self._context = context
+        self._links: dict[str, _Link] = {}
+        self._type = ""
+        self._types: dict[str, bool] = {}
+        self._channels: dict[tuple[tuple[str, str], ...], Channel] = {}
+        self._reported = (0, "")
+
+    def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
+        """Updates the publishers.
+
+        A connection to a publisher that is no longer listed goes on until it ends: a
+        restarted master lists none at first.
+
+        Args:
+            type_name: The topic's type, empty if the master does not know it.
+            uris: Addresses of its publishers.
+            is_wanted: Messages of that type are wanted.
+        """
+        if type_name:
+            self._type = type_name
+            self._types[type_name] = is_wanted
+        listed = set(uris)
+        for uri, link in tuple(self._links.items()):
+            link.list(is_listed=uri in listed)
+            if link.has_ended and not link.is_listed:
+                del self._links[uri]
+        for uri in sorted(listed - set(self._links)):
+            link = self._links[uri] = _Link(self, uri)
+            self._context.spawn(self._keep(uri, link))
+        self.report()
+
+    def report(self) -> None:
+        """Reports the number of connected publishers to the sink if it has changed."""
+        now = (sum(link.is_up for link in self._links.values()), self._type)
+        if now == self._reported:
+            return
+        before, self._reported = self._reported, now
+        if now[0]:
+            self._context.sink.topic_came(self.topic, self._type, now[0])
+        elif before[0]:
+            self._context.sink.topic_gone(self.topic)
+
+    def channel(self, fields: Mapping[str, str]) -> Channel | None:
+        """The channel of a connection, the same one for the same header.
+
+        Returns:
+            None if messages of the publisher's type are not wanted.
+        """
+        type_name = fields.get("type", "")
+        if type_name and type_name != ANY and not self._takes(type_name, fields):
+            return None
+        key = tuple(sorted(fields.items()))
+        channel = self._channels.pop(key, None)
+        if channel is None:
+            channel = channel_of(self.topic, fields)
+            self._context.sink.expect(channel)
+        self._channels[key] = channel
+        if len(self._channels) > _MAX_CHANNELS:
+            del self._channels[next(iter(self._channels))]
+        return channel
+
+    def _takes(self, type_name: str, fields: Mapping[str, str]) -> bool:
+        """Tells whether messages of a type are wanted; reports publishers that disagree."""
+        if not self._type:
+            self._type = type_name
+        elif type_name != self._type:
+            publisher = one_line(fields.get("callerid", "an unnamed node"))
+            self._context.sink.say(
+                f"{one_line(self.topic)}: publishers do not agree on its type, "
+                f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
+                "both are recorded"
+            )
+        wanted = self._types.get(type_name)
+        if wanted is None:
+            wanted = self._context.sink.wants(self.topic, type_name)
+            if len(self._types) < _MAX_CHANNELS:
+                self._types[type_name] = wanted
+        return wanted
+
+    async def _keep(self, uri: str, link: _Link) -> None:
+        await link.run(self._context)
+        link.is_up, link.has_ended = False, True
+        if not link.is_listed:
+            del self._links[uri]
+        self.report()
+
+
+class _Link:
+    """The connection to one publisher of a topic.
+
+    Attributes:
+        is_listed: The master lists the publisher.
+        is_up: The connection is established.
+        has_ended: `run` has returned.
+    """
+
+    def __init__(self, subscription: Subscription, uri: str) -> None:
+        self.is_listed = True
+        self.is_up = False
+        self.has_ended = False
+        self._subscription = subscription
+        self._uri = uri
+        self._failures = 0
+        self._has_reported = False
+        self._hurry = asyncio.Event()
+
+    def list(self, *, is_listed: bool) -> None:
+        """Updates `is_listed`; a new listing retries at once."""
+        if is_listed and not self.is_listed:
+            self._hurry.set()
+        self.is_listed = is_listed
+
+    async def run(self, context: Context) -> None:
+        """Connects and reconnects until the publisher is neither listed nor reachable."""
+        topic = self._subscription.topic
+        while True:
+            try:
+                connected, fields = await subscribe(
+                    context.network, context.caller, topic, self._uri
+                )
+            except (OSError, PeerError) as error:
+                if not self.is_listed:
+                    return
+                self._failures += 1
+                # A single failure is normal: a node that ends is listed a little longer.
+                if self._failures >= 2:
+                    context.errors.add(self._uri, topic, error)
+            else:
+                try:
+                    channel = self._subscription.channel(fields)
+                except BaseException:
+                    connected.close()
+                    raise
+                if channel is None:
+                    connected.close()
+                    return
+                await self._serve(context, connected, channel)
+            self._set_up(is_up=False)
+            # It may have returned under another address, which only the master knows.
+            context.look_again(topic)
+            await self._pause()
+
+    async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
+        """Lets the reader read a connection until it ends."""
+        loop = asyncio.get_running_loop()
+        ended: asyncio.Future[str] = loop.create_future()
+
+        def settle(failure: str) -> None:
+            if not ended.done():
+                ended.set_result(failure)
+
+        def closed(failure: str) -> None:
+            loop.call_soon_threadsafe(settle, failure)
+
+        began = loop.time()
+        stream = Stream(connected, channel, context.sink, context.max_message_bytes, closed)
+        self._set_up(is_up=True)
+        context.reader.add(stream)
+        failure = await ended
+        if loop.time() - began > _STABLE_S:
+            self._failures, self._has_reported = 0, False
+            context.errors.resolve(self._uri, self._subscription.topic)
+        else:
+            self._failures += 1
+        # Repeated failures of a publisher are reported once; the ledger has all.
+        if failure and not self._has_reported:
+            self._has_reported = True
+            name = channel.metadata.get("callerid", "an unnamed node")
+            context.sink.say(
+                f"{one_line(self._subscription.topic)}: lost the connection to {one_line(name)} at "
+                f"{one_line(self._uri)}: {failure}; connecting again"
+            )
+
+    def _set_up(self, *, is_up: bool) -> None:
+        self.is_up = is_up
+        self._subscription.report()
+
+    async def _pause(self) -> None:
+        """Waits longer after each failure, unless the master lists the publisher again."""
+        self._hurry.clear()
+        pause = min(_FIRST_PAUSE_S * 2 ** min(self._failures, 10), _MAX_PAUSE_S)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause):
+                await self._hurry.wait()

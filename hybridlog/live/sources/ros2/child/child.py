@@ -1,0 +1,212 @@
+"""The child in the ROS environment: polls the graph, subscribes, passes messages on.
+
+It reports each topic and type with publishers; the recorder decides which to subscribe to.
+One thread does everything except reading the recorder's commands.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from typing import Any
+
+from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
+from hybridlog.live.sources.ros2.child.event_sender import EventSender
+from hybridlog.live.sources.ros2.child.middleware import Middleware
+from hybridlog.live.sources.ros2.child.outbox import Outbox
+from hybridlog.live.sources.ros2.child.topics import Topics
+from hybridlog.live.sources.ros2.child.wire import MAX_BATCH, WireError, parse_object
+
+_LOOK_S = 0.5
+_FIRST_LOOKS_S = 0.1
+_EAGER_S = 3.0
+_IDLE_S = 0.5
+_PAUSE_S = 0.001
+_SMALL_COUNT = 64
+_SMALL_BYTES = 1 << 20
+_SEND_BYTES = 1 << 20
+_SHORT_WAIT_S = 0.01
+_CATCH_UP_S = 0.5
+_FLUSH_S = 2.0
+
+
+class Child:
+    """Moves messages from ROS into the outbox, and the outbox into the socket.
+
+    Args:
+        middleware: ROS.
+        topics: The topics of the graph.
+        outbox: Takes messages and events.
+        events: Puts events into the outbox.
+    """
+
+    def __init__(
+        self, middleware: Middleware, topics: Topics, outbox: Outbox, events: EventSender
+    ) -> None:
+        self._middleware = middleware
+        self._topics = topics
+        self._outbox = outbox
+        self._events = events
+        self._commands: deque[dict[str, Any]] = deque()
+        self._is_stopping = False
+
+    # From other threads.
+
+    def command(self, command: dict[str, Any]) -> None:
+        """Takes a command of the recorder."""
+        self._commands.append(command)
+        self._middleware.wake()
+
+    def stop(self) -> None:
+        """Ends `run` soon, after it has passed on all received messages."""
+        self._is_stopping = True
+        self._middleware.wake()
+
+    # The main thread.
+
+    def run(self, peer: socket.socket) -> None:
+        """Works until it is stopped.
+
+        Args:
+            peer: The socket of the outbox.
+
+        Raises:
+            OSError: The recorder has ended.
+        """
+        writable = select.poll()
+        writable.register(peer, select.POLLOUT)
+        began = next_look = time.monotonic()
+        while not self._is_stopping:
+            while self._commands:
+                command = self._commands.popleft()
+                self._topics.subscribe(str(command.get("subscribe")), str(command.get("type")))
+            now = time.monotonic()
+            if now >= next_look:
+                self._topics.look()
+                # A new recorder needs the existing topics at once.
+                next_look = now + (_FIRST_LOOKS_S if now - began < _EAGER_S else _LOOK_S)
+            wait = 0.0
+            if self._outbox.send() and not self._topics.doubled:
+                wait = max(0.0, min(_IDLE_S, next_look - time.monotonic()))
+            count, size = self._take(wait)
+            if not self._outbox.send():
+                writable.poll(2)
+            elif count < _SMALL_COUNT and size < _SMALL_BYTES:
+                # A short pause, so that messages come in batches and not one per wake-up.
+                time.sleep(_PAUSE_S)
+        self._finish(writable)
+
+    def _take(self, wait: float) -> tuple[int, int]:
+        """Takes messages of all subscriptions; returns their number and bytes.
+
+        Args:
+            wait: Maximum time to wait for a message, seconds.
+        """
+        ready = self._middleware.wait(wait)
+        owners = self._topics.owners
+        count = size = 0
+        # Topics with two subscriptions are always visited, to close one in time.
+        for topic in dict.fromkeys([*(owners[found] for found in ready), *self._topics.doubled]):
+            assert topic.stream is not None
+            try:
+                taken, taken_size = topic.stream.take(self._outbox)
+            except Exception as error:
+                # rclpy raises errors of many kinds; each costs one message.
+                self._events.lost(topic.name, "unreadable", 1, detail=str(error))
+                self._events.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
+                continue
+            count += taken
+            size += taken_size
+            if taken_size >= _SEND_BYTES:
+                # The recorder can work meanwhile, and the next topic has room.
+                self._outbox.send()
+        self._outbox.close_batch()
+        return count, size
+
+    def _finish(self, writable: select.poll) -> None:
+        """Passes on the messages received so far, for a limited time."""
+        self._topics.end()
+        deadline = time.monotonic() + _CATCH_UP_S
+        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT or not self._topics.has_caught_up():
+            if time.monotonic() >= deadline:
+                break
+            if not self._outbox.send():
+                writable.poll(2)
+        self._topics.account(final=True)
+        self._events.bye()
+        deadline = time.monotonic() + _FLUSH_S
+        while not self._outbox.send() and time.monotonic() < deadline:
+            writable.poll(100)
+
+
+def run(number: int) -> int:
+    """The program.
+
+    Args:
+        number: File descriptor of the socket.
+
+    Returns:
+        The exit code.
+    """
+    peer = socket.socket(fileno=number)
+    peer.set_inheritable(False)
+    # The recorder sends no command before the greeting.
+    with peer.makefile("rb") as file:
+        settings = parse_object(file.readline(MAX_BATCH))
+    outbox = Outbox(peer)
+    events = EventSender(outbox)
+    try:
+        middleware = Middleware()
+    except Exception as error:
+        # The recorder reports any error of ROS.
+        events.failed(error)
+        outbox.send()
+        return 1
+    overrides = settings.get("overrides", {})
+    topics = Topics(middleware, events, Definitions(share_folders()), overrides)
+    child = Child(middleware, topics, outbox, events)
+    events.hello(middleware.implementation)
+    signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())
+    threading.Thread(target=_listen, args=(peer, child), daemon=True).start()
+    try:
+        child.run(peer)
+    except (BrokenPipeError, ConnectionResetError):
+        # The recorder has died.
+        return 1
+    finally:
+        middleware.close()
+    return 0
+
+
+def _listen(peer: socket.socket, child: Child) -> None:
+    """Reads the recorder's commands until the end of input."""
+    readable = select.poll()
+    readable.register(peer, select.POLLIN)
+    rest = b""
+    while True:
+        readable.poll()
+        try:
+            data = peer.recv(1 << 16)
+        except BlockingIOError:
+            continue
+        except OSError:
+            data = b""
+        if not data:
+            break
+        *lines, rest = (rest + data).split(b"\n")
+        try:
+            for line in lines:
+                child.command(parse_object(line))
+        except WireError as error:
+            print(f"malformed command: {error}", file=sys.stderr)  # noqa: T201
+            break
+    child.stop()
+    # Even if the middleware hangs, the child must not outlive the recorder.
+    time.sleep(2 * _FLUSH_S)
+    os._exit(1)

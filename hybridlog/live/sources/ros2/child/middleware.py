@@ -1,0 +1,297 @@
+"""The parts of rclpy that a recorder needs: graph, raw subscriptions, waiting.
+
+No other module imports rclpy. Subscriptions are polled: an executor creates a task per
+message, and has a fifth of the speed.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from hybridlog.live.sources.ros2.child.profile import default_profile
+from hybridlog.live.sources.ros2.child.qos import DURATIONS, Profile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hybridlog.live.sources.ros2.child.definitions import TypeName
+
+_ID = 16
+"""Length of a publisher's id in bytes; some releases pad it with zeros."""
+
+_MAX_INVALID = 100
+
+
+class Offer(NamedTuple):
+    """A publisher.
+
+    Attributes:
+        publisher: Its id, as in its messages.
+        node: Name of its node with the namespace; empty until it is known.
+        profile: Quality of service that it offers.
+        type_hash: Hash of the type's description; empty in older releases.
+    """
+
+    publisher: bytes
+    node: str
+    profile: Profile
+    type_hash: str
+
+
+class Subscription:
+    """A raw subscription.
+
+    Attributes:
+        profile: Requested quality of service.
+        tells_all: The middleware also counts losses before the first message and after the
+            last, but no message from before the subscription.
+        take: Returns the next message and its information, None if there is none.
+    """
+
+    def __init__(self, middleware: Middleware, handle: Any, profile: Profile) -> None:
+        self.profile = profile
+        self.take: Callable[[], tuple[bytes, dict[str, Any]] | None] = partial(
+            handle.handle.take_message, handle.msg_type, True
+        )
+        self.handle = handle.handle
+        self._middleware = middleware
+        self._subscription = handle
+        self._losses = middleware.losses_of(self.handle)
+        # Other middlewares may count differently.
+        self.tells_all = middleware.implementation.startswith("rmw_fastrtps")
+
+    @property
+    def tells_losses(self) -> bool:
+        """True if the middleware counts losses."""
+        return self._losses is not None
+
+    def losses(self) -> int:
+        """Messages lost since the last call, as the middleware counts them."""
+        if self._losses is None:
+            return 0
+        status = self._losses.take_event()
+        return 0 if status is None else int(status.total_count_change)
+
+    def close(self) -> None:
+        """Ends the subscription; messages that were not taken are gone."""
+        if self._losses is not None:
+            self._losses.destroy_when_not_in_use()
+            self._losses = None
+        self._middleware.forget(self, self._subscription)
+
+
+class Middleware:
+    """A node without services, parameters or log topic.
+
+    Attributes:
+        implementation: Name of the middleware, such as `rmw_fastrtps_cpp`.
+        invalid: Topics with names that ROS refuses, and the errors.
+
+    Raises:
+        ImportError: rclpy is not installed.
+    """
+
+    def __init__(self) -> None:
+        import rclpy  # type: ignore[import-not-found]
+        from rclpy.impl.implementation_singleton import (  # type: ignore[import-not-found]
+            rclpy_implementation,
+        )
+        from rclpy.signals import SignalHandlerOptions  # type: ignore[import-not-found]
+
+        self._rclpy = rclpy
+        self._native = rclpy_implementation
+        self._silent = _no_callbacks()
+        name = f"hybridlog_recorder_{os.getpid()}"
+        self._name = f"/{name}"
+        with default_profile():
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+            self._context = rclpy.get_default_context()
+            self._node = rclpy.create_node(
+                name,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
+        self._guard = self._node.create_guard_condition(lambda: None)
+        self._wait_set: Any = None
+        self._open: list[Subscription] = []
+        self._at: dict[int, Subscription] = {}
+        self.invalid: dict[str, str] = {}
+        self.implementation = str(rclpy.get_rmw_implementation_identifier())
+
+    def wake(self) -> None:
+        """Ends a wait; thread safe, even while the node closes."""
+        with suppress(self._native.InvalidHandle):
+            self._guard.trigger()
+
+    def publishers(self) -> dict[tuple[str, str], list[Offer]]:
+        """All publishers of other nodes, by topic and type.
+
+        DDS programs without ROS may have names that ROS refuses; these go to `invalid`.
+        """
+        found: dict[tuple[str, str], list[Offer]] = {}
+        for topic, _ in self._node.get_topic_names_and_types():
+            try:
+                infos = self._node.get_publishers_info_by_topic(topic)
+            except Exception as error:
+                # rclpy raises errors of many kinds; each concerns only this topic.
+                if len(self.invalid) < _MAX_INVALID:
+                    self.invalid[topic] = " ".join(str(error).split())
+                continue
+            for info in infos:
+                offer = _offer(info)
+                if offer.node != self._name:
+                    found.setdefault((topic, info.topic_type), []).append(offer)
+        return found
+
+    def subscribe(self, topic: str, kind: TypeName, profile: Profile) -> Subscription:
+        """Subscribes to the serialized messages of a topic.
+
+        Raises:
+            ImportError: The type has no Python module.
+            Exception: Any error of rclpy.
+        """
+        handle = self._node.create_subscription(
+            message_class(kind),
+            topic,
+            _nothing,
+            self._quality(profile),
+            raw=True,
+            event_callbacks=self._silent,
+        )
+        found = Subscription(self, handle, profile)
+        self._open.append(found)
+        self._wait_set = None
+        return found
+
+    def forget(self, subscription: Subscription, inner: Any) -> None:
+        """Ends a subscription; only `Subscription.close` calls it.
+
+        Args:
+            subscription: The subscription.
+            inner: Its rclpy object.
+        """
+        self._open = [other for other in self._open if other is not subscription]
+        self._wait_set = None
+        self._node.destroy_subscription(inner)
+
+    def losses_of(self, handle: Any) -> Any:
+        """The rclpy event of lost messages, None if it is not supported."""
+        if not hasattr(self._native, "EventHandle"):
+            return None  # Humble
+        kinds = self._native.rcl_subscription_event_type_t
+        try:
+            return self._native.EventHandle(handle, kinds.RCL_SUBSCRIPTION_MESSAGE_LOST)
+        except self._native.UnsupportedEventTypeError:
+            return None
+
+    def wait(self, seconds: float) -> list[Subscription]:
+        """Waits until some subscriptions have messages, with a time limit.
+
+        Returns:
+            The subscriptions with messages.
+        """
+        if self._wait_set is None:
+            self._at = {sub.handle.pointer: sub for sub in self._open}
+            self._wait_set = self._native.WaitSet(
+                len(self._open), 1, 0, 0, 0, 0, self._context.handle
+            )
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        add = wait_set.add_subscription
+        for sub in self._open:
+            add(sub.handle)
+        wait_set.add_guard_condition(self._guard.handle)
+        wait_set.wait(int(seconds * 1e9))
+        return [self._at[pointer] for pointer in wait_set.get_ready_entities("subscription")]
+
+    def close(self) -> None:
+        """Removes the node from the graph."""
+        self._wait_set = None
+        self._node.destroy_node()
+        self._rclpy.shutdown()
+
+    def _quality(self, profile: Profile) -> Any:
+        """The rclpy object of a profile."""
+        from rclpy.duration import Duration  # type: ignore[import-not-found]
+        from rclpy.qos import QoSProfile  # type: ignore[import-not-found]
+
+        return QoSProfile(
+            **{
+                name: Duration(nanoseconds=value) if name in DURATIONS else value
+                for name, value in profile._asdict().items()
+            }
+        )
+
+
+def _nothing(_message: object) -> None:
+    """Never called: the node does not spin."""
+
+
+def _no_callbacks() -> Any:
+    """Event callbacks that keep rclpy from logging unhandled events."""
+    try:
+        module = import_module("rclpy.event_handler")
+    except ImportError:
+        module = import_module("rclpy.qos_event")  # its name in Humble
+    return module.SubscriptionEventCallbacks(use_default_callbacks=False)
+
+
+def _offer(info: Any) -> Offer:
+    """A publisher from the information in the graph."""
+    quality = info.qos_profile
+    profile = Profile(
+        history=int(quality.history),
+        depth=int(quality.depth),
+        reliability=int(quality.reliability),
+        durability=int(quality.durability),
+        deadline=int(quality.deadline.nanoseconds),
+        lifespan=int(quality.lifespan.nanoseconds),
+        liveliness=int(quality.liveliness),
+        liveliness_lease_duration=int(quality.liveliness_lease_duration.nanoseconds),
+        avoid_ros_namespace_conventions=bool(quality.avoid_ros_namespace_conventions),
+    )
+    node = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+    if "_NODE_NAME_UNKNOWN_" in node:
+        node = ""
+    type_hash = getattr(info, "topic_type_hash", None)
+    known = type_hash is not None and type_hash.version > 0
+    return Offer(
+        publisher=publisher_id(bytes(info.endpoint_gid)),
+        node=node,
+        profile=profile,
+        type_hash=str(type_hash) if known else "",
+    )
+
+
+def publisher_id(gid: bytes) -> bytes:
+    """A publisher's id, cut to the common length in graph and messages."""
+    return gid[:_ID]
+
+
+def message_class(kind: TypeName) -> Any:
+    """The Python class of a type.
+
+    Raises:
+        ImportError: The type has no Python class.
+    """
+    found: Any = import_module(f"{kind.package}.{kind.folder}")
+    # The event of an action's service is Name.Impl.SendGoalService.Event.
+    steps = {
+        "": [],
+        "Event": ["Event"],
+        "FeedbackMessage": ["Impl", "FeedbackMessage"],
+        "SendGoal_Event": ["Impl", "SendGoalService", "Event"],
+        "GetResult_Event": ["Impl", "GetResultService", "Event"],
+    }[kind.part]
+    for step in [kind.name, *steps]:
+        try:
+            found = getattr(found, step)
+        except AttributeError as error:
+            name = "/".join(kind[:3])
+            raise ImportError(f"the installed Python module of {name} has no {step}") from error
+    return found

@@ -1,0 +1,133 @@
+"""Queue of messages and events for the recorder, in bounded memory.
+
+Writes to the socket do not block. While the recorder does not read, the outbox fills up.
+Messages that do not fit are counted by channel.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from itertools import islice
+from typing import Any
+
+from hybridlog.live.sources.ros2.child.wire import (
+    COUNT,
+    ENTRY,
+    HEADER,
+    LARGE,
+    MAX_PAYLOAD,
+    MESSAGE,
+    MESSAGES,
+    event_frame,
+)
+
+BUDGET = 256 << 20
+"""Maximum number of queued bytes."""
+
+_BATCH = 1 << 20
+_AT_ONCE = 64
+
+
+class Refusal:
+    """Refused messages of one channel since the last report."""
+
+    __slots__ = ("count", "first", "last")
+
+    def __init__(self, received: int) -> None:
+        self.count = 0
+        self.first = received
+        self.last = received
+
+
+class Outbox:
+    """Packs messages and events into frames, and sends them.
+
+    Args:
+        peer: The socket; it becomes non-blocking.
+        budget: Maximum number of queued bytes.
+
+    Attributes:
+        waiting: Queued bytes.
+        refused: Messages by channel that did not fit or were too large.
+    """
+
+    def __init__(self, peer: socket.socket, budget: int = BUDGET) -> None:
+        peer.setblocking(False)
+        self._peer = peer
+        self._budget = budget
+        self._buffers: deque[bytes | memoryview] = deque()
+        self._entries: list[bytes] = []
+        self._payloads: list[bytes] = []
+        self._small = 0
+        self.waiting = 0
+        self.refused: dict[int, Refusal] = {}
+
+    def message(self, channel: int, payload: bytes, received: int, sent: int, number: int) -> None:
+        """Adds a message; the arguments are those of `wire.ENTRY`."""
+        size = len(payload)
+        if (self.waiting and self.waiting + size > self._budget) or size > MAX_PAYLOAD:
+            refusal = self.refused.get(channel)
+            if refusal is None:
+                refusal = self.refused[channel] = Refusal(received)
+            refusal.count += 1
+            refusal.last = received
+            return
+        entry = ENTRY.pack(channel, size, received, sent, number)
+        if size >= LARGE:
+            self.close_batch()
+            self._put(HEADER.pack(MESSAGE, ENTRY.size + size) + entry)
+            self._put(payload)
+            return
+        self._entries.append(entry)
+        self._payloads.append(payload)
+        self._small += size + ENTRY.size
+        if self._small >= _BATCH:
+            self.close_batch()
+
+    def event(self, event: dict[str, Any]) -> None:
+        """Adds an event after all messages so far, even beyond the budget."""
+        self.close_batch()
+        self._put(event_frame(event))
+
+    def close_batch(self) -> None:
+        """Packs the small messages so far into a frame."""
+        if not self._entries:
+            return
+        length = COUNT.size + self._small
+        count = COUNT.pack(len(self._entries))
+        head = HEADER.pack(MESSAGES, length)
+        self._put(b"".join((head, count, *self._entries, *self._payloads)))
+        self._entries.clear()
+        self._payloads.clear()
+        self._small = 0
+
+    def _put(self, data: bytes) -> None:
+        self._buffers.append(data)
+        self.waiting += len(data)
+
+    def send(self) -> bool:
+        """Sends as much as the socket takes without blocking.
+
+        Returns:
+            True if the queue is empty.
+
+        Raises:
+            OSError: The recorder has ended.
+        """
+        self.close_batch()
+        buffers = self._buffers
+        while buffers:
+            try:
+                done = self._peer.sendmsg(list(islice(buffers, _AT_ONCE)))
+            except BlockingIOError:
+                return False
+            self.waiting -= done
+            while done:
+                first = buffers[0]
+                if done < len(first):
+                    buffers[0] = memoryview(first)[done:]
+                    break
+                done -= len(first)
+                buffers.popleft()
+        return True

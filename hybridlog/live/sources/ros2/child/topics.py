@@ -1,0 +1,289 @@
+"""Follows the ROS graph: topics, their publishers, and subscriptions to them."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.live.sources.ros2.child.definitions import UnknownTypeError, parse_type
+from hybridlog.live.sources.ros2.child.publication_gaps import MAX_PUBLISHERS
+from hybridlog.live.sources.ros2.child.qos import (
+    DEPTH,
+    DEPTH_OF_ARRAYS,
+    DEPTH_OF_BYTES,
+    Profile,
+    conflicts,
+    offered_text,
+    request,
+)
+from hybridlog.live.sources.ros2.child.stream import Stream
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
+    from hybridlog.live.sources.ros2.child.event_sender import EventSender
+    from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
+
+MAX_TOPICS = 10_000
+"""Maximum number of topics and types; further ones are ignored."""
+
+_OVERLAP_S = 1.0
+_REPORT_S = 10.0
+
+
+class Topic:
+    """A topic and type that has, or had, publishers.
+
+    Attributes:
+        offers: The present publishers.
+        is_wanted: The recorder wants the topic.
+        definition: Definition of the type, None if unknown.
+        stream: The messages, None without a subscription.
+        nodes: Names of the nodes of present and past publishers.
+        profiles: Profiles that publishers have offered for the current channel.
+        problem: The reason why it cannot be subscribed to, or an empty string.
+        reported_at: Monotonic time of the last report of the problem.
+    """
+
+    def __init__(self, name: str, kind: str) -> None:
+        self.name = name
+        self.kind = kind
+        self.offers: list[Offer] = []
+        self.is_wanted = False
+        self.definition: Definition | None = None
+        self.stream: Stream | None = None
+        self.nodes: dict[bytes, str] = {}
+        self.profiles: set[Profile] = set()
+        self.problem = ""
+        self.reported_at = 0.0
+
+
+class Topics:
+    """All topics of the graph; follows its changes.
+
+    Args:
+        middleware: ROS.
+        events: Sends events to the recorder.
+        definitions: Definitions of types.
+        overrides: Fields of `Profile` by topic that the user has set.
+
+    Attributes:
+        owners: Topic of each subscription.
+        doubled: Topics with two subscriptions.
+    """
+
+    def __init__(
+        self,
+        middleware: Middleware,
+        events: EventSender,
+        definitions: Definitions,
+        overrides: Mapping[str, Mapping[str, Any]],
+    ) -> None:
+        self.owners: dict[Subscription, Topic] = {}
+        self.doubled: list[Topic] = []
+        self._live: list[Topic] = []
+        self._middleware = middleware
+        self._events = events
+        self._definitions = definitions
+        self._overrides = overrides
+        self._topics: dict[tuple[str, str], Topic] = {}
+        self._ended: int | None = None
+
+    def end(self) -> None:
+        """Ends the recording: later messages do not matter."""
+        self._ended = time.time_ns()
+
+    def has_caught_up(self) -> bool:
+        """Tells whether each publisher that was active at the end has sent once more.
+
+        Only the next message shows a gap before it.
+        """
+        since = self._ended
+        streams = [topic.stream for topic in self._live if topic.stream is not None]
+        return since is None or all(stream.has_caught_up(since) for stream in streams)
+
+    def look(self) -> None:
+        """Looks at the graph, follows its changes, and reports losses."""
+        found = self._middleware.publishers()
+        for name, reason in self._middleware.invalid.items():
+            self._events.say(f"{name!r} is ignored, ROS cannot subscribe to it: {reason}")
+        for key, offers in found.items():
+            topic = self._topics.get(key)
+            if topic is None:
+                if len(self._topics) >= MAX_TOPICS:
+                    self._events.say(f"more than {MAX_TOPICS} topics; the rest is ignored")
+                    continue
+                topic = self._topics[key] = Topic(*key)
+                self._events.candidate(*key)
+            before, topic.offers = topic.offers, offers
+            if topic.is_wanted:
+                self._update(topic, before)
+        for key, topic in list(self._topics.items()):
+            if key not in found:
+                self._without_publishers(topic)
+        self.account()
+
+    def _without_publishers(self, topic: Topic) -> None:
+        """Handles a topic without publishers; its subscription stays for the next one."""
+        had, topic.offers = bool(topic.offers), []
+        if topic.stream is None:
+            del self._topics[topic.name, topic.kind]
+        if had and topic.is_wanted:
+            others = (other for other in self._topics.values() if other.name == topic.name)
+            if not any(other.offers and other.is_wanted for other in others):
+                self._events.gone(topic.name)
+
+    def _update(self, topic: Topic, before: list[Offer]) -> None:
+        """Handles the publishers of a wanted topic."""
+        if len(before) != len(topic.offers):
+            self._events.publishers(topic.name, topic.kind, len(topic.offers))
+        stream = topic.stream
+        if stream is None:
+            self._report_problem(topic)
+            return
+        known = {offer.publisher for offer in before}
+        if any(offer.publisher not in known for offer in topic.offers):
+            self._adapt(topic, stream, is_first=not before)
+        self._check(topic, stream, known)
+
+    def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
+        """Adapts a subscription to new publishers."""
+        asked, wanted = stream.subscription.profile, self._wanted(topic)
+        is_incompatible = any(conflicts(offer.profile, asked) for offer in topic.offers)
+        if wanted != asked and (is_incompatible or is_first):
+            self._resubscribe(topic, stream, wanted)
+        if not {offer.profile for offer in topic.offers} <= topic.profiles:
+            stream.channel = self._open_channel(topic)
+
+    def _resubscribe(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
+        """Subscribes again, with a profile that is compatible with all publishers."""
+        try:
+            found = self._middleware.subscribe(topic.name, parse_type(topic.kind), wanted)
+        except Exception as error:
+            self._events.say(f"{topic.name}: cannot subscribe to new publishers: {error}")
+            return
+        stream.replace(found, _OVERLAP_S)
+        self._list()
+
+    def _check(self, topic: Topic, stream: Stream, known: Collection[bytes]) -> None:
+        """Reports incompatible publishers and different versions of the type.
+
+        Args:
+            topic: The topic.
+            stream: Its messages.
+            known: Publishers of the last look; names of new ones come late.
+        """
+        for offer in topic.offers:
+            reasons = conflicts(offer.profile, stream.subscription.profile)
+            if reasons and offer.publisher in known:
+                self._events.say(
+                    f"{topic.name}: {offer.node or 'a publisher'} is incompatible: its "
+                    f"{' and '.join(reasons)} does not satisfy the QoS overrides; change that "
+                    "in the file"
+                )
+        if len(_hashes(topic)) > 1:
+            self._events.say(
+                f"{topic.name}: its publishers have different versions of {topic.kind}; "
+                "the installed definition is recorded"
+            )
+
+    def _wanted(self, topic: Topic) -> Profile:
+        assert topic.definition is not None
+        depth = DEPTH_OF_ARRAYS if topic.definition.has_arrays else DEPTH
+        depth = DEPTH_OF_BYTES if topic.definition.has_bytes else depth
+        override = self._overrides.get(topic.name, {})
+        return request([offer.profile for offer in topic.offers], depth, override)
+
+    def subscribe(self, name: str, kind: str) -> None:
+        """Subscribes to a topic that the recorder wants."""
+        topic = self._topics.get((name, kind))
+        if topic is None or topic.is_wanted:
+            return
+        topic.is_wanted = True
+        self._events.publishers(name, kind, len(topic.offers))
+        try:
+            topic.definition = self._definitions.find(kind)
+            found = self._middleware.subscribe(name, parse_type(kind), self._wanted(topic))
+        except UnknownTypeError as error:
+            self._refuse(topic, str(error))
+            return
+        except Exception as error:
+            # rclpy raises errors of many kinds; each concerns only this topic.
+            self._refuse(topic, f"rclpy cannot subscribe: {error or type(error).__name__}")
+            return
+        topic.stream = Stream(found, self._open_channel(topic), topic.offers)
+        self._live.append(topic)
+        self._list()
+
+    def _list(self) -> None:
+        """Updates `owners` and `doubled`."""
+        self.owners.clear()
+        self.doubled.clear()
+        for topic in self._live:
+            assert topic.stream is not None
+            subscriptions = topic.stream.subscriptions
+            self.owners.update((subscription, topic) for subscription in subscriptions)
+            if len(subscriptions) > 1:
+                self.doubled.append(topic)
+
+    def _open_channel(self, topic: Topic) -> int:
+        """Announces a channel, and returns its number."""
+        assert topic.definition is not None
+        profiles = [offer.profile for offer in topic.offers]
+        topic.profiles.update(profiles)
+        hashes = _hashes(topic)
+        type_hash = hashes.pop() if len(hashes) == 1 else ""
+        offered = offered_text(profiles)
+        return self._events.channel(topic.name, topic.kind, topic.definition, offered, type_hash)
+
+    def _refuse(self, topic: Topic, problem: str) -> None:
+        topic.problem = problem
+        topic.reported_at = -_REPORT_S
+        self._events.say(f"{topic.name}: {topic.kind} cannot be recorded: {problem}")
+        self._report_problem(topic)
+
+    def _report_problem(self, topic: Topic) -> None:
+        """Reports, now and then, that the messages of a topic without subscription are lost."""
+        now = time.monotonic()
+        if topic.problem and now - topic.reported_at >= _REPORT_S:
+            topic.reported_at = now
+            self._events.lost(topic.name, "unreadable", None, detail=topic.problem)
+
+    def account(self, *, final: bool = False) -> None:
+        """Reports losses in transport and in the outbox.
+
+        Args:
+            final: The recording ends.
+        """
+        self._list()
+        ended = (self._ended or time.time_ns()) if final else None
+        for topic in self._live:
+            assert topic.stream is not None
+            self._account(topic, topic.stream, ended)
+        self._events.refusals()
+
+    def _account(self, topic: Topic, stream: Stream, ended: int | None) -> None:
+        if len(topic.nodes) > MAX_PUBLISHERS:
+            topic.nodes.clear()
+        topic.nodes.update((offer.publisher, offer.node) for offer in topic.offers if offer.node)
+        for loss in stream.look(topic.offers, final=ended):
+            node = topic.nodes.get(loss.publisher, "")
+            if (not stream.named or not loss.publisher) and len(topic.offers) == 1:
+                node = topic.offers[0].node
+            times = loss.first, loss.last
+            detail = ", ".join(filter(None, (f"from {node}" if node else "", loss.place)))
+            self._events.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
+        if not (stream.numbered or stream.subscription.tells_losses):
+            self._events.say(
+                "this ROS does not number messages, so losses in transport cannot be counted"
+            )
+        if not stream.named and stream.numbered and len(topic.offers) > 1:
+            self._events.say(
+                f"{topic.name}: this rclpy does not name the publishers of messages, so losses "
+                "in transport cannot be counted; ROS 2 Kilted names them"
+            )
+
+
+def _hashes(topic: Topic) -> set[str]:
+    return {offer.type_hash for offer in topic.offers if offer.type_hash}

@@ -1,0 +1,108 @@
+"""QoS overrides of the user: a YAML file in the format of rosbag2.
+
+/tf_static:
+  history: keep_last
+  depth: 10
+  reliability: reliable
+  durability: transient_local
+  deadline: {sec: 1, nsec: 0}
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_BYTES = 256 << 10
+MAX_DEPTH = 1_000_000
+
+_POLICIES = {
+    "history": {"system_default": 0, "keep_last": 1, "keep_all": 2},
+    "reliability": {"system_default": 0, "reliable": 1, "best_effort": 2},
+    "durability": {"system_default": 0, "transient_local": 1, "volatile": 2},
+    "liveliness": {"system_default": 0, "automatic": 1, "manual_by_topic": 3},
+}
+
+
+def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
+    """Reads the overrides: fields of `Profile` by topic.
+
+    Args:
+        path: The YAML file.
+
+    Raises:
+        UsageError: The file is unreadable or not YAML, or a policy is unknown.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be opened: {error.strerror}") from error
+    if len(data) > MAX_BYTES:
+        raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are too large for QoS overrides")
+    try:
+        # Hostile YAML may nest deeply; the safe loader only makes plain values.
+        root: object = YAML(typ="safe", pure=True).load(data)
+    except (YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UsageError(f"{path}: invalid YAML: {reason}") from error
+    if root is None:
+        return {}
+    if not isinstance(root, dict):
+        raise UsageError(f"{path}: topics with policies below them are expected")
+    found = {}
+    for topic, policies in root.items():
+        if not isinstance(topic, str) or not isinstance(policies, dict):
+            raise UsageError(f"{path}: {topic!r}: a topic with policies below it is expected")
+        name = topic if topic.startswith("/") else f"/{topic}"
+        found[name] = {
+            str(key): _policy(key, value, f"{path}: {topic}") for key, value in policies.items()
+        }
+    return found
+
+
+def _policy(name: object, value: object, where: str) -> int:
+    """The number of a policy.
+
+    Raises:
+        UsageError: The policy or its value is unknown.
+    """
+    if name in DURATIONS:
+        return _duration(value, f"{where}: {name}")
+    if name == "depth":
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
+            raise UsageError(f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {value!r}")
+        return value
+    if name == "avoid_ros_namespace_conventions":
+        if not isinstance(value, bool):
+            raise UsageError(f"{where}: {name} is true or false, not {value!r}")
+        return value
+    words = _POLICIES.get(name) if isinstance(name, str) else None
+    if words is None:
+        known = ", ".join(Profile._fields)
+        raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
+    number = words.get(value.lower()) if isinstance(value, str) else None
+    if number is None:
+        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {value!r}")
+    return number
+
+
+def _duration(value: object, where: str) -> int:
+    """A duration in ns.
+
+    Raises:
+        UsageError: The value is not a duration.
+    """
+    if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
+        sec, nsec = value["sec"], value["nsec"]
+        if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
+            return int(min(sec * 1_000_000_000 + nsec, FOREVER))
+    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {value!r}")

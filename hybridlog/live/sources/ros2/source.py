@@ -1,0 +1,196 @@
+"""The ROS 2 source: starts and supervises a child in the ROS environment.
+
+A child that dies is restarted with growing pauses. The outage is reported for each topic.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING
+
+from hybridlog.live.sources.base import LiveSource
+from hybridlog.live.sources.ros2.child.wire import WireError
+from hybridlog.live.sources.ros2.overrides import read_overrides
+from hybridlog.live.sources.ros2.process import ChildError, Process, launch
+from hybridlog.live.sources.ros2.receiver import Receiver, report_outage
+from hybridlog.live.sources.text import one_line
+from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hybridlog.live.sources.base import Sink
+
+MAX_DOMAIN = 232
+
+_PAUSE_S = 0.5
+_MAX_PAUSE_S = 30.0
+_STABLE_S = 30.0
+_HAND_OVER_S = 3.0
+_TERM_S = 1.0
+
+
+class Ros2Source(LiveSource):
+    """Records the topics of a ROS 2 domain.
+
+    Args:
+        python: An interpreter with rclpy. None for the one in the environment variable
+            `HYBRIDLOG_ROS2_PYTHON`; else `python3` if a ROS environment is sourced; else
+            the current one.
+        qos_overrides: YAML file with QoS profiles by topic, in the format of rosbag2.
+        domain_id: ROS domain, None for that of the environment.
+    """
+
+    kind = "ROS 2"
+
+    def __init__(
+        self,
+        python: str | None = None,
+        qos_overrides: Path | None = None,
+        domain_id: int | None = None,
+    ) -> None:
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        self.address = f"domain {domain if domain_id is None else domain_id}"
+        self._python = python
+        self._overrides = qos_overrides
+        self._domain_id = domain_id
+        self._stopping = Event()
+        self._lock = Lock()
+        self._child: Process | None = None
+        self._settings: dict[str, object] = {}
+        self._thread: Thread | None = None
+        self._outages: dict[str, int] = {}
+
+    def check(self) -> None:
+        """Start the child; messages are read after `start`.
+
+        Raises:
+            UsageError: The domain is invalid, or the overrides are unreadable.
+            SourceError: ROS does not start.
+            MissingDependencyError: No interpreter has rclpy.
+        """
+        if self._child is None:
+            self._child, self._settings = self._launched()
+
+    def start(self, sink: Sink) -> None:
+        """Begin to listen.
+
+        Raises:
+            UsageError: As `check`.
+            SourceError: As `check`.
+            MissingDependencyError: As `check`.
+        """
+        self.check()
+        self._thread = Thread(
+            target=self._run, args=(self._child, sink, self._settings), name="ros2", daemon=True
+        )
+        self._thread.start()
+
+    def _launched(self) -> tuple[Process, dict[str, object]]:
+        """A new child and its settings."""
+        domain = self.address.partition(" ")[2]
+        if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
+            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
+        overrides = {} if self._overrides is None else read_overrides(self._overrides)
+        settings: dict[str, object] = {"overrides": overrides}
+        try:
+            child, self._python = launch(self._python, settings, self._domain_id, self._stopping)
+        except ChildError as error:
+            raise SourceError(
+                f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
+            ) from error
+        self.address = f"domain {domain}, {one_line(str(child.hello.get('middleware')))}"
+        return child, settings
+
+    def stop(self) -> None:
+        """Stop listening, after the child has passed on its messages."""
+        with self._lock:
+            self._stopping.set()
+            child, self._child = self._child, None
+        if self._thread is None:
+            if child is not None:
+                child.end()
+            return
+        if child is None:
+            self._thread.join()
+            return
+        child.end_input()
+        self._thread.join(_HAND_OVER_S)
+        if self._thread.is_alive():
+            child.terminate()
+            self._thread.join(_TERM_S)
+        if self._thread.is_alive():
+            child.kill()
+        self._thread.join()
+
+    def _run(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
+        """Reads from children until the source is stopped."""
+        try:
+            self._supervise(child, sink, settings)
+        except Exception as error:
+            # An error of our own; the recorder must not wait for this source.
+            sink.ended(f"the ROS 2 source failed: {error!r}")
+            raise
+
+    def _supervise(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
+        """Reads from one child after the other."""
+        pause = _PAUSE_S
+        while child is not None:
+            began = time.monotonic()
+            reason = self._listen(child, sink)
+            if self._stopping.is_set():
+                break
+            if time.monotonic() - began > _STABLE_S:
+                pause = _PAUSE_S
+            sink.say(f"ROS 2: the child ended ({reason}); restarting it")
+            child = self._start_again(sink, settings, pause)
+            pause = min(2 * pause, _MAX_PAUSE_S)
+        for topic, since in self._outages.items():
+            report_outage(sink, topic, since)
+        self._outages.clear()
+
+    def _listen(self, child: Process, sink: Sink) -> str:
+        """Reads from a child until it ends; returns the reason of its end."""
+        receiver = Receiver(child.peer, sink, self._outages)
+        reason = ""
+        exit_report = ""
+        try:
+            try:
+                receiver.run()
+            except (WireError, MemoryError) as error:
+                reason = str(error) or "not enough memory for a message"
+                child.kill()
+            except OSError as error:
+                reason = error.strerror or str(error)
+                exit_report = child.exit_report()
+            else:
+                exit_report = child.exit_report()
+        finally:
+            child.end()
+        if not (self._stopping.is_set() and receiver.said_bye):
+            for topic in receiver.subscribed:
+                self._outages.setdefault(topic, receiver.last_received)
+        if not self._stopping.is_set():
+            for topic in sorted(receiver.present):
+                sink.topic_gone(topic)
+        return one_line("; ".join(filter(None, (reason, exit_report))))
+
+    def _start_again(self, sink: Sink, settings: dict[str, object], pause: float) -> Process | None:
+        """A new child after a pause; None if the source is stopped meanwhile."""
+        while not self._stopping.wait(pause):
+            pause = min(2 * pause, _MAX_PAUSE_S)
+            try:
+                child, _ = launch(self._python, settings, self._domain_id, self._stopping)
+            except (ChildError, MissingDependencyError) as error:
+                if self._stopping.is_set():
+                    break
+                sink.say(one_line(f"ROS 2 does not restart, trying again: {error}"))
+                continue
+            with self._lock:
+                if not self._stopping.is_set():
+                    self._child = child
+                    return child
+            child.end()
+        return None

@@ -1,0 +1,167 @@
+"""ROS 1 as Debian packs it: rosmaster, rospy, rosbag's recorder and player.
+
+Installed ones are used. Where they are not all there, the packages are fetched once into
+the cache and unpacked there, which needs apt but neither root nor an installation.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import textwrap
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.live.sources.peer_cache import made_once
+
+PACKAGES = (
+    "python3-rosmaster",
+    "python3-rospy",
+    "python3-std-msgs",
+    "python3-sensor-msgs",
+    "python3-rosbag",
+)
+_SYSTEM = Path("/")
+_STATUS = Path("/var/lib/dpkg/status")
+_OF_ROS = re.compile("^Source: ros-", re.MULTILINE)
+_TIMEOUT_S = 200
+
+
+class Ros1(NamedTuple):
+    """Where ROS 1 lies.
+
+    Attributes:
+        python: The Python that its modules are for.
+        tools: Folder of the commands `record` and `play`, which are written in C++.
+        environment: Variables that all of them need.
+    """
+
+    python: str
+    tools: Path
+    environment: dict[str, str]
+
+
+def ros1() -> Ros1 | str:
+    """ROS 1, or why it cannot be had."""
+    installed = _in(_SYSTEM)
+    if not _failure(installed):
+        return installed
+    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
+        return "it is not installed, and there is no apt to fetch it with"
+    place = made_once("ros1-debian", _made)
+    if isinstance(place, str):
+        return place
+    fetched = _in(place / "tree")
+    return _failure(fetched) or fetched
+
+
+def _made(place: Path) -> str:
+    """Fetch everything; returns why it could not."""
+    try:
+        _fetch(place)
+    except subprocess.SubprocessError as error:
+        said = getattr(error, "stderr", None) or str(error)
+        return f"apt cannot fetch it: {(said.strip().splitlines() or [''])[-1]}"
+    return ""
+
+
+def _in(root: Path) -> Ros1:
+    """ROS 1 as it would be in a tree."""
+    own_python = root / "usr/bin/python3"
+    environment = {"PYTHONPATH": ""}
+    if root != _SYSTEM:
+        libraries = [*root.glob("usr/lib/*-linux-gnu"), *root.glob("lib/*-linux-gnu")]
+        environment = {
+            "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
+            # Where the player looks for the package that reads bags, and for its plugin.
+            "ROS_PACKAGE_PATH": str(root / "usr/share"),
+            "CMAKE_PREFIX_PATH": str(_plugins(root)),
+            "LD_LIBRARY_PATH": ":".join(map(str, libraries)),
+        }
+        if own_python.exists():
+            # Debian's Python was missing, too.
+            environment["PYTHONHOME"] = str(root / "usr")
+        else:
+            own_python = _SYSTEM / "usr/bin/python3"
+    return Ros1(str(own_python), root / "usr/lib/rosbag", environment)
+
+
+def _plugins(root: Path) -> Path:
+    """A directory below which `lib` has a tree's plugins: they are found in no other way."""
+    prefix = root / "plugins"
+    prefix.mkdir(exist_ok=True)
+    for plugins in root.glob("usr/lib/*-linux-gnu/ros"):
+        with suppress(FileExistsError):  # also of a test that runs beside this one
+            (prefix / "lib").symlink_to(plugins)
+    return prefix
+
+
+def _failure(found: Ros1) -> str:
+    """Why some ROS 1 does not work, empty when it does."""
+    modules = "import rosbag, rosmaster, rospy, sensor_msgs.msg, std_msgs.msg"
+    for command in ([found.python, "-c", modules], [found.tools / "record", "--help"]):
+        try:
+            subprocess.run(
+                command,
+                env={**os.environ, **found.environment},
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=60,
+            )
+        except subprocess.CalledProcessError as error:
+            return str((error.stderr.strip().splitlines() or ["it fails"])[-1])
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return str(error)
+    return ""
+
+
+def _without_ros(status: str) -> str:
+    """What dpkg says of a system, as if that had nothing of ROS: a tree has all or nothing."""
+    packages = status.split("\n\n")
+    return "\n\n".join(package for package in packages if not _OF_ROS.search(package))
+
+
+def _fetch(place: Path) -> None:
+    """Fetches the packages and all that they need, and unpacks them.
+
+    Raises:
+        subprocess.SubprocessError: apt cannot.
+    """
+    for folder in ("state/lists/partial", "cache/archives/partial", "tree"):
+        (place / folder).mkdir(parents=True)
+    status = place / "state" / "status"
+    status.write_text(_without_ros(_STATUS.read_text()))
+    settings = place / "apt.conf"
+    settings.write_text(
+        textwrap.dedent(
+            f"""\
+            Dir::State "{place}/state";
+            Dir::State::status "{status}";
+            Dir::Cache "{place}/cache";
+            Debug::NoLocking "true";
+            APT::Install-Recommends "false";
+            APT::Sandbox::User "";
+            """
+        )
+    )
+
+    def run(*command: str | Path) -> None:
+        subprocess.run(
+            command,
+            env={**os.environ, "APT_CONFIG": str(settings)},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=_TIMEOUT_S,
+        )
+
+    run("apt-get", "update", "-qq")
+    run("apt-get", "install", "-qq", "--yes", "--download-only", *PACKAGES)
+    for package in sorted((place / "cache" / "archives").glob("*.deb")):
+        run("dpkg", "-x", package, place / "tree")
+    for done in ("state", "cache"):
+        shutil.rmtree(place / done)

@@ -1,0 +1,1101 @@
+"""The Foxglove source: against the SDK's own server, and against servers that misbehave."""
+
+from __future__ import annotations
+
+import base64
+import json
+import random
+import shutil
+import socket
+import ssl
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.foxglove import protocol as foxglove_protocol
+from hybridlog.live.sources.foxglove import session as foxglove_session
+from hybridlog.live.sources.foxglove.protocol import PeerError, parse_channel
+from hybridlog.live.sources.foxglove.source import FoxgloveSource
+from hybridlog_storage.errors import MissingDependencyError, UsageError
+from hybridlog_storage.messages import Schema
+from tests.live.sources.heard import DEADLINE_S, Heard, must_return
+
+pytest.importorskip(
+    "websockets", reason="websockets is not installed: nothing of the Foxglove source is tested"
+)
+
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+from websockets.typing import Subprotocol
+from websockets.uri import parse_uri
+
+from hybridlog.live.sources.foxglove import client as foxglove_client
+from hybridlog.live.sources.foxglove import connection as foxglove_connection
+from hybridlog.live.sources.foxglove import handshake as foxglove_handshake
+
+# A server that sends whatever bytes a test wants.
+
+
+def frame(opcode: int, payload: bytes, *, is_last: bool = True, length: int | None = None) -> bytes:
+    """A websocket frame of a server, perhaps with a length that is a lie."""
+    size = len(payload) if length is None else length
+    head = bytes([opcode | (0x80 if is_last else 0)])
+    if size < 126:
+        head += bytes([size])
+    elif size < 1 << 16:
+        head += struct.pack(">BH", 126, size)
+    else:
+        head += struct.pack(">BQ", 127, size)
+    return head + payload
+
+
+def text(message: object) -> bytes:
+    return frame(Opcode.TEXT, json.dumps(message).encode())
+
+
+def body(subscription: int, log_time: int, payload: bytes) -> bytes:
+    return struct.pack("<BIQ", 1, subscription, log_time) + payload
+
+
+def message(subscription: int, log_time: int, payload: bytes) -> bytes:
+    return frame(Opcode.BINARY, body(subscription, log_time, payload))
+
+
+def channel(number: int = 1, topic: str = "/a", **others: object) -> dict[str, object]:
+    return {"id": number, "topic": topic, "encoding": "json", "schemaName": "T", **others}
+
+
+def advertise(*channels: object) -> bytes:
+    return text({"op": "advertise", "channels": list(channels)})
+
+
+class Peer:
+    """One connection as the server sees it."""
+
+    def __init__(self, made: socket.socket) -> None:
+        self.socket = made
+        self.socket.settimeout(DEADLINE_S)
+        self.protocol = ServerProtocol(
+            subprotocols=[Subprotocol("foxglove.websocket.v1")], max_size=None
+        )
+        self.frames: list[Frame] = []
+
+    def shake_hands(self) -> None:
+        while self.protocol.state is State.CONNECTING:
+            self.protocol.receive_data(self.socket.recv(1 << 16))
+            for request in self.protocol.events_received():
+                self.protocol.send_response(self.protocol.accept(request))  # type: ignore[arg-type]
+            self.send(*self.protocol.data_to_send())
+
+    def send(self, *pieces: bytes) -> None:
+        self.socket.sendall(b"".join(pieces))
+
+    def hear(self) -> Frame:
+        """The next frame of the client; the answers of websockets are not sent."""
+        while not self.frames:
+            data = self.socket.recv(1 << 16)
+            if not data:
+                raise EOFError
+            self.protocol.receive_data(data)
+            self.frames += [e for e in self.protocol.events_received() if isinstance(e, Frame)]
+        return self.frames.pop(0)
+
+    def subscribed(self) -> dict[int, int]:
+        """What the client subscribes to next: channel by subscription."""
+        request = json.loads(bytes(self.hear().data))
+        assert request["op"] == "subscribe"
+        return {s["channelId"]: s["id"] for s in request["subscriptions"]}
+
+    def offer(self, *channels: object) -> dict[int, int]:
+        self.send(advertise(*channels))
+        return self.subscribed()
+
+    def wait(self) -> None:
+        """Until the client says goodbye, or just goes."""
+        try:
+            while (heard := self.hear()).opcode is not Opcode.CLOSE:
+                pass
+            self.send(frame(Opcode.CLOSE, bytes(heard.data)))
+        except (OSError, EOFError):
+            pass
+
+
+Script = Callable[[Peer], None]
+
+
+class Server:
+    """Listens on loopback, and plays a script for each connection, the last one for ever."""
+
+    def __init__(self, *scripts: Script, port: int = 0, is_raw: bool = False) -> None:
+        self.scripts = list(scripts)
+        self.is_raw = is_raw
+        self.tls: ssl.SSLContext | None = None
+        self.failures: list[BaseException] = []
+        self._peers: list[socket.socket] = []
+        self._listening = socket.create_server(("127.0.0.1", port))
+        self.port = self._listening.getsockname()[1]
+        self.url = f"ws://127.0.0.1:{self.port}"
+        self._threads = [threading.Thread(target=self._accept)]
+
+    def __enter__(self) -> Server:
+        self._threads[0].start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listening.shutdown(socket.SHUT_RDWR)
+        self._listening.close()
+        for peer in self._peers:
+            try:
+                peer.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass
+        for thread in self._threads:
+            thread.join(DEADLINE_S)
+            assert not thread.is_alive()
+        if self.failures:
+            raise self.failures[0]
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                made, _ = self._listening.accept()
+            except OSError:
+                return
+            self._peers.append(made)
+            script = self.scripts.pop(0) if len(self.scripts) > 1 else self.scripts[0]
+            self._threads.append(threading.Thread(target=self._serve, args=(made, script)))
+            self._threads[-1].start()
+
+    def _serve(self, made: socket.socket, script: Script) -> None:
+        with made:
+            try:
+                if self.tls is not None:
+                    made = self.tls.wrap_socket(made, server_side=True)
+                with made:
+                    peer = Peer(made)
+                    if not self.is_raw:
+                        peer.shake_hands()
+                    script(peer)
+            except (OSError, EOFError):
+                pass  # the client is gone, which each test looks for at its own end
+            except BaseException as error:
+                self.failures.append(error)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Look more often and try again sooner; and nothing is left behind."""
+    for module in (foxglove_handshake, foxglove_connection):
+        monkeypatch.setattr(module, "TICK_S", 0.02)
+    monkeypatch.setattr(foxglove_client, "_PAUSES_S", (0.02, 0.05))
+    yield
+    assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
+
+
+# Without a server.
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("robot:8765", "does not begin with ws://"),
+        ("http://robot:8765", "does not begin with ws://"),
+        ("ws://", "names no host"),
+        ("ws://:8765", "names no host"),
+        ("ws://robot:0", "port 0"),
+        ("ws://robot:99999", "not the address"),
+        ("ws://robot:port", "not the address"),
+        ("ws://[::1:8765", "not the address"),
+        ("ws://robot:8765/#x", "'#'"),
+        ("ws://ro bot:8765", "not the address"),
+        ("ws://robot\x1b[31m:8765", "not the address"),
+        ("ws://me@robot:8765", "without a password"),
+        ("ws://" + "a" * 80 + ".\u00e9:8765", "not the address"),
+        ("", "does not begin"),
+    ],
+)
+def test_an_address_that_is_none_is_refused_with_the_cure(url: str, words: str) -> None:
+    with pytest.raises(UsageError, match=r"wss?://") as caught:
+        FoxgloveSource(url).start(Heard())
+    assert words in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+def test_no_password_is_shown() -> None:
+    assert FoxgloveSource("wss://me:secret@robot:8765/x").address == "wss://robot:8765/x"
+
+
+def test_a_limit_that_is_too_small_is_refused() -> None:
+    with pytest.raises(UsageError, match="1 MiB"):
+        FoxgloveSource("ws://robot:8765", max_message_bytes=1000)
+
+
+def test_without_websockets_the_message_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for module in (foxglove_client, foxglove_connection, foxglove_handshake):
+        monkeypatch.delitem(sys.modules, module.__name__)
+    monkeypatch.setitem(sys.modules, "websockets.client", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[foxglove\]'"):
+        FoxgloveSource("ws://127.0.0.1:1").start(Heard())
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        (
+            {"encoding": "ros1", "schema": "string data", "schemaEncoding": "ros1msg"},
+            Schema("T", "ros1msg", b"string data"),
+        ),
+        ({"encoding": "ros1", "schema": "string data"}, Schema("T", "ros1msg", b"string data")),
+        ({"encoding": "cdr", "schema": "string data"}, Schema("T", "ros2msg", b"string data")),
+        (
+            {"encoding": "cdr", "schema": "module {}", "schemaEncoding": "ros2idl"},
+            Schema("T", "ros2idl", b"module {}"),
+        ),
+        (
+            {"encoding": "json", "schema": '{"\u00e9": 1}'},
+            Schema("T", "jsonschema", '{"\u00e9": 1}'.encode()),
+        ),
+        (
+            {"encoding": "protobuf", "schema": base64.b64encode(b"\0\xff\n").decode()},
+            Schema("T", "protobuf", b"\0\xff\n"),
+        ),
+        (
+            {
+                "encoding": "flatbuffer",
+                "schema": base64.b64encode(b"\0\xfe").decode(),
+                "schemaEncoding": "flatbuffer",
+            },
+            Schema("T", "flatbuffer", b"\0\xfe"),
+        ),
+        ({"encoding": "own", "schema": "x", "schemaEncoding": "mine"}, Schema("T", "mine", b"x")),
+        ({"encoding": "json", "schema": ""}, Schema("T", "", b"")),
+        ({"encoding": "json", "schema": "", "schemaName": ""}, None),
+        ({"encoding": "json", "schemaName": None}, None),
+    ],
+)  # fmt: skip
+def test_definitions_become_schemas(entry: dict[str, object], expected: Schema | None) -> None:
+    found = parse_channel({**channel(), **entry})
+    assert found.problem == ""
+    assert found.channel.schema == expected
+    assert found.channel.message_encoding == entry["encoding"]
+    assert found.channel.has_publish_time
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (5, "not a JSON object"),
+        (None, "not a JSON object"),
+        ({}, "'id'"),
+        ({**channel(), "id": True}, "'id'"),
+        ({**channel(), "id": -1}, "'id'"),
+        ({**channel(), "id": 1 << 64}, "'id'"),
+        ({**channel(), "id": 1.0}, "'id'"),
+        ({**channel(), "topic": None}, "topic"),
+        ({**channel(), "topic": "\ud800"}, "topic"),
+        ({**channel(), "topic": ""}, "topic"),
+        ({**channel(), "encoding": []}, "encoding"),
+    ],
+)
+def test_a_channel_that_is_none_is_refused(entry: object, words: str) -> None:
+    with pytest.raises(PeerError, match=words):
+        parse_channel(entry)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "problem"),
+    [
+        ("protobuf", "!!!!", "base64"),
+        ("protobuf", "abc", "base64"),
+        ("protobuf", "\u00e9", "base64"),
+        ("json", {"type": "object"}, "not text"),
+        ("json", "\ud800", "not text"),
+    ],
+)
+def test_a_broken_definition_leaves_a_channel_without(
+    encoding: str, schema: object, problem: str
+) -> None:
+    found = parse_channel(channel(encoding=encoding, schema=schema))
+    assert found.channel.schema == Schema("T", "", b"")
+    assert problem in found.problem
+
+
+# With a server that sends what a test wants.
+
+SIZES = [0, 1, 99, 112, 113, 125, 126, 65522, 65523, 65536, 70_000, 131_072, 300_000, 3_000_001]
+
+
+def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
+    random.seed(4)
+    sizes = [*SIZES, *(random.randrange(2000) for _ in range(300)), *SIZES[::-1]]
+    payloads = [random.randbytes(size) for size in sizes]
+
+    def script(peer: Peer) -> None:
+        peer.send(text({"op": "serverInfo", "name": "x", "capabilities": ["time"]}))
+        number = peer.offer(channel(7))[7]
+        stream = b"".join(
+            [message(number, at, payload) for at, payload in enumerate(payloads)]
+            # Clocks, pings, other operations and unknown kinds lie in between.
+            + [frame(Opcode.BINARY, b"\x02" + bytes(8)), frame(Opcode.PING, b"hello")]
+            + [text({"op": "parameterValues"}), frame(Opcode.BINARY, b"\x77" + bytes(100_000))]
+            + [message(number, len(payloads), b"last")]
+        )
+        while stream:
+            size = random.choice([1, 2, 3, 7, 100, 5000, 100_000, 1_000_000])
+            peer.send(stream[:size])
+            stream = stream[size:]
+        assert bytes(peer.hear().data) == b"hello"
+        peer.wait()
+
+    before = time.time_ns()
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) > len(payloads))
+    assert heard.payloads() == [*payloads, b"last"]
+    assert {type(taken.payload) for taken in heard.taken} == {bytes}
+    assert [taken.sent for taken in heard.taken] == list(range(len(payloads) + 1))
+    assert {taken.sequence for taken in heard.taken} == {None}
+    assert len({id(taken.channel) for taken in heard.taken}) == 1
+    assert (len(heard.expected), heard.unexpected) == (1, [])
+    times = [taken.received for taken in heard.taken]
+    assert before <= times[0]
+    assert times == sorted(times)
+    assert heard.topics == [("/a", "T", 1), ("/a",)]
+    assert (heard.said, heard.losses, heard.ends) == ([], [], [])
+
+
+def test_messages_in_pieces_are_put_together() -> None:
+    def script(peer: Peer) -> None:
+        offer = json.dumps({"op": "advertise", "channels": [channel()]}).encode()
+        peer.send(frame(Opcode.TEXT, offer[:5], is_last=False))
+        peer.send(frame(Opcode.CONT, offer[5:]))
+        whole = body(peer.subscribed()[1], 5, bytes(100_000))
+        peer.send(
+            frame(Opcode.BINARY, whole[:3], is_last=False),
+            frame(Opcode.PING, b"!"),
+            frame(Opcode.CONT, whole[3:70_000], is_last=False),
+            frame(Opcode.CONT, b"", is_last=False),
+            frame(Opcode.CONT, whole[70_000:]),
+            message(0, 6, b"next"),
+        )
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == 2)
+    assert heard.payloads() == [bytes(100_000), b"next"]
+    assert heard.said == []
+
+
+def test_only_what_is_wanted_is_subscribed_to() -> None:
+    asked: list[dict[int, int]] = []
+
+    def script(peer: Peer) -> None:
+        asked.append(
+            peer.offer(channel(1, "/a"), channel(2, "/b"), channel(3, "/a", schemaName="U"))
+        )
+        peer.send(*(message(number, 0, b"x") for number in asked[0].values()))
+        peer.wait()
+
+    heard = Heard(lambda topic, _: topic == "/a")
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == 2)
+    assert set(asked[0]) == {1, 3}
+    assert heard.topics[:2] == [("/a", "T", 1), ("/a", "U", 2)]
+    types = [taken.channel.schema.name for taken in heard.taken if taken.channel.schema]
+    assert types == ["T", "U"]
+
+
+def test_channels_that_go_and_come_again() -> None:
+    def script(peer: Peer) -> None:
+        first = peer.offer(channel(1))[1]
+        peer.send(message(first, 0, b"1"))
+        peer.send(text({"op": "unadvertise", "channelIds": [1, 77, "x", None, [1]]}))
+        # The server's queue of messages may be behind its queue of announcements.
+        peer.send(message(first, 0, b"2"))
+        again = peer.offer(channel(1))[1]
+        assert again != first
+        peer.send(message(again, 0, b"3"), advertise(channel(1)))
+        other = channel(1, schemaName="U")
+        peer.send(advertise(other))
+        assert json.loads(bytes(peer.hear().data)) == {
+            "op": "unsubscribe",
+            "subscriptionIds": [again],
+        }
+        changed = peer.subscribed()[1]
+        peer.send(message(changed, 0, b"4"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == 4)
+    assert heard.payloads() == [b"1", b"2", b"3", b"4"]
+    came = ("/a", "T", 1)
+    assert heard.topics == [came, ("/a",), came, ("/a",), ("/a", "U", 1), ("/a",)]
+    assert heard.said == heard.losses == []
+
+
+REFUSALS = ["Unknown channel ID: {}", "Channel {} is not available; ignoring subscription"]
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_a_channel_that_is_offered_too_soon_is_asked_for_again(words: str) -> None:
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel(7))[7]
+        for _ in range(3):
+            peer.send(text({"op": "status", "level": 2, "message": words.format(7)}))
+            assert peer.subscribed() == {7: number}
+        peer.send(message(number, 0, b"1"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert heard.said == []
+
+
+def test_a_channel_that_is_offered_and_never_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove_session, "_RETRY_S", 0.0)
+
+    def script(peer: Peer) -> None:
+        peer.offer(channel(7))
+        status = text({"op": "status", "level": 2, "message": REFUSALS[0].format(7)})
+        for _ in range(20):
+            peer.send(status)
+            peer.subscribed()
+        peer.send(status, text({"op": "status", "message": REFUSALS[0].format(8)}))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.said) == 2)
+    assert "offers '/a', but does not send it" in heard.said[0]
+    assert "says: Unknown channel ID: 8" in heard.said[1]
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"),
+    [
+        (frame(Opcode.TEXT, b"{"), "not JSON"),
+        (frame(Opcode.TEXT, b"\xff\xfe"), "not JSON"),
+        (frame(Opcode.TEXT, b"[" * 100_000), "not JSON"),
+        (frame(Opcode.TEXT, b"9" * 10_000), "not JSON"),
+        (text([1]), "without an operation"),
+        (text({"op": 5}), "without an operation"),
+        (text({"op": "advertise"}), "something else than a list of channels"),
+        (text({"op": "unadvertise", "channelIds": 5}), "something else than a list of channels"),
+        (advertise(5, channel(2, "")), "without a topic"),
+        (text({"op": "status", "level": 2, "message": "\x1b[31mbad\nnews"}), "says: ?[31mbad news"),
+        (message(4711, 0, b"x"), "unknown subscription"),
+        (frame(Opcode.BINARY, b""), "empty binary message"),
+        (frame(Opcode.BINARY, b"\x01abc"), "shorter than its header"),
+        (advertise(channel(2, "/p", encoding="protobuf", schema="!")), "is not base64"),
+    ],
+)
+def test_nonsense_is_told_in_a_line_and_the_rest_goes_on(sent: bytes, words: str) -> None:
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        peer.send(sent, message(number, 0, b"after"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert heard.payloads() == [b"after"]
+    assert heard.said_of(words), heard.said
+    assert all(line.startswith(server.url) and line.isprintable() for line in heard.said)
+    assert all(len(line) < 400 for line in heard.said)
+    # What may have been a message is a row, too.
+    is_binary = sent[0] & 15 == Opcode.BINARY
+    rows = [(loss.topic, loss.cause, loss.count) for loss in heard.losses]
+    assert rows == ([("", Cause.UNREADABLE, 1)] if is_binary else [])
+    assert source.was_reached
+
+
+def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> None:
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        for at in range(300):
+            peer.send(text({"op": "status", "message": str(at)}))
+        peer.send(message(number, 0, b"after"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert len(heard.said) == 101
+
+
+def test_channels_without_end_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove_session, "_MAX_CHANNELS", 10)
+
+    def script(peer: Peer) -> None:
+        found = peer.offer(*(channel(at, f"/{at}") for at in range(50)))
+        assert len(found) == 10
+        peer.send(message(found[9], 0, b"x"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert heard.said_of("more than 10 channels")
+
+
+def test_a_time_that_no_log_can_hold_is_replaced() -> None:
+    def script(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel())[1], (1 << 64) - 1, b"x"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert heard.taken[0].sent == heard.taken[0].received
+    assert heard.said_of("2262")
+
+
+def test_a_message_over_the_limit_is_passed_over_and_counted() -> None:
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        peer.send(message(number, 0, bytes((1 << 20) + 1)), message(number, 0, b"small"))
+        peer.send(message(number, 0, bytes(1 << 20)))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server:
+        with FoxgloveSource(server.url, max_message_bytes=1 << 20) as source:
+            source.start(heard)
+            heard.until(lambda h: len(h.taken) == 2)
+    assert heard.payloads() == [b"small", bytes(1 << 20)]
+    (lost,) = heard.losses
+    assert lost[:3] == ("/a", Cause.UNREADABLE, 1)
+    assert str((1 << 20) + 1) in lost.detail
+    assert heard.said_of("exceed the limit")
+
+
+BREAKS = [
+    (frame(2, body(0, 0, b"x"), length=1 << 62), "announces a message"),
+    (frame(1, b"{", length=1 << 40), "sends a JSON message of more than"),
+    (frame(2, b"\x01", is_last=False, length=1 << 40), "sends a message in pieces of more than"),
+    (frame(9, b"x", length=1 << 40), "control frame is too long"),
+    (b"\x82\x85abcd12345", "violates the websocket protocol"),
+    (b"\x83\x01x", "violates the websocket protocol"),
+    (b"\xc2\x01x", "violates the websocket protocol"),
+    (frame(0, b"x"), "violates the websocket protocol"),
+    (frame(2, b"", is_last=False) + frame(2, b"x"), "violates the websocket protocol"),
+    (frame(8, b"\x03\xe9going"), "closed the connection (going)"),
+    (frame(8, b"\x03\xe9\x1b[2J"), "closed the connection (?[2J)"),
+    (frame(8, b""), "closed the connection;"),
+    (b"", "the connection broke"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("sent", "words"), BREAKS)
+def test_a_connection_that_ends_is_made_anew(sent: bytes, words: str) -> None:
+    def first(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel(1))[1], 0, b"1"), sent)
+        if sent:
+            peer.wait()
+
+    def second(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel(9))[9], 0, b"2"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(first, second) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == 2)
+    assert heard.payloads() == [b"1", b"2"]
+    (line,) = heard.said
+    assert words in line
+    assert line.endswith("; trying again")
+    assert line.isprintable()
+    outage = heard.losses[-1]
+    assert outage[:3] == ("/a", Cause.CONNECTION, None)
+    assert heard.taken[0].received <= outage.first <= outage.last <= heard.taken[1].received
+    assert heard.topics == [("/a", "T", 1), ("/a",)] * 2
+
+
+@pytest.mark.parametrize(
+    ("size", "is_in_pieces"),
+    [(100, False), (60_000, False), (200_000, False), (5_000_000, False), (100, True)],
+)
+def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_pieces: bool) -> None:
+    def first(peer: Peer) -> None:
+        number = peer.offer(channel(1))[1]
+        whole = message(number, 0, bytes(size))
+        if is_in_pieces:
+            whole = frame(Opcode.BINARY, body(number, 0, bytes(size)), is_last=False) + b"."
+        peer.send(whole[: len(whole) - 1])
+
+    heard = Heard()
+    with Server(first, Peer.wait) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.losses)
+    assert heard.taken == []
+    (lost,) = heard.losses
+    assert lost[:3] == ("/a", Cause.CONNECTION, 1)
+    assert "in the middle" in lost.detail
+
+
+def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
+    def script(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel())[1], 0, b"1"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(f"ws://localhost:{server.port}/x?y") as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert heard.said == []
+
+
+def test_a_server_that_falls_silent_is_asked_and_then_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(foxglove_connection, "_PING_S", 0.1)
+    monkeypatch.setattr(foxglove_connection, "_SILENT_S", 0.3)
+    asked: list[Opcode] = []
+
+    def first(peer: Peer) -> None:
+        asked.append(peer.hear().opcode)
+        peer.wait()
+
+    def second(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        for _ in range(5):
+            assert peer.hear().opcode is Opcode.PING
+            peer.send(frame(Opcode.PONG, b""))
+        peer.send(message(number, 0, b"1"))
+        peer.wait()
+
+    heard = Heard()
+    with Server(first, second) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+    assert asked == [Opcode.PING]
+    assert [line for line in heard.said if "has been silent for" in line] == heard.said
+    assert len(heard.said) == 1
+
+
+def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
+    dice = random.Random(5)
+    address = foxglove_protocol.parse_address("ws://localhost:1")
+    whole = [
+        advertise(channel(), channel(2, "/b")),
+        message(0, 1, bytes(100)),
+        message(1, 2, bytes(70_000)),
+        frame(Opcode.BINARY, body(0, 1, b"abc")[:5], is_last=False),
+        frame(Opcode.PING, b"x"),
+        frame(Opcode.CONT, body(0, 1, b"abc")[5:]),
+        message(0, 3, b"y"),
+        frame(Opcode.CLOSE, b""),
+    ]
+    for _ in range(300):
+        stream = bytearray(b"".join(whole))
+        for _ in range(dice.randrange(4)):
+            # Most of what can go wrong lies in the heads of frames.
+            starts = [sum(map(len, whole[:at])) for at in range(len(whole))]
+            place = (dice.choice(starts) + dice.randrange(12)) % len(stream)
+            stream[place] = dice.randrange(256)
+        data = bytes(stream[: dice.choice([len(stream), dice.randrange(len(stream))])])
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            theirs.sendall(data[200:])
+            theirs.shutdown(socket.SHUT_WR)
+            protocol = ClientProtocol(parse_uri(address.url), state=State.OPEN, max_size=None)
+            opened = foxglove_handshake.Opened(ours, protocol, data[:200])
+            connection = foxglove_connection.Connection(opened, 1 << 20, lambda: False)
+            heard = Heard()
+            session = foxglove_session.Session(
+                heard, foxglove_session.Notifier(heard, "x"), connection.send, {}
+            )
+            with suppress(PeerError):
+                assert "closed" in connection.read(session)
+            session.end(is_stopped=True)
+
+
+@pytest.mark.parametrize("after", [100, 2])
+def test_gaps_of_header_numbers_are_rows(after: int) -> None:
+    """Also those that too few messages followed, when the server leaves."""
+    numbers = [*range(100), *range(105, 105 + after)]
+    definition = "Header header\nfloat32 x"
+
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel(encoding="ros1", schema=definition, topic="/scan"))[1]
+        peer.send(*(message(number, 0, struct.pack("<Id", n, 0.5)) for n in numbers))
+        if after > 8:
+            peer.wait()
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == len(numbers) and h.losses)
+        lost = heard.losses[0]
+        assert lost[:3] == ("/scan", Cause.TRANSPORT, 5)
+        assert lost.detail == "header.seq went from 99 to 105"
+        assert (lost.first, lost.last) == (heard.taken[99].received, heard.taken[100].received)
+    assert [loss.cause for loss in heard.losses].count(Cause.TRANSPORT) == 1
+
+
+# Those that are no Foxglove server.
+
+
+def answer(data: bytes) -> Script:
+    def script(peer: Peer) -> None:
+        peer.socket.recv(1 << 16)
+        peer.send(data)
+        peer.wait()
+
+    return script
+
+
+def other_subprotocol(peer: Peer) -> None:
+    peer.protocol.available_subprotocols = None
+    peer.shake_hands()
+    peer.wait()
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (answer(b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nhello"), "answers HTTP 404"),
+        (answer(b"HTTP/1.1 401 Who\r\n\r\n"), "USER:PASSWORD"),
+        (answer(b"HTTP/1.1 200 \x1b[31m\r\n\r\n"), "answers HTTP 200"),
+        (answer(b"SSH-2.0-OpenSSH\r\n\r\n"), "not a websocket server"),
+        (answer(b"\x00" * 100_000), "not a websocket server"),
+        (answer(b"HTTP/1.1 101 Yes\r\n\r\n"), "handshake failed"),
+        (answer(b"HTTP/1.1 101 Yes\r\n" + b"a: b\r\n" * 5000 + b"\r\n"), "handshake failed"),
+        (other_subprotocol, "does not speak Foxglove"),
+        (lambda peer: None, "the connection broke|not a websocket server"),
+    ],
+)  # fmt: skip
+def test_somebody_elses_server_is_told_and_tried_again(script: Script, words: str) -> None:
+    heard = Heard()
+    with Server(script, is_raw=True) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: any(h.said_of(word) for word in words.split("|")))
+    assert all(line.isprintable() and line.endswith("; trying again") for line in heard.said)
+    assert heard.taken == []
+
+
+def test_a_server_that_comes_late_is_waited_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+
+    def script(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel())[1], 0, b"1"))
+        peer.wait()
+
+    heard = Heard()
+    with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
+        source.start(heard)
+        heard.until(lambda h: h.said_of("refuses connections"))
+        with Server(script, port=port):
+            heard.until(lambda h: h.taken)
+            source.stop()
+
+
+def test_a_host_that_is_not_known() -> None:
+    heard = Heard()
+    with FoxgloveSource("ws://no-such-host.invalid:8765") as source:
+        source.start(heard)
+        heard.until(lambda h: h.said_of("is unknown"))
+
+
+# Stopping.
+
+
+@pytest.mark.parametrize("is_raw", [True, False])
+def test_a_silent_server_does_not_hold_up_the_end(*, is_raw: bool) -> None:
+    there = threading.Event()
+
+    def script(peer: Peer) -> None:
+        there.set()
+        peer.wait()
+
+    heard = Heard()
+    with Server(script, is_raw=is_raw) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        assert there.wait(DEADLINE_S)
+        must_return(source.stop)
+        must_return(source.stop)
+        assert [t for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
+    assert heard.said == []
+
+
+def test_what_is_under_way_at_the_end_is_handed_over() -> None:
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        peer.send(message(number, 0, b"1"))
+        goodbye = peer.hear()
+        assert goodbye.opcode is Opcode.CLOSE
+        # A half of a large message, whose rest comes, and then the answer.
+        large = message(number, 0, bytes(1_000_000))
+        peer.send(message(number, 0, b"2"), large[:500_000])
+        peer.send(large[500_000:], frame(Opcode.CLOSE, bytes(goodbye.data)))
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+        source.stop()
+        assert heard.payloads() == [b"1", b"2", bytes(1_000_000)]
+    assert heard.said == heard.losses == []
+
+
+def test_a_flood_does_not_hold_up_the_end() -> None:
+    def script(peer: Peer) -> None:
+        flood = message(peer.offer(channel())[1], 0, bytes(1000)) * 100
+        while True:
+            peer.send(flood)
+
+    heard = Heard()
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+        source.stop()
+        known = len(heard.taken)
+        assert known == len(heard.taken)
+    assert heard.said == []
+
+
+def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", lambda args: seen.append(args.exc_value))
+
+    def script(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel())[1], 0, b"1"))
+        peer.wait()
+
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("no more")
+
+    heard = Heard()
+    monkeypatch.setattr(heard, "take", fails)
+    with Server(script) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+    assert "no more" in heard.ends[0]
+    assert len(seen) == 1
+
+
+# TLS.
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    program = shutil.which("openssl")
+    if program is None:
+        pytest.skip("openssl is not installed: wss:// is not tested")
+    folder = tmp_path_factory.mktemp("tls")
+    subprocess.run(
+        f"{program} req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 "
+        "-keyout key.pem -out cert.pem -subj /CN=localhost -addext subjectAltName=IP:127.0.0.1",
+        shell=True,
+        check=True,
+        cwd=folder,
+        capture_output=True,
+    )
+    return folder / "cert.pem", folder / "key.pem"
+
+
+def tls_server(script: Script, certificate: tuple[Path, Path]) -> Server:
+    server = Server(script)
+    server.tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    server.tls.load_cert_chain(*certificate)
+    server.url = server.url.replace("ws:", "wss:")
+    return server
+
+
+def test_tls_carries_messages_of_any_size(
+    certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
+    payloads = [random.randbytes(size) for size in SIZES]
+
+    def script(peer: Peer) -> None:
+        number = peer.offer(channel())[1]
+        peer.send(*(message(number, 0, payload) for payload in payloads))
+        peer.wait()
+
+    heard = Heard()
+    with tls_server(script, certificate) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) == len(payloads))
+    assert heard.payloads() == payloads
+    assert heard.said == []
+
+
+def test_a_certificate_that_nobody_vouches_for_is_refused(
+    certificate: tuple[Path, Path],
+) -> None:
+    heard = Heard()
+    with tls_server(Peer.wait, certificate) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(lambda h: h.said_of("certificate is not trusted"))
+    assert heard.said_of("SSL_CERT_FILE")
+
+
+def test_a_server_without_tls_is_told() -> None:
+    heard = Heard()
+    with Server(answer(b"HTTP/1.1 400 Bad\r\n\r\n"), is_raw=True) as server:
+        with FoxgloveSource(server.url.replace("ws:", "wss:")) as source:
+            source.start(heard)
+            heard.until(lambda h: h.said_of("try ws://"))
+
+
+# The SDK's own server.
+
+
+@pytest.fixture
+def sdk() -> Any:
+    return pytest.importorskip(
+        "foxglove", reason="foxglove-sdk is not installed: no real Foxglove server is tested"
+    )
+
+
+@pytest.mark.peer("Foxglove")
+def test_a_program_with_the_sdk(sdk: Any) -> None:
+    context = sdk.Context()
+    server = sdk.start_server(host="127.0.0.1", port=0, context=context, name="real")
+    text = b"string data"
+    offers = {
+        "/json": ("json", sdk.Schema(name="J", encoding="jsonschema", data=b'{"type":"object"}')),
+        "/ros1": ("ros1", sdk.Schema(name="std_msgs/String", encoding="ros1msg", data=text)),
+        "/ros2": ("cdr", sdk.Schema(name="std_msgs/msg/String", encoding="ros2msg", data=text)),
+        "/proto": ("protobuf", sdk.Schema(name="p.P", encoding="protobuf", data=b"\n\x00\xff")),
+        "/flat": ("flatbuffer", sdk.Schema(name="F", encoding="flatbuffer", data=b"\x00\xfe")),
+        "/own": ("own", sdk.Schema(name="O", encoding="mine", data=b"as you like")),
+    }
+    channels = {
+        topic: sdk.Channel(topic, message_encoding=encoding, schema=schema, context=context)
+        for topic, (encoding, schema) in offers.items()
+    }
+    sizes = [0, 1, 125, 126, 65_535, 65_536, 640_000, 4_000_000]
+    heard = Heard()
+    try:
+        with FoxgloveSource(f"ws://127.0.0.1:{server.port}") as source:
+            source.start(heard)
+            subscribed(heard, channels)
+            sent = {topic: [random.randbytes(size) for size in sizes] for topic in channels}
+            for topic, payloads in sent.items():
+                for at, payload in enumerate(payloads):
+                    channels[topic].log(payload, log_time=1_700_000_000_000_000_000 + at)
+            heard.until(lambda h: len(h.taken) == len(channels) * len(sizes))
+            for topic, payloads in sent.items():
+                assert heard.payloads(topic) == payloads
+            times = {taken.sent for taken in heard.taken}
+            assert times == {1_700_000_000_000_000_000 + at for at in range(len(sizes))}
+            for taken in heard.taken:
+                encoding, schema = offers[taken.channel.topic]
+                assert taken.channel.message_encoding == encoding
+                assert taken.channel.schema == Schema(schema.name, schema.encoding, schema.data)
+
+            # A channel that goes, one with the same topic and another type, and a status.
+            channels["/json"].close()
+            heard.until(lambda h: ("/json",) in h.topics)
+            again = plain(sdk, "/json", context)
+            heard.until(lambda h: [t[0] for t in h.topics if len(t) > 1].count("/json") == 2)
+            until_taken(heard, lambda: again.log(b"again"), "/json", b"again")
+            server.publish_status("careful", sdk.StatusLevel.Warning)
+            heard.until(lambda h: h.said_of("says: careful"))
+    finally:
+        server.stop()
+    assert heard.losses == []
+
+
+def plain(sdk: Any, topic: str, context: Any) -> Any:
+    schema = sdk.Schema(name="P", encoding="mine", data=b"as you like")
+    return sdk.Channel(topic, message_encoding="own", schema=schema, context=context)
+
+
+def subscribed(heard: Heard, channels: dict[str, Any]) -> None:
+    heard.until(lambda h: {t[0] for t in h.topics} >= set(channels))
+    deadline = time.monotonic() + DEADLINE_S
+    while not all(each.has_sinks() for each in channels.values()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def until_taken(heard: Heard, log: Callable[[], None], topic: str, payload: bytes) -> None:
+    """Log until it comes: the server takes a moment to know of a subscription."""
+    deadline = time.monotonic() + DEADLINE_S
+    while payload not in heard.payloads(topic):
+        assert time.monotonic() < deadline, vars(heard)
+        log()
+        time.sleep(0.01)
+
+
+def start_again(sdk: Any, port: int, context: Any) -> Any:
+    """A server on a port that another one may not have left yet."""
+    deadline = time.monotonic() + DEADLINE_S
+    while True:
+        try:
+            return sdk.start_server(host="127.0.0.1", port=port, context=context)
+        except RuntimeError:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+@pytest.mark.peer("Foxglove")
+def test_an_sdk_server_that_begins_anew(sdk: Any) -> None:
+    context = sdk.Context()
+    made = plain(sdk, "/a", context)
+    server = sdk.start_server(host="127.0.0.1", port=0, context=context)
+    port = server.port
+    heard = Heard()
+    try:
+        with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
+            source.start(heard)
+            until_taken(heard, lambda: made.log(b"1"), "/a", b"1")
+            server.stop()
+            heard.until(lambda h: h.said)
+            server = start_again(sdk, port, context)
+            until_taken(heard, lambda: made.log(b"2"), "/a", b"2")
+    finally:
+        server.stop()
+    assert [lost[:3] for lost in heard.losses] == [("/a", Cause.CONNECTION, None)]
+
+
+@pytest.mark.peer("Foxglove")
+def test_many_messages_of_the_sdk_come_in_order(sdk: Any) -> None:
+    context = sdk.Context()
+    made = plain(sdk, "/a", context)
+    count = 5000
+    server = sdk.start_server(
+        host="127.0.0.1", port=0, context=context, message_backlog_size=2 * count
+    )
+    heard = Heard()
+    try:
+        with FoxgloveSource(f"ws://127.0.0.1:{server.port}") as source:
+            source.start(heard)
+            subscribed(heard, {"/a": made})
+            for at in range(count):
+                made.log(b"%d" % at)
+            heard.until(lambda h: len(h.taken) == count)
+    finally:
+        server.stop()
+    assert heard.payloads() == [b"%d" % at for at in range(count)]

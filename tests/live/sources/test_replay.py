@@ -1,0 +1,424 @@
+"""Logs played as if the robot ran, compared with other people's readers."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from hybridlog.live.sources import replay, replay_order
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.replay import ReplaySource
+from hybridlog.live.sources.replay_order import Lookahead, Rows
+from hybridlog_storage.errors import SourceError, UsageError
+from hybridlog_storage.messages import Batch, Channel
+from tests import independent
+from tests.data import DATA, needs_data
+from tests.live.sources.heard import Heard, must_return
+
+BEGIN = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+FAST = 1e9
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left() -> Iterator[None]:
+    yield
+    assert [t.name for t in threading.enumerate() if t.name.startswith("hybridlog-replay")] == []
+
+
+def write(path: Path, messages: Iterable[tuple[str, int, bytes]], sequence: int = 0) -> Path:
+    """An MCAP file of topics, log times and payloads, as they come."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1000)
+        writer.start()
+        schema = writer.register_schema("T", "jsonschema", b"{}")
+        channels: dict[str, int] = {}
+        for at, (topic, log_time, payload) in enumerate(messages):
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            number = channels[topic]
+            writer.add_message(number, log_time, payload, log_time - 5, sequence and sequence + at)
+        writer.add_attachment(0, 0, "notes.txt", "text/plain", b"hello")
+        writer.finish()
+    return path
+
+
+def play(path: Path, heard: Heard, *, speed: float = FAST) -> None:
+    """Play a log to its end."""
+    with ReplaySource(path, speed=speed) as source:
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+
+
+def assert_same(heard: Heard, expected: Sequence[independent.Seen]) -> None:
+    """All messages came, byte for byte, those of a topic in the order of their times."""
+    by_topic: dict[str, list[independent.Seen]] = defaultdict(list)
+    for seen in sorted(expected, key=lambda seen: seen.log_time):
+        by_topic[seen.topic].append(seen)
+    assert len(heard.taken) == len(expected)
+    got: dict[str, list[bytes]] = defaultdict(list)
+    for taken in heard.taken:
+        got[taken.channel.topic].append(taken.payload)
+    for topic, messages in by_topic.items():
+        at = 0
+        same_time = Counter(seen.log_time for seen in messages)
+        for count in same_time.values():
+            want = Counter(seen.payload for seen in messages[at : at + count])
+            assert Counter(got[topic][at : at + count]) == want
+            at += count
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "real/leg_tracker_stationary.bag",
+        "real/tilt_laser.bag",
+        "real/luminar_pointcloud.bag",
+        "real/ouster.mcap",
+        "real/auv_ros2.mcap",
+        "real/auv_ros2_db3",
+        "odd/example-bz2.bag",
+        "odd/example-lz4.bag",
+        "odd/example-unsorted-chunks.bag",
+        "odd/every_sensor_msg_ros2.mcap",
+        "odd/protobuf.mcap",
+        "odd/empty_msgs.bag",
+        "odd/no-messages.bag",
+        "odd/rosbag2/split_mcap",
+    ],
+)
+def test_real_logs_come_as_other_readers_see_them(name: str) -> None:
+    heard = Heard()
+    play(DATA / name, heard)
+    expected = independent.read(DATA / name)
+    assert_same(heard, expected)
+    assert heard.losses == []
+    assert heard.ends == [""]
+    assert heard.unexpected == []
+    came = {topic[0] for topic in heard.topics if len(topic) == 3}
+    gone = {topic[0] for topic in heard.topics if len(topic) == 1}
+    assert came == gone >= {seen.topic for seen in expected}
+
+
+@needs_data
+def test_ros1_connections_are_channels_of_their_own() -> None:
+    heard = Heard()
+    play(DATA / "real/tilt_laser.bag", heard)
+    channels = {id(taken.channel): taken.channel for taken in heard.taken}
+    assert {channel.message_encoding for channel in channels.values()} == {"ros1"}
+    assert all(channel.metadata["md5sum"] for channel in channels.values())
+    assert {taken.sent for taken in heard.taken} == {None}
+    assert {taken.sequence for taken in heard.taken} == {None}
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "messages"),
+    [("tilt_trunc60.bag", 2469), ("ouster_zstd_bitflip.mcap", 100), ("lidar_trunc50.db3", 217)],
+)
+def test_what_cannot_be_read_is_a_row(name: str, messages: int) -> None:
+    heard = Heard()
+    play(DATA / "damaged" / name, heard)
+    assert len(heard.taken) == messages
+    assert heard.ends == [""]
+    told = [lost.detail for lost in heard.losses] + heard.said
+    assert any(name in line for line in told)
+    for lost in heard.losses:
+        assert lost[:2] == ("", Cause.UNREADABLE)
+        assert lost.count != 0
+    if name == "tilt_trunc60.bag":
+        assert heard.losses
+        assert any(", byte " in lost.detail for lost in heard.losses)
+
+
+def test_times_and_numbers_are_those_of_the_log(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in range(5)], 7)
+    heard = Heard()
+    before = time.time_ns()
+    play(path, heard)
+    after = time.time_ns()
+    assert heard.payloads() == [b"0", b"1", b"2", b"3", b"4"]
+    assert [taken.sent for taken in heard.taken] == [BEGIN + at - 5 for at in range(5)]
+    assert [taken.sequence for taken in heard.taken] == [7, 8, 9, 10, 11]
+    assert all(before <= taken.received <= after for taken in heard.taken)
+    assert len({id(taken.channel) for taken in heard.taken}) == 1
+    assert heard.topics == [("/a", "T", 1), ("/a",)]
+    unnumbered = Heard()
+    play(write(tmp_path / "b.mcap", [("/a", BEGIN, b"x")]), unnumbered)
+    assert unnumbered.taken[0].sequence is None
+
+
+class Clock(threading.Event):
+    """A clock that advances only while the player waits for it."""
+
+    now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time_ns(self) -> int:
+        return int(self.now * SECOND)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self.now += timeout
+        return self.is_set()
+
+
+def play_by(
+    clock: Clock, path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch, speed: float
+) -> None:
+    with monkeypatch.context() as patch, ReplaySource(path, speed=speed) as source:
+        patch.setattr(replay, "time", clock)
+        source._stop = clock
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+
+
+@pytest.mark.parametrize("speed", [1.0, 2.5])
+def test_nothing_comes_before_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: float
+) -> None:
+    offsets = [0.0, 0.0, 0.05, 0.1, 0.1004, 0.1007, 0.3, 5000.0]
+    log = [("/a", BEGIN + int(offset * SECOND), b"x") for offset in offsets]
+    path = write(tmp_path / "a.mcap", log)
+    clock, heard = Clock(), Heard()
+    began = clock.now
+    play_by(clock, path, heard, monkeypatch, speed)
+    assert len(heard.taken) == len(offsets)
+    for taken, offset in zip(heard.taken, offsets, strict=True):
+        late = taken.received / SECOND - (began + offset / speed)
+        assert -1e-6 <= late <= replay._MIN_PAUSE_S + 1e-6
+
+
+def test_many_small_messages_do_not_cost_a_pause_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = 5000
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at * 100_000, b"") for at in range(count)])
+    pauses = []
+    pause = replay._Player._pause
+    monkeypatch.setattr(
+        replay._Player, "_pause", lambda *given: (pauses.append(1), pause(*given))[1]
+    )
+    heard = Heard()
+    play(path, heard, speed=1.0)
+    assert len(heard.taken) == count
+    # The log takes half a second, and no pause is shorter than a millisecond.
+    assert 1 <= len(pauses) <= 501
+
+
+def test_the_order_is_by_time_as_far_as_one_looks_ahead(tmp_path: Path) -> None:
+    times = list(range(3000))
+    random.Random(1).shuffle(times)
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in times])
+    heard = Heard()
+    play(path, heard)
+    assert heard.payloads() == [b"%d" % at for at in range(3000)]
+
+
+def batch(times: Sequence[int], size: int) -> Batch:
+    count = len(times)
+    column = np.array(times, np.int64)
+    return Batch(
+        bytearray(b"".join(b"%0*d" % (size, at) for at in times)),
+        np.arange(count, dtype=np.int64) * size,
+        np.full(count, size, np.int64),
+        np.zeros(count, np.int32),
+        column,
+        column,
+        np.zeros(count, np.uint32),
+    )
+
+
+def payloads(rows: Rows | None) -> list[bytes]:
+    return [] if rows is None else list(rows.payloads())
+
+
+def test_looking_ahead_is_bounded_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_order, "_WINDOW", 10_000)
+    monkeypatch.setattr(replay_order, "_WINDOW_ROWS", 300)
+    lookahead = Lookahead()
+    dice = random.Random(2)
+    times = [*range(2000, 4000), *range(2000)]  # the second half is late
+    times[::50] = [9_000_000 + at for at in times[::50]]  # a clock that is wrong
+    got: list[bytes] = []
+    for at in range(0, len(times), 40):
+        piece = times[at : at + 40]
+        dice.shuffle(piece)
+        size = dice.choice([20, 50])
+        rows = lookahead.add(batch(piece, size))
+        if rows is not None:
+            assert (np.diff(rows.table.log_time) >= 0).all()
+        got += payloads(rows)
+        for waiting in lookahead._waiting:
+            held = sum(map(len, waiting.buffers))
+            assert held <= 10_000 + 2 * waiting.table.payload_bytes
+        assert lookahead._bytes <= 10_000
+        assert lookahead._rows <= 300
+    got += payloads(lookahead.rest())
+    numbers = [int(payload) for payload in got]
+    assert sorted(numbers) == sorted(times)
+    for half in (range(2000), range(2000, 4000)):
+        right = [number for number in numbers if number in half]
+        assert right == sorted(right)
+    assert payloads(lookahead.rest()) == []
+
+
+def test_a_message_larger_than_what_is_looked_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_order, "_WINDOW", 100)
+    lookahead = Lookahead()
+    assert len(payloads(lookahead.add(batch([5], 1000)))) == 1
+    assert lookahead.rest() is None
+
+
+def test_a_late_part_of_a_log_is_sent_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay_order, "_WINDOW", 2000)
+    second_first = [*range(1000, 2000), *range(1000)]
+    log = [("/a", BEGIN + at * 3600 * SECOND, b"%0100d" % at) for at in second_first]
+    path = write(tmp_path / "a.mcap", log)
+    heard = Heard()
+    play(path, heard)
+    assert sorted(heard.payloads()) == [b"%0100d" % at for at in range(2000)]
+
+
+def test_what_is_late_in_the_log_is_no_lateness_of_ours() -> None:
+    def step(*times: int) -> replay._Step:
+        rows = Lookahead()
+        rows.add(batch(times, 20))
+        return replay._Step(0, rows.rest(), [Channel("/a", "json", None)], [])
+
+    hour = 3600 * SECOND
+    heard = Heard()
+    player = replay._Player(heard, "log", 1.0, threading.Event())
+    end = replay._Step(0, None, [], [], end=True)
+    player.play(iter([step(BEGIN, BEGIN + 1), step(BEGIN - hour), step(BEGIN + 2), end]))
+    assert len(heard.taken) == 4
+    assert heard.said == []
+
+
+def test_only_what_is_wanted_is_played(tmp_path: Path) -> None:
+    log = [(topic, BEGIN + at, b"x") for at in range(10) for topic in ("/a", "/b")]
+    path = write(tmp_path / "a.mcap", log)
+    asked: list[tuple[str, str]] = []
+    heard = Heard(lambda topic, kind: bool(asked.append((topic, kind))) or topic == "/b")
+    play(path, heard)
+    assert {taken.channel.topic for taken in heard.taken} == {"/b"}
+    assert len(heard.taken) == 10
+    assert asked == [("/a", "T"), ("/b", "T")]
+    assert heard.topics == [("/b", "T", 1), ("/b",)]
+
+
+def test_falling_behind_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay, "_LATE_S", 0.0)
+    monkeypatch.setattr(replay, "_AT_ONCE", 10)
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"x") for at in range(100)])
+    heard = Heard()
+    play(path, heard)
+    (line,) = heard.said
+    assert "cannot be played at speed 1e+09" in line
+    assert len(heard.taken) == 100
+
+
+def test_a_long_pause_is_said_and_can_be_left(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"1"), ("/a", BEGIN + 7200 * SECOND, b"2")])
+    heard = Heard()
+    with ReplaySource(path) as source:
+        source.start(heard)
+        heard.until(lambda h: h.said)
+        must_return(source.stop)
+        must_return(source.stop)
+        assert [t for t in threading.enumerate() if t.name.startswith("hybridlog-replay")] == []
+    assert heard.payloads() == [b"1"]
+    assert "takes 7200 s" in heard.said[0]
+    assert heard.ends == []
+
+
+def test_rounds_follow_each_other_until_stopped(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in range(3)])
+    heard = Heard()
+    with ReplaySource(path, speed=FAST, loop=True) as source:
+        source.start(heard)
+        heard.until(lambda h: len(h.taken) >= 7)
+    assert heard.payloads()[:7] == [b"0", b"1", b"2", b"0", b"1", b"2", b"0"]
+    assert len({id(taken.channel) for taken in heard.taken}) == 1
+    assert heard.topics == [("/a", "T", 1)]
+    assert heard.ends == []
+
+
+def test_what_is_not_wanted_takes_its_time_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = [("/a", BEGIN, b"x"), ("/b", BEGIN + SECOND // 5, b"y")]
+    path = write(tmp_path / "a.mcap", log)
+    for topic in ("/a", "/c"):
+        heard = Heard(lambda name, _, topic=topic: name == topic)  # type: ignore[misc]
+        clock = Clock()
+        began = clock.now
+        play_by(clock, path, heard, monkeypatch, speed=1.0)
+        assert clock.now == pytest.approx(began + 0.2, abs=replay._MIN_PAUSE_S)
+        assert heard.ends == [""]
+    with ReplaySource(path, loop=True) as source:
+        source.start(Heard(lambda *_: False))
+
+
+def test_a_log_without_messages_has_no_rounds(tmp_path: Path) -> None:
+    heard = Heard()
+    with ReplaySource(write(tmp_path / "a.mcap", []), loop=True) as source:
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+    assert heard.ends == [""]
+
+
+def test_a_log_that_vanishes_between_rounds_ends_with_the_reason(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"x")])
+    heard = Heard()
+    with ReplaySource(path, loop=True) as source:
+        source.start(heard)
+        heard.until(lambda h: h.taken)
+        path.unlink()
+        heard.until(lambda h: h.ends)
+    assert "no such file" in heard.ends[0]
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_speed_that_is_none_is_refused(tmp_path: Path, speed: float) -> None:
+    with pytest.raises(UsageError, match="above zero"):
+        ReplaySource(tmp_path, speed=speed)
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("hello")
+    for name, words in (("a.txt", "not a log"), ("missing.bag", "no such file")):
+        source = ReplaySource(tmp_path / name)
+        with pytest.raises(SourceError, match=words):
+            source.start(Heard())
+        source.stop()
+
+
+def test_a_sink_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", lambda given: seen.append(given.exc_value))
+    path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"x")])
+
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("no more")
+
+    heard = Heard()
+    monkeypatch.setattr(heard, "take", fails)
+    with ReplaySource(path) as source:
+        source.start(heard)
+        heard.until(lambda h: h.ends)
+    assert "no more" in heard.ends[0]
+    assert len(seen) == 1

@@ -1,0 +1,731 @@
+"""The ROS 1 source against a master and publishers in plain Python, good and bad ones."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+import psutil
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.ros1 import error_aggregator
+from hybridlog.live.sources.ros1.source import Ros1Source
+from hybridlog_storage.errors import UsageError
+from tests.live.sources.heard import must_return
+from tests.live.sources.ros1_peers import (
+    Collector,
+    FakeMaster,
+    FakePublisher,
+    eventually,
+    framed,
+    sends,
+    until_closed,
+)
+
+Script = Callable[[socket.socket], None]
+
+
+@pytest.fixture(autouse=True)
+def _quiet_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(error_aggregator, "_QUIET_S", 0.1)
+    for name in ("ROS_MASTER_URI", "ROS_HOSTNAME", "ROS_IP", "ROS_IPV6"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left() -> Iterator[None]:
+    """No thread and no socket outlives a test."""
+    files, threads = psutil.Process().num_fds(), threading.active_count()
+    yield
+    eventually(lambda: threading.active_count() <= threads)
+    eventually(lambda: psutil.Process().num_fds() <= files)
+
+
+@contextmanager
+def _system(
+    *publishers: FakePublisher,
+    sink: Collector | None = None,
+    tells: bool = True,
+    poll_s: float = 0.1,
+) -> Iterator[tuple[FakeMaster, Collector]]:
+    """A master, publishers that it knows, and a source that listens to them."""
+    sink = sink or Collector()
+    with ExitStack() as stack:
+        master = stack.enter_context(FakeMaster(tells=tells))
+        for publisher in publishers:
+            stack.enter_context(publisher)
+            _announce(master, publisher)
+        with Ros1Source(master.uri, poll_s=poll_s) as source:
+            source.start(sink)
+            yield master, sink
+
+
+def _announce(master: FakeMaster, publisher: FakePublisher) -> None:
+    master.add(publisher.topic, publisher.fields["type"], publisher.node, publisher.uri)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+# What should happen
+
+
+def test_messages_come_as_they_were_sent() -> None:
+    publisher = FakePublisher(sends(b"", b"one", bytes(3_000_000), b"two"))
+    before = time.time_ns()
+    with _system(publisher) as (_, sink):
+        sink.wait_for(b"", b"one", bytes(3_000_000), b"two")
+    channel = sink.taken[0].channel
+    assert all(taken.channel is channel for taken in sink.taken)
+    assert before <= sink.taken[0].received <= sink.taken[-1].received <= time.time_ns()
+    assert channel.topic == "/topic"
+    assert channel.schema is not None
+    assert (channel.schema.name, channel.schema.data) == ("std_msgs/String", b"string data\n")
+    assert channel.metadata["callerid"] == "/node"
+    (asked,) = publisher.asked
+    assert (asked["topic"], asked["type"], asked["md5sum"]) == ("/topic", "*", "*")
+    assert sink.topics == [("/topic", "std_msgs/String", 1)]
+    assert sink.expected == [channel]
+    assert sink.unexpected == sink.said == sink.losses == sink.ends == []
+
+
+def test_it_registers_under_its_name_and_leaves_no_trace() -> None:
+    with _system(FakePublisher(sends(b"x"))) as (master, sink):
+        sink.wait_for(b"x")
+        (name,) = master.subscribers["/topic"]
+        assert name.startswith(f"/hybridlog_{os.getpid()}_")
+        api = master.subscribers["/topic"][name]
+        assert api.startswith("http://127.0.0.1:")
+        source_is_alive = master.calls.count("getSystemState")
+        eventually(lambda: master.calls.count("getSystemState") > source_is_alive)
+    with FakeMaster() as master, Ros1Source(master.uri, poll_s=0.05) as source:
+        with FakePublisher(sends(b"x")) as publisher:
+            _announce(master, publisher)
+            sink = Collector()
+            source.start(sink)
+            sink.wait_for(b"x")
+            source.stop()
+            source.stop()
+            assert master.subscribers == {"/topic": {}}
+
+
+def test_only_topics_that_are_wanted() -> None:
+    sink = Collector(wanted=lambda topic, type_name: topic == "/b")
+    a, b = FakePublisher(sends(b"a"), topic="/a"), FakePublisher(sends(b"b"), topic="/b")
+    with _system(a, b, sink=sink) as (master, _):
+        sink.wait_for(b"b", topic="/b")
+        eventually(lambda: master.calls.count("getSystemState") > 4)
+    assert a.asked == []
+    assert sink.asked == [("/a", "std_msgs/String"), ("/b", "std_msgs/String")]
+    assert "/a" not in master.subscribers
+
+
+@pytest.mark.parametrize("tells", [True, False], ids=["told by the master", "found by asking"])
+def test_new_topics_and_new_publishers(tells: bool) -> None:
+    first, second = (FakePublisher(sends(node.encode()), node=node) for node in ("/1", "/2"))
+    other = FakePublisher(sends(b"other"), topic="/other")
+    with _system(tells=tells) as (master, sink), first, second, other:
+        _announce(master, first)
+        sink.wait_for(b"/1")
+        _announce(master, second)
+        sink.wait_for(b"/1", b"/2")
+        _announce(master, other)
+        sink.wait_for(b"other", topic="/other")
+    assert [topic for topic in sink.topics if topic[0] == "/topic"][:2] == [
+        ("/topic", "std_msgs/String", 1),
+        ("/topic", "std_msgs/String", 2),
+    ]
+
+
+def test_the_master_is_heard_at_once() -> None:
+    first, second = (FakePublisher(sends(node.encode()), node=node) for node in ("/1", "/2"))
+    with _system(first, poll_s=3600) as (master, sink), second:
+        sink.wait_for(b"/1")
+        _announce(master, second)
+        sink.wait_for(b"/1", b"/2")
+
+
+def test_a_topic_goes_and_comes_back() -> None:
+    closing = threading.Event()
+
+    def until_told(connection: socket.socket) -> None:
+        connection.sendall(framed(b"x"))
+        closing.wait(10)
+
+    publisher = FakePublisher(until_told)
+    with _system(publisher) as (master, sink):
+        sink.wait_for(b"x")
+        publisher.withdraw()
+        master.remove("/topic", "/node")
+        closing.set()
+        sink.wait(lambda: ("/topic",) in sink.topics)
+        with FakePublisher(sends(b"y")) as again:
+            _announce(master, again)
+            sink.wait_for(b"x", b"y")
+    came = ("/topic", "std_msgs/String", 1)
+    assert sink.topics[:3] == [came, ("/topic",), came]
+    assert sink.taken[0].channel is sink.taken[1].channel
+    assert sink.said == []
+
+
+def test_a_node_that_is_started_anew_at_another_address() -> None:
+    """The master's list of names stays the same, and nobody tells us."""
+    with _system(tells=False) as (master, sink):
+        with FakePublisher(sends(b"x")) as first:
+            _announce(master, first)
+            sink.wait_for(b"x")
+        with FakePublisher(sends(b"y")) as second:
+            _announce(master, second)
+            sink.wait_for(b"x", b"y")
+
+
+def test_publishers_of_different_types() -> None:
+    numbers = {"type": "std_msgs/Int8", "message_definition": "int8 data\n", "md5sum": "27"}
+    sink = Collector(wanted=lambda topic, type_name: type_name != "std_msgs/Bool")
+    bools = FakePublisher(sends(b"no"), node="/bool", fields={"type": "std_msgs/Bool"})
+    with _system(FakePublisher(sends(b"text")), sink=sink) as (master, _):
+        sink.wait_for(b"text")
+        with FakePublisher(sends(b"7"), node="/int\x1b[31m", fields=numbers) as other, bools:
+            master.add("/topic", "", "/bool", bools.uri)
+            master.add("/topic", "", "/int", other.uri)
+            sink.wait_for(b"text", b"7")
+            eventually(lambda: bool(bools.asked))
+            sink.wait_said("/topic", "std_msgs/String", "std_msgs/Int8", "/int?[31m")
+    assert bools.connections <= 1
+    schemas = [taken.channel.schema for taken in sink.taken]
+    assert [schema.name for schema in schemas if schema] == ["std_msgs/String", "std_msgs/Int8"]
+
+
+def test_a_topic_that_comes_back_with_a_type_that_is_not_wanted() -> None:
+    sink = Collector(wanted=lambda topic, type_name: type_name == "std_msgs/String")
+    with _system(sink=sink) as (master, _):
+        with FakePublisher(sends(b"x")) as first:
+            _announce(master, first)
+            sink.wait_for(b"x")
+            master.remove("/topic", "/node")
+        sink.wait(lambda: ("/topic",) in sink.topics)
+        looks = master.calls.count("getSystemState")
+        eventually(lambda: master.calls.count("getSystemState") > looks + 1)
+        master.types.clear()
+        with FakePublisher(sends(b"y"), fields={"type": "std_msgs/Bool"}) as second:
+            _announce(master, second)
+            eventually(lambda: bool(second.asked))
+            eventually(lambda: sink.topics[-1] == ("/topic",))
+    assert sink.payloads() == [b"x"]
+
+
+def test_a_type_that_the_master_does_not_know() -> None:
+    publisher = FakePublisher(sends(b"x"))
+    with _system() as (master, sink), publisher:
+        master.add("/topic", "*", "/node", publisher.uri)
+        sink.wait_for(b"x")
+        sink.wait(lambda: ("/topic", "std_msgs/String", 1) in sink.topics)
+    assert sink.asked[0] == ("/topic", "")
+    assert ("/topic", "std_msgs/String") in sink.asked
+
+
+@pytest.mark.parametrize("after", [2, 20])
+def test_dropped_messages_are_counted(after: int) -> None:
+    """A gap that few messages follow is reported at the end, otherwise at once."""
+    header = {"type": "a/B", "message_definition": "Header header\n"}
+    numbers = [*range(1, 21), *range(25, 25 + after)]
+    payloads = [struct.pack("<I", number) + b"rest" for number in numbers]
+    with _system(FakePublisher(sends(*payloads), fields=header)) as (_, sink):
+        sink.wait_for(*payloads)
+        if after > 8:
+            sink.wait(lambda: bool(sink.losses))
+    assert [taken.sequence for taken in sink.taken] == numbers
+    (loss,) = sink.losses
+    assert (loss.topic, loss.cause, loss.count) == ("/topic", Cause.TRANSPORT, 4)
+    assert "/node" in loss.detail
+
+
+# Masters
+
+
+def test_a_master_that_is_not_there_yet() -> None:
+    sink, port = Collector(), _free_port()
+    with Ros1Source(f"http://127.0.0.1:{port}") as source:
+        source.start(sink)
+        sink.wait_said("no ROS master", f"127.0.0.1:{port}", "refused", "roscore")
+        with FakeMaster(port=port) as master, FakePublisher(sends(b"x")) as publisher:
+            _announce(master, publisher)
+            sink.wait_for(b"x")
+
+
+def test_a_master_that_is_started_anew() -> None:
+    """It knows nobody; what is connected goes on, and new publishers are found."""
+    going: list[socket.socket] = []
+
+    def script(connection: socket.socket) -> None:
+        connection.sendall(framed(b"before"))
+        going.append(connection)
+        until_closed(connection)
+
+    sink = Collector()
+    with ExitStack() as stack:
+        first = stack.enter_context(FakePublisher(script))
+        with FakeMaster() as master:
+            _announce(master, first)
+            source = stack.enter_context(Ros1Source(master.uri, poll_s=0.05))
+            source.start(sink)
+            sink.wait_for(b"before")
+        sink.wait_said("no ROS master")
+        master = stack.enter_context(FakeMaster(port=master.port))
+        eventually(lambda: bool(master.subscribers.get("/topic")))
+        going[0].sendall(framed(b"after"))
+        sink.wait_for(b"before", b"after")
+        second = stack.enter_context(FakePublisher(sends(b"new"), node="/new"))
+        _announce(master, second)
+        sink.wait_for(b"before", b"after", b"new")
+    assert first.connections == 1
+    assert not sink.losses
+
+
+def _serve_raw(answer: bytes, *, endless: bool = False) -> Script:
+    def script(connection: socket.socket) -> None:
+        connection.recv(65536)
+        connection.sendall(answer)
+        while endless:
+            connection.sendall(bytes(1 << 20))
+
+    return script
+
+
+def _http(body: bytes, *, length: str | None = None) -> bytes:
+    count = length or str(len(body))
+    return f"HTTP/1.0 200 OK\r\nContent-Length: {count}\r\n\r\n".encode() + body
+
+
+def _xml(value: object) -> bytes:
+    return _http(xmlrpc.client.dumps((value,), methodresponse=True).encode())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (b"", "does not speak HTTP"),
+        (b"SSH-2.0-x\r\n\r\n", "does not speak HTTP"),
+        (b"HTTP/1.0 404 \x1b[2JNo\r\n\r\n", "404 ?[2JNo"),
+        (_http(b"<html>"), "malformed XML-RPC"),
+        (_http(b"", length="99999999999"), "longer than"),
+        (_http(b"", length="-1"), "an invalid content length"),
+        (_http(b"abc", length="10"), "in the middle of its answer"),
+        (_http(b"<!DOCTYPE a [<!ENTITY b 'c'>]>"), "XML with a document type"),
+        (_xml([1, "", [[["/a", "b"]], [], []]]), "not that of a ROS master"),
+        (_xml([1, "", 5]), "not that of a ROS master"),
+        (_xml({"a": 1}), "not that of a ROS node"),
+        (_xml([-1, "go \x9b away", 0]), "it refuses: go ? away"),
+        (_http(xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no")).encode()), "it answers: no"),
+        (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", "in chunks"),
+    ],
+)
+def test_what_is_no_master(answer: bytes, words: str) -> None:
+    with _raw_server(_serve_raw(answer)) as port:
+        sink = Collector()
+        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+            source.start(sink)
+            sink.wait_said("no ROS master", words)
+
+
+@pytest.mark.parametrize("answer", [b"x", b"HTTP/1.0 200 OK\r\n\r\n"], ids=["header", "body"])
+def test_an_answer_without_end(answer: bytes) -> None:
+    before = psutil.Process().memory_info().rss
+    with _raw_server(_serve_raw(answer, endless=True)) as port:
+        sink = Collector()
+        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+            source.start(sink)
+            sink.wait_said("no ROS master")
+    assert psutil.Process().memory_info().rss - before < 150 << 20
+
+
+@contextmanager
+def _raw_server(script: Script) -> Iterator[int]:
+    """A server that does what it likes with each connection, one after the other."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def work() -> None:
+            while True:
+                try:
+                    connection, _ = listening.accept()
+                except OSError:
+                    return
+                with connection:
+                    connection.settimeout(10)
+                    try:
+                        script(connection)
+                    except OSError:
+                        continue  # the other side has hung up
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        yield listening.getsockname()[1]
+        listening.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["robot", "localhost:11311", "https://robot:11311", "http://:1", "http://robot:0", "\x1b"],
+)
+def test_an_address_that_is_none(uri: str) -> None:
+    with Ros1Source(uri) as source:
+        with pytest.raises(UsageError, match=r"not an address.*ROS_MASTER_URI") as caught:
+            source.start(Collector())
+    assert str(caught.value).isprintable()
+
+
+def test_where_the_master_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Ros1Source().address == "http://localhost:11311"
+    monkeypatch.setenv("ROS_MASTER_URI", "http://robot:1234")
+    assert Ros1Source().address == "http://robot:1234"
+    assert Ros1Source("http://other:1").address == "http://other:1"
+    monkeypatch.setenv("ROS_MASTER_URI", "")
+    assert Ros1Source().address == "http://localhost:11311"
+
+
+def test_a_name_that_nobody_knows() -> None:
+    sink = Collector()
+    with Ros1Source("http://no-such-host.invalid:11311") as source:
+        source.start(sink)
+        sink.wait_said("no ROS master", "no-such-host.invalid")
+
+
+# Publishers
+
+
+def test_a_publisher_that_dies_in_a_message_is_connected_again() -> None:
+    def script(connection: socket.socket) -> None:
+        if publisher.connections == 1:
+            connection.sendall(framed(b"first") + b"\x64\0\0\0half")
+            connection.shutdown(socket.SHUT_RDWR)
+        else:
+            sends(b"second")(connection)
+
+    publisher = FakePublisher(script)
+    with _system(publisher) as (_, sink):
+        sink.wait_for(b"first", b"second")
+        sink.wait_said("/topic", "/node", "4 of 100 bytes", "connecting again")
+    (loss,) = sink.losses
+    assert (loss.cause, loss.count) == (Cause.CONNECTION, 1)
+    assert "4 of 100 bytes" in loss.detail
+    assert sink.taken[0].channel is sink.taken[1].channel
+
+
+def test_a_message_of_four_gigabytes_that_never_comes() -> None:
+    def script(connection: socket.socket) -> None:
+        connection.sendall(b"\xff\xff\xff\xff" + b"x" * 1000)
+        until_closed(connection)
+
+    bad, good = FakePublisher(script, node="/bad"), FakePublisher(sends(b"good"), node="/good")
+    with _system(bad, good) as (_, sink):
+        sink.wait_for(b"good")
+        sink.wait(lambda: bool(sink.losses))
+        sink.wait_said("/bad", "4294967295 bytes")
+    assert {(loss.cause, loss.count) for loss in sink.losses} == {(Cause.UNREADABLE, 1)}
+
+
+def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:
+    def script(connection: socket.socket) -> None:
+        connection.sendall(struct.pack("<I", 1 << 30) + bytes(100_000))
+        reached.release()
+        until_closed(connection)
+
+    reached = threading.Semaphore(0)
+    bad = [FakePublisher(script, node=f"/bad{n}") for n in range(8)]
+    before = psutil.Process().memory_info().rss
+    with _system(*bad, FakePublisher(sends(b"good"))) as (_, sink):
+        sink.wait_for(b"good")
+        for _ in bad:
+            assert reached.acquire(timeout=20)
+        assert psutil.Process().memory_info().rss - before < 64 << 20
+
+
+@pytest.mark.parametrize(
+    ("greeting", "words"),
+    [
+        (b"\xff\xff\xff\xff", "connection header of 4294967295 bytes"),
+        (b"\x08\0\0\0\xff\xff\xff\x7fabcd", "exceeds it by"),
+        (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "no '='"),
+        (b"\x20\0\0\0abc", "closed the connection within its header"),
+        (b"", "closed the connection within its header"),
+        (framed(framed(b"error=you \x1b[31m may not")), "it refuses: you ?[31m may not"),
+    ],
+)
+def test_a_broken_header(greeting: bytes, words: str) -> None:
+    def script(connection: socket.socket) -> None:
+        connection.sendall(greeting)
+        connection.shutdown(socket.SHUT_RDWR)
+
+    bad = FakePublisher(script, node="/bad", greets=False)
+    with _system(bad, FakePublisher(sends(b"good"))) as (_, sink):
+        sink.wait_for(b"good")
+        sink.wait_said("/topic", bad.uri, words)
+
+
+def test_broken_text_in_a_header() -> None:
+    fields = {"callerid": "/\udcff\x1b[2J", "message_definition": "string \udcfe"}
+    body = b"".join(
+        len(line).to_bytes(4, "little") + line
+        for line in (f"{k}={v}".encode(errors="surrogateescape") for k, v in fields.items())
+    )
+
+    def script(connection: socket.socket) -> None:
+        connection.sendall(framed(body, b"x") + b"\x10\0\0\0x")
+        connection.shutdown(socket.SHUT_RDWR)
+
+    with _system(FakePublisher(script, greets=False)) as (_, sink):
+        sink.wait(lambda: bool(sink.said) and bool(sink.losses))
+    assert sink.taken[0].payload == b"x"
+    assert sink.taken[0].channel.schema is None
+    assert all(line.isprintable() for line in sink.said)
+    assert all(loss.detail.isprintable() for loss in sink.losses)
+
+
+def test_a_publisher_that_is_not_there() -> None:
+    with _system(FakePublisher(sends(b"good"))) as (master, sink):
+        sink.wait_for(b"good")
+        master.add("/topic", "", "/dead", f"http://127.0.0.1:{_free_port()}/")
+        master.add("/topic", "", "/odd", "tcp://\x9bnowhere")
+        sink.wait_said("/topic", "refused", "rosnode cleanup", "ROS_IP")
+        sink.wait_said("/topic", "not an address")
+        sink.wait(lambda: sink.topics[-1] == ("/topic", "std_msgs/String", 1))
+    assert all(line.isprintable() for line in sink.said)
+
+
+def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The master in Python lets some of many callers wait for a second.
+    monkeypatch.setattr(error_aggregator, "_QUIET_S", 1.5)
+    with FakeMaster() as master, Ros1Source(master.uri, poll_s=0.05) as source:
+        assert not source.was_reached
+        uri = f"http://127.0.0.1:{_free_port()}/"
+        for number in range(11):
+            master.add(f"/dead/{number:02}", "std_msgs/String", "/dead", uri)
+        sink = Collector()
+        source.start(sink)
+        sink.wait_said("11 topics (/dead/00, /dead/01, /dead/02, …)", uri, "rosnode cleanup")
+        master.add("/dead/late", "std_msgs/String", "/dead", uri)
+        calls = master.calls.count("getSystemState")
+        eventually(lambda: master.calls.count("getSystemState") > calls + 30)
+        assert source.was_reached
+    assert len(sink.said) == 1
+    assert sink.topics == []
+
+
+def test_what_a_publisher_does_wrong_is_told_once_however_it_is_worded() -> None:
+    def script(connection: socket.socket) -> None:
+        connection.sendall(struct.pack("<I", (1 << 31) + publisher.connections))
+        connection.shutdown(socket.SHUT_RDWR)
+
+    publisher = FakePublisher(script, greets=False)
+    with _system(publisher) as (_, sink):
+        sink.wait_said("/topic", publisher.uri, "a connection header of 214748")
+        eventually(lambda: publisher.connections >= 3)
+    assert len(sink.said) == 1
+    assert "dead" not in sink.said[0]
+    assert sink.topics == []
+
+
+@pytest.mark.parametrize(
+    "offer",
+    [[], ["UDPROS", "x", 1], ["TCPROS", "127.0.0.1"], ["TCPROS", "", 1], ["TCPROS", "x", 0]],
+)
+def test_a_publisher_that_offers_nothing(offer: list[object]) -> None:
+    publisher = FakePublisher(sends(b"x"), offer=offer)
+    with _system(publisher) as (_, sink):
+        sink.wait_said("does not offer the topic over TCPROS")
+
+
+def test_a_topic_nobody_speaks_on_delays_nothing() -> None:
+    silent = FakePublisher(until_closed, topic="/silent")
+    never = FakePublisher(until_closed, topic="/never", greets=False)
+    with ExitStack() as stack:
+        publishers = silent, never, FakePublisher(sends(b"x"))
+        _, sink = stack.enter_context(_system(*publishers))
+        sink.wait_for(b"x")
+        eventually(lambda: silent.connections == never.connections == 1)
+        must_return(stack.close)
+
+
+# Our node
+
+
+def test_what_other_programs_may_ask() -> None:
+    with _system(FakePublisher(sends(b"x"))) as (master, sink):
+        sink.wait_for(b"x")
+        (api,) = master.subscribers["/topic"].values()
+        with xmlrpc.client.ServerProxy(api) as node:
+            assert node.getPid("/me") == [1, "", os.getpid()]
+            assert node.getMasterUri("/me") == [1, "", f"{master.uri}/"]
+            assert node.getSubscriptions("/me") == [1, "", [["/topic", "*"]]]
+            assert node.getPublications("/me") == [1, "", []]
+            assert node.getBusInfo("/me") == [1, "", []]
+            assert node.getBusStats("/me") == [1, "", [[], [], []]]
+            assert node.paramUpdate("/me", "/a", 1)[0] == 1
+            assert node.requestTopic("/me", "/a", [["TCPROS"]])[0] == 0
+            assert node.publisherUpdate("/me")[0] == -1
+            assert node.publisherUpdate("/me", "/foreign", ["http://robot:1/"])[0] == 1
+            assert node.shutdown("/me\x9b", "because")[0] == -1
+            with pytest.raises(xmlrpc.client.Fault, match="unknown method"):
+                node.system.listMethods()
+        sink.wait_said("/me? asks this node to shut down")
+        place = ("127.0.0.1", int(api.rstrip("/").rpartition(":")[2]))
+        for request in (
+            b"GET / HTTP/1.0\r\n\r\n",
+            b"POST / HTTP/1.0\r\n\r\n",
+            b"POST / HTTP/1.0\r\nContent-Length: 99999999\r\n\r\n",
+            b"POST / HTTP/1.0\r\nContent-Length: 3\r\n\r\nabc",
+            bytes(200_000),
+        ):
+            with socket.create_connection(place) as connection:
+                try:
+                    connection.sendall(request)
+                    assert connection.recv(10) == b""
+                except ConnectionError:
+                    continue  # it hung up with some of that unread
+        with xmlrpc.client.ServerProxy(api) as node:
+            assert node.getPid("/me")[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "host"),
+    [
+        ("ROS_IP", "127.0.0.2", "127.0.0.2"),
+        ("ROS_HOSTNAME", "localhost", "localhost"),
+        ("ROS_IPV6", "off", "127.0.0.1"),
+    ],
+)
+def test_the_address_that_our_node_gives(
+    variable: str, value: str, host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, value)
+    first, second = (FakePublisher(sends(node.encode()), node=node) for node in ("/1", "/2"))
+    with _system(first, poll_s=3600) as (master, sink), second:
+        sink.wait_for(b"/1")
+        (api,) = master.subscribers["/topic"].values()
+        assert api.startswith(f"http://{host}:")
+        listening = [c.laddr.ip for c in psutil.Process().net_connections("tcp")]
+        assert {"0.0.0.0", "::"}.isdisjoint(listening)
+        _announce(master, second)
+        sink.wait_for(b"/1", b"/2")
+
+
+@pytest.mark.parametrize("variable", ["ROS_IP", "ROS_HOSTNAME"])
+def test_an_address_of_our_node_that_is_none(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "192.0.2.1")
+    with _system(FakePublisher(sends(b"x"))) as (_, sink):
+        sink.wait_for(b"x")
+        sink.wait_said(f"{variable}=192.0.2.1", "not an address of this computer")
+
+
+def _has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.skipif(not _has_ipv6(), reason="IPv6 was NOT tested: this computer has no ::1")
+@pytest.mark.parametrize("brackets", [True, False])
+def test_ipv6(brackets: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_IPV6", "on")
+    sink = Collector()
+    with FakeMaster("::1") as master, FakePublisher(sends(b"x"), host="::1") as publisher:
+        uri = publisher.uri if brackets else publisher.uri.replace("[", "").replace("]", "")
+        master.add("/topic", "std_msgs/String", "/node", uri)
+        with Ros1Source(master.uri) as source:
+            source.start(sink)
+            sink.wait_for(b"x")
+            assert next(iter(master.subscribers["/topic"].values())).startswith("http://[::1]:")
+
+
+# Stopping
+
+
+def test_what_has_come_is_handed_over_when_it_stops() -> None:
+    """The source is held up with its socket full, and stopped."""
+    payloads = [str(number).encode() * 100 for number in range(2000)]
+    held, holding, sent = threading.Event(), threading.Event(), threading.Event()
+
+    class Slow(Collector):
+        def take(self, *arguments: object, **more: object) -> None:
+            held.set()
+            holding.wait(20)
+            super().take(*arguments, **more)  # type: ignore[arg-type]
+
+    def script(connection: socket.socket) -> None:
+        connection.sendall(framed(*payloads))
+        sent.set()
+        until_closed(connection)
+
+    sink = Slow()
+    with _system(FakePublisher(script), sink=sink):
+        # All of it may fit into the socket before anybody reads there.
+        assert sent.wait(20)
+        assert held.wait(20)
+        threading.Timer(0.1, holding.set).start()
+    assert sink.payloads() == payloads
+    assert sink.topics == [("/topic", "std_msgs/String", 1)]
+
+
+def test_stopping_before_and_right_after_the_start() -> None:
+    source = Ros1Source("http://127.0.0.1:1")
+    source.stop()
+    for _ in range(20):
+        sink = Collector()
+        source = Ros1Source("http://127.0.0.1:1")
+        source.start(sink)
+        source.stop()
+        assert sink.ends == []
+
+
+def test_stopping_while_publishers_pour() -> None:
+    def pour(connection: socket.socket) -> None:
+        data = framed(bytes(100)) * 1000
+        while True:
+            connection.sendall(data)
+
+    with ExitStack() as stack:
+        _, sink = stack.enter_context(_system(FakePublisher(pour)))
+        sink.wait(lambda: len(sink.taken) > 1000)
+        must_return(stack.close)
+    count = len(sink.taken)
+    assert len(sink.taken) == count
+
+
+def test_a_master_that_never_answers_does_not_hold_up_the_end() -> None:
+    def silent(connection: socket.socket) -> None:
+        while connection.recv(4096):
+            pass
+
+    with _raw_server(silent) as port:
+        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+            source.start(Collector())
+            time.sleep(0.1)  # so that it is in the middle of its call
+            must_return(source.stop)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_sink_that_fails_ends_the_source_with_a_reason() -> None:
+    class Broken(Collector):
+        def take(self, *_: object, **__: object) -> None:
+            raise RuntimeError("no room in the shelf")
+
+    sink = Broken()
+    with _system(FakePublisher(sends(b"x")), sink=sink):
+        sink.wait(lambda: bool(sink.ends))
+    assert "no room in the shelf" in sink.ends[0]

@@ -1,0 +1,352 @@
+"""The parts of the ROS 1 source by themselves: headers, addresses, counting, cutting."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import random
+import select
+import socket
+import struct
+import time
+import warnings
+
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.ros1.network import PeerError, endpoint_of
+from hybridlog.live.sources.ros1.rpc import RpcServer
+from hybridlog.live.sources.ros1.stream import Stream
+from hybridlog.live.sources.ros1.wire import (
+    WireError,
+    channel_of,
+    decode_header,
+    encode_header,
+)
+from hybridlog.live.sources.sequence_gaps import has_sequence_numbers
+from hybridlog.live.sources.text import one_line
+from hybridlog_storage.messages import Channel, Schema
+from tests.live.sources.ros1_peers import Collector, framed
+
+# Headers
+
+
+def test_a_header_comes_back_as_it_was() -> None:
+    fields = {"callerid": "/nöde", "topic": "/a=b", "message_definition": "string data\n", "x": ""}
+    data = encode_header(fields)
+    assert int.from_bytes(data[:4], "little") == len(data) - 4
+    assert decode_header(data[4:]) == fields
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        (b"\x05\0\0\0ab=", "exceeds it by"),
+        (b"\xff\xff\xff\xffab=c", "exceeds it by"),
+        (b"\x03\0\0\0ab=\0\0", "surplus bytes"),
+        (b"\x03\0\0\0abc", "no '='"),
+        (b"\0\0\0\0", "no '='"),
+        (encode_header({f"k{n}": "" for n in range(1001)})[4:], "more than 1000 fields"),
+    ],
+)
+def test_a_broken_header_is_named(body: bytes, words: str) -> None:
+    with pytest.raises(WireError, match=words):
+        decode_header(body)
+
+
+def test_any_bytes_are_a_header_or_an_error() -> None:
+    draw = random.Random(1)
+    whole = encode_header({"callerid": "/a", "type": "std_msgs/String", "md5sum": "*"})[4:]
+    for _ in range(2000):
+        body = bytearray(whole)
+        for _ in range(draw.randrange(4)):
+            body[draw.randrange(len(body))] = draw.randrange(256)
+        try:
+            fields = decode_header(bytes(body[: draw.randrange(len(body) + 1)]))
+        except WireError:
+            continue
+        channel_of("/t", fields)
+
+
+def test_a_channel_looks_as_if_it_came_from_a_bag() -> None:
+    fields = {
+        "callerid": "/camera",
+        "latching": "1",
+        "md5sum": "abc",
+        "message_definition": "uint8 x # ü\n",
+        "topic": "/other",
+        "type": "a_msgs/B",
+    }
+    channel = channel_of("/topic", fields)
+    assert channel.topic == "/topic"
+    assert channel.message_encoding == "ros1"
+    assert channel.schema == Schema("a_msgs/B", "ros1msg", "uint8 x # ü\n".encode())
+    assert channel.metadata == {"callerid": "/camera", "latching": "1", "md5sum": "abc"}
+    assert not channel.has_publish_time
+
+
+def test_a_type_without_definition_and_none_at_all() -> None:
+    assert channel_of("/t", {"type": "a/B"}).schema == Schema("a/B", "", b"")
+    assert channel_of("/t", {"type": "*", "message_definition": "x"}).schema is None
+    assert channel_of("/t", {}).schema is None
+
+
+@pytest.mark.parametrize(
+    ("definition", "numbered"),
+    [
+        ("Header header\nfloat32 x\n", True),
+        ("std_msgs/Header header", True),
+        (
+            "# a comment: Foo bar\n\n  \nint8 A=1\nstring B=Header header\n\tHeader  header # c",
+            True,
+        ),
+        ("float32 x\nHeader header\n", False),
+        ("Header head\n", False),
+        ("Header[] header\n", False),
+        ("uint32 seq\ntime stamp\nstring frame_id\n", False),
+        ("", False),
+        ("\n=====\nMSG: std_msgs/Header\nHeader header", False),
+        ("#" * 10000, False),
+    ],
+)
+def test_types_that_publishers_number(definition: str, numbered: bool) -> None:
+    fields = {"type": "a/B", "message_definition": definition}
+    assert has_sequence_numbers(channel_of("/t", fields)) is numbered
+    assert not has_sequence_numbers(channel_of("/t", {**fields, "latching": "1"}))
+    ros2 = Schema("a/B", "ros2msg", definition.encode())
+    assert not has_sequence_numbers(Channel("/t", "cdr", ros2))
+
+
+@pytest.mark.parametrize("text", ["\x1b[2J", "a\nb", "\x9b1m", "\u202eabc", "x" * 5000, "\ud800"])
+def test_what_peers_say_is_shown_harmlessly(text: str) -> None:
+    line = one_line(text)
+    assert line.isprintable()
+    assert len(line) < 1000
+    assert one_line(text.encode(errors="replace")).isprintable()
+
+
+# Addresses
+
+
+@pytest.mark.parametrize(
+    ("uri", "endpoint"),
+    [
+        ("http://robot:11311", ("robot", 11311)),
+        ("http://10.0.0.1:1/x", ("10.0.0.1", 1)),
+        ("http://[::1]:80/", ("::1", 80)),
+        ("http://::1:4711/", ("::1", 4711)),
+        ("http://robot/", ("robot", 11311)),
+        ("http://[::1]", ("::1", 11311)),
+    ],
+)
+def test_addresses(uri: str, endpoint: tuple[str, int]) -> None:
+    assert endpoint_of(uri, 11311) == endpoint
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "",
+        "robot:11311",
+        "https://robot:1",
+        "http://",
+        "http://:11311",
+        "http://robot:0",
+        "http://robot:65536",
+        "http://robot:99999999999999999999",
+        "http://robot:1x",
+        "http://robot:²",
+        "http://user:word@robot:1",
+        "http://[::1:80",
+        "http://robot:11311/\r\nX: y",
+    ],
+)
+def test_what_is_no_address(uri: str) -> None:
+    with pytest.raises(PeerError, match="not an address"):
+        endpoint_of(uri)
+
+
+# Being called
+
+
+@pytest.mark.parametrize("turns", range(6))
+def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
+    async def stopped_after_turns() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            listening.setblocking(False)
+            serving = asyncio.create_task(RpcServer(listening, {}).serve())
+            await asyncio.sleep(0.01)
+            with socket.create_connection(listening.getsockname()) as caller:
+                for _ in range(turns):
+                    await asyncio.sleep(0)
+                serving.cancel()
+                await asyncio.wait([serving])
+                gc.collect()
+                caller.settimeout(5)
+                try:
+                    assert caller.recv(1) == b""
+                except ConnectionResetError:
+                    pass  # nobody had taken the call yet
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        asyncio.run(stopped_after_turns())
+    assert [str(warning.message) for warning in told] == []
+
+
+# Cutting
+
+_NUMBERED = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"Header header\n"))
+_PLAIN = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"string data\n"))
+
+
+class _Pipe:
+    """A stream, and the end that a publisher writes to."""
+
+    def __init__(self, channel: Channel = _PLAIN, limit: int = 1 << 30) -> None:
+        self.peer, ours = socket.socketpair()
+        ours.setblocking(False)
+        self.peer.setblocking(False)
+        self.sink = Collector()
+        self.ends: list[str] = []
+        self.stream = Stream(ours, channel, self.sink, limit, self.ends.append)
+        self.alive = True
+
+    def send(self, data: bytes) -> None:
+        """Writes as much as fits, and reads, until all is through."""
+        view = memoryview(data)
+        while view:
+            try:
+                view = view[self.peer.send(view) :]
+            except BlockingIOError:
+                pass
+            self.read()
+
+    def read(self) -> None:
+        """Reads what is there."""
+        while self.alive and select.select([self.stream.socket], [], [], 0)[0]:
+            self.alive = self.stream.read()
+
+    def hang_up(self) -> None:
+        self.peer.close()
+        self.read()
+        assert not self.alive
+        self.stream.close()
+
+    def payloads(self) -> list[bytes]:
+        return [taken.payload for taken in self.sink.taken]
+
+
+def _payload(draw: random.Random, number: int) -> bytes:
+    size = draw.choice([0, 1, 3, 4, 20, 500, 70_000, 65_536, 300_000, 262_140, 262_144])
+    return (struct.pack("<I", number) + draw.randbytes(size))[:size]
+
+
+@pytest.mark.parametrize("channel", [_PLAIN, _NUMBERED], ids=["plain", "numbered"])
+@pytest.mark.parametrize("seed", range(4))
+def test_messages_come_out_as_they_went_in(seed: int, channel: Channel) -> None:
+    draw = random.Random(seed)
+    payloads = [_payload(draw, number) for number in range(60)]
+    data = framed(*payloads)
+    pipe = _Pipe(channel)
+    pos = 0
+    while pos < len(data):
+        size = draw.choice([1, 2, 3, 5, 100, 4096, 65_536, 200_000, 1 << 20])
+        pipe.send(data[pos : pos + size])
+        pos += size
+    pipe.hang_up()
+    assert pipe.payloads() == payloads
+    assert {id(taken.channel) for taken in pipe.sink.taken} == {id(channel)}
+    assert [taken.received for taken in pipe.sink.taken] == sorted(
+        taken.received for taken in pipe.sink.taken
+    )
+    numbers = [taken.sequence for taken in pipe.sink.taken]
+    if channel is _PLAIN:
+        assert set(numbers) == {None}
+    else:
+        expected = [n if len(payload) >= 4 else None for n, payload in enumerate(payloads)]
+        assert numbers == expected
+    assert pipe.ends == [""]
+
+
+def test_one_byte_at_a_time() -> None:
+    payloads = [b"", b"a", b"abcd" * 5, b"", b"xyz"]
+    pipe = _Pipe()
+    for byte in framed(*payloads):
+        pipe.send(bytes([byte]))
+    pipe.hang_up()
+    assert pipe.payloads() == payloads
+    assert not pipe.sink.losses
+
+
+def test_a_message_longer_than_a_piece() -> None:
+    payloads = [random.Random(1).randbytes(10_000_000), b"after", bytes(5_000_000), b""]
+    pipe = _Pipe()
+    pipe.send(framed(*payloads))
+    pipe.hang_up()
+    assert pipe.payloads() == payloads
+
+
+@pytest.mark.parametrize("size", [20, 200_000])
+def test_dropped_messages_are_counted(size: int) -> None:
+    pipe = _Pipe(_NUMBERED)
+    rest = bytes(size)
+    before = time.time_ns()
+    for number in [*range(10), 12, 13, 20]:
+        pipe.send(framed(struct.pack("<I", number) + rest))
+    pipe.hang_up()
+    assert len(pipe.payloads()) == 13
+    assert [(loss.cause, loss.count) for loss in pipe.sink.losses] == [
+        (Cause.TRANSPORT, 2),
+        (Cause.TRANSPORT, 6),
+    ]
+    assert all(before <= loss.first <= loss.last <= time.time_ns() for loss in pipe.sink.losses)
+    # Each lies between the message before it and the one after.
+    times = [taken.received for taken in pipe.sink.taken]
+    assert [(loss.first, loss.last) for loss in pipe.sink.losses] == [
+        (times[9], times[10]),
+        (times[11], times[12]),
+    ]
+
+
+@pytest.mark.parametrize(
+    "cut", [b"\1", b"\1\0\0", b"\5\0\0\0", b"\5\0\0\0abcd", b"\0\0\x10\0" + bytes(500_000)]
+)
+def test_a_publisher_that_dies_in_a_message(cut: bytes) -> None:
+    pipe = _Pipe()
+    pipe.send(framed(b"whole") + cut)
+    pipe.hang_up()
+    assert pipe.payloads() == [b"whole"]
+    (loss,) = pipe.sink.losses
+    assert (loss.topic, loss.cause, loss.count) == ("/topic", Cause.CONNECTION, 1)
+    assert loss.first <= loss.last
+    assert "in the middle of a message" in loss.detail
+    assert pipe.ends == [pipe.stream.failure]
+
+
+@pytest.mark.parametrize("size", [0xFFFFFFFF, 1001])
+def test_a_message_that_is_too_long_ends_the_connection(size: int) -> None:
+    pipe = _Pipe(limit=1000)
+    pipe.send(framed(bytes(1000), b"x") + struct.pack("<I", size) + bytes(2000))
+    assert pipe.payloads() == [bytes(1000), b"x"]
+    assert not pipe.alive
+    (loss,) = pipe.sink.losses
+    assert (loss.cause, loss.count) == (Cause.UNREADABLE, 1)
+    assert str(size) in loss.detail
+    pipe.hang_up()
+
+
+def test_a_connection_that_is_reset() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        peer = socket.create_connection(server.getsockname())
+        ours, _ = server.accept()
+    ours.setblocking(False)
+    sink, ends = Collector(), list[str]()
+    stream = Stream(ours, _PLAIN, sink, 1000, ends.append)
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    peer.close()
+    assert not stream.read()
+    stream.close()
+    (loss,) = sink.losses
+    assert (loss.cause, loss.count) == (Cause.CONNECTION, None)
+    assert "the connection broke" in ends[0]

@@ -1,0 +1,338 @@
+"""The ROS 1 source against the real master and rospy, as Debian has them."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import struct
+import subprocess
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.ros1.source import Ros1Source
+from tests.live.sources.ros1_debian import PACKAGES, Ros1, ros1
+from tests.live.sources.ros1_peers import Collector, eventually
+
+PUBLISHER = """
+import hashlib, io, json, sys
+import rospy
+from sensor_msgs.msg import CompressedImage
+from std_msgs.msg import String
+
+order = json.loads(sys.argv[1])
+rospy.init_node(order["node"], disable_signals=True)
+if order["type"] == "image":
+    kind, make = CompressedImage, lambda n, size: CompressedImage(data=bytes([n % 256]) * size)
+else:
+    kind, make = String, lambda n, size: String(("%d " % n).ljust(size, "x"))
+publisher = rospy.Publisher(
+    order["topic"], kind, queue_size=order.get("queue", 0), latch=order.get("latch", False)
+)
+number = 0
+print(json.dumps({"definition": kind._full_text, "md5sum": kind._md5sum}), flush=True)
+for line in sys.stdin:
+    command = json.loads(line)
+    while publisher.get_num_connections() < command.get("connections", 0):
+        rospy.sleep(0.01)
+    hashes = []
+    for _ in range(command["count"]):
+        message = make(number, command["size"])
+        publisher.publish(message)
+        number += 1
+        payload = io.BytesIO()
+        message.serialize(payload)
+        hashes.append(hashlib.sha256(payload.getvalue()).hexdigest())
+    print(json.dumps(hashes), flush=True)
+rospy.signal_shutdown("done")
+"""
+
+
+MASTER = "import rosmaster; rosmaster.rosmaster_main()"
+
+
+pytestmark = pytest.mark.peer("ROS 1")
+
+
+@pytest.fixture(scope="session")
+def debian() -> Ros1:
+    found = ros1()
+    if isinstance(found, str):
+        pytest.skip(
+            f"ROS 1 was NOT tested with real peers, {found}: apt-get install {' '.join(PACKAGES)}"
+        )
+    return found
+
+
+class _Master:
+    """`rosmaster --core` on a port of its own."""
+
+    def __init__(self, debian: Ros1) -> None:
+        self.debian = debian
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            self.port = server.getsockname()[1]
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self.environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
+            "ROS_MASTER_URI": self.uri,
+            "ROS_IP": "127.0.0.1",
+            **debian.environment,
+        }
+
+    def __enter__(self) -> _Master:
+        self._process = subprocess.Popen(
+            [self.debian.python, "-c", MASTER, "--core", "-p", str(self.port)],
+            env=self.environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        eventually(self._answers)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        self._process.wait(20)
+
+    def _answers(self) -> bool:
+        try:
+            with xmlrpc.client.ServerProxy(self.uri) as master:
+                return bool(master.getPid("/test"))
+        except OSError:
+            return False
+
+    def subscribers(self, topic: str) -> list[str]:
+        with xmlrpc.client.ServerProxy(self.uri) as master:
+            _, _, (_, subscribers, _) = master.getSystemState("/test")  # type: ignore[misc]
+        return [node for name, nodes in subscribers if name == topic for node in nodes]
+
+
+class _Publisher:
+    """A node that publishes when it is told to."""
+
+    def __init__(self, master: _Master, topic: str, type_name: str = "text", **more: Any) -> None:
+        order = {"node": "talker", "topic": topic, "type": type_name, **more}
+        self._process = subprocess.Popen(
+            [master.debian.python, "-c", PUBLISHER, json.dumps(order)],
+            env=master.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.facts = self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        return json.loads(self._process.stdout.readline())
+
+    def tell(self, count: int, size: int = 20, connections: int = 1) -> None:
+        assert self._process.stdin is not None
+        command = {"count": count, "size": size, "connections": connections}
+        self._process.stdin.write(json.dumps(command) + "\n")
+        self._process.stdin.flush()
+
+    def publish(self, count: int, size: int = 20, connections: int = 1) -> list[str]:
+        """Has messages sent; gives a hash of each payload."""
+        self.tell(count, size, connections)
+        return list(self._answer())
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def __enter__(self) -> _Publisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.communicate(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def master(debian: Ros1) -> Iterator[_Master]:
+    with _Master(debian) as running:
+        yield running
+
+
+@contextmanager
+def _listening(master: _Master, sink: Collector) -> Iterator[Collector]:
+    with Ros1Source(master.uri, poll_s=0.2) as source:
+        source.start(sink)
+        yield sink
+
+
+def _hashes(sink: Collector, topic: str) -> list[str]:
+    return [sha256(payload).hexdigest() for payload in sink.payloads(topic)]
+
+
+def _only(topic: str) -> Collector:
+    return Collector(wanted=lambda name, type_name: name == topic)
+
+
+@pytest.mark.parametrize(
+    ("type_name", "count", "size"),
+    [("text", 2000, 0), ("text", 2000, 300), ("image", 30, 640_000), ("image", 3, 20_000_000)],
+)
+def test_payloads_are_those_that_were_published(
+    master: _Master, type_name: str, count: int, size: int
+) -> None:
+    topic = f"/exact_{type_name}_{size}"
+    with (
+        _Publisher(master, topic, type_name) as publisher,
+        _listening(master, _only(topic)) as sink,
+    ):
+        hashes = publisher.publish(count, size)
+        sink.wait(lambda: len(sink.taken) == count)
+        assert _hashes(sink, topic) == hashes
+    channel = sink.taken[0].channel
+    assert channel.schema is not None
+    assert channel.schema.data.decode() == publisher.facts["definition"]
+    assert channel.metadata["md5sum"] == publisher.facts["md5sum"]
+    assert channel.metadata["callerid"] == "/talker"
+    numbers = [taken.sequence for taken in sink.taken]
+    assert numbers == ([None] * count if type_name == "text" else list(range(1, count + 1)))
+    assert sink.losses == []
+    assert master.subscribers(topic) == []
+
+
+def test_a_late_subscriber_gets_what_is_latched(master: _Master) -> None:
+    with _Publisher(master, "/latched", latch=True) as publisher:
+        (*_, last) = publisher.publish(3, connections=0)
+        with _listening(master, _only("/latched")) as sink:
+            sink.wait(lambda: len(sink.taken) == 1)
+            assert _hashes(sink, "/latched") == [last]
+    assert sink.taken[0].channel.metadata["latching"] == "1"
+
+
+def test_two_publishers_on_a_topic(master: _Master) -> None:
+    with (
+        _Publisher(master, "/pair", node="left") as left,
+        _Publisher(master, "/pair", node="right") as right,
+        _listening(master, _only("/pair")) as sink,
+    ):
+        hashes = left.publish(50) + right.publish(50)
+        sink.wait(lambda: len(sink.taken) == 100)
+        assert sorted(_hashes(sink, "/pair")) == sorted(hashes)
+        assert ("/pair", "std_msgs/String", 2) in sink.topics
+    assert {taken.channel.metadata["callerid"] for taken in sink.taken} == {"/left", "/right"}
+
+
+def test_a_publisher_that_is_killed_and_started_anew(master: _Master) -> None:
+    with _listening(master, _only("/mortal")) as sink:
+        with _Publisher(master, "/mortal") as first:
+            first.publish(10)
+            sink.wait(lambda: len(sink.taken) == 10)
+            first.kill()
+            sink.wait(lambda: ("/mortal",) in sink.topics)
+        with _Publisher(master, "/mortal") as second:
+            second.publish(10)
+            sink.wait(lambda: len(sink.taken) == 20)
+        sink.wait(lambda: sink.topics[-1] == ("/mortal",))
+
+
+def test_the_master_is_started_anew(debian: Ros1) -> None:
+    master, sink = _Master(debian), _only("/steady")
+    with master:
+        with _Publisher(master, "/steady") as publisher, Ros1Source(master.uri) as source:
+            source.start(sink)
+            publisher.publish(5)
+            master.__exit__()
+            publisher.publish(5)
+            sink.wait_said("no ROS master")
+            master.__enter__()
+            eventually(lambda: bool(master.subscribers("/steady")))
+            publisher.publish(5)
+            sink.wait(lambda: len(sink.taken) == 15)
+            with _Publisher(master, "/steady", node="new") as other:
+                other.publish(5)
+                sink.wait(lambda: len(sink.taken) == 20)
+    assert sink.losses == []
+
+
+def test_what_a_publisher_drops_is_counted(master: _Master) -> None:
+    """Nothing is read while it sends far more than the sockets hold."""
+    reading = threading.Event()
+
+    class Slow(Collector):
+        def take(self, *arguments: Any, **more: Any) -> None:
+            super().take(*arguments, **more)
+            if len(self.taken) >= 20:
+                reading.wait(60)
+
+    sink = Slow(wanted=lambda name, type_name: name == "/flood")
+    with _Publisher(master, "/flood", "image", queue=2) as publisher:
+        with _listening(master, sink):
+            for number in range(20):
+                publisher.publish(1, 100)
+                sink.wait(lambda number=number: len(sink.taken) > number)  # type: ignore[misc]
+            publisher.publish(80, 2_000_000)
+            reading.set()
+            publisher.publish(1, 100)
+            sink.wait(lambda: sink.taken[-1].sequence == 101)
+    lost = sum(loss.count or 0 for loss in sink.losses)
+    assert {loss.cause for loss in sink.losses} == {Cause.TRANSPORT}
+    assert lost > 0
+    assert len(sink.taken) + lost == 101
+    assert all(t.sequence == struct.unpack("<I", t.payload[:4])[0] for t in sink.taken)
+
+
+BAG = """
+import hashlib, io, json, sys
+import rosbag, rospy
+from sensor_msgs.msg import CompressedImage
+
+hashes = []
+with rosbag.Bag(sys.argv[1], "w") as bag:
+    for number in range(40):
+        message = CompressedImage(data=bytes([number]) * 5000 * number)
+        message.header.seq = number // 2
+        bag.write("/played", message, rospy.Time(1000, number * 10_000_000))
+        payload = io.BytesIO()
+        message.serialize(payload)
+        hashes.append(hashlib.sha256(payload.getvalue()).hexdigest())
+print(json.dumps(hashes))
+"""
+
+
+def test_a_publisher_in_c_plus_plus(master: _Master, tmp_path: Path) -> None:
+    """It plays a bag whose numbers say nothing of what it sends."""
+    bag = tmp_path / "some.bag"
+    done = subprocess.run(
+        [master.debian.python, "-c", BAG, str(bag)],
+        env=master.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    with _listening(master, _only("/played")) as sink:
+        subprocess.run(
+            [
+                str(master.debian.tools / "play"),
+                "--quiet",
+                "--wait-for-subscribers",
+                "--topics",
+                "/played",
+                "--bags",
+                bag,
+            ],
+            env=master.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            check=True,
+            timeout=60,
+        )
+        sink.wait(lambda: len(sink.taken) == 40)
+        assert _hashes(sink, "/played") == json.loads(done.stdout)
+        sink.wait(lambda: sink.topics[-1] == ("/played",))
+    channel = sink.taken[0].channel
+    assert channel.schema is not None
+    assert channel.schema.name == "sensor_msgs/CompressedImage"
+    assert channel.metadata["callerid"].startswith("/play_")
+    assert sink.losses == []

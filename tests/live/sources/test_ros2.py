@@ -1,0 +1,479 @@
+"""The recorder's end of the ROS 2 source, against children that a test can make misbehave."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.ros2 import process as ros2_process
+from hybridlog.live.sources.ros2 import source as ros2
+from hybridlog.live.sources.ros2.overrides import read_overrides
+from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
+from hybridlog.live.sources.ros2.source import Ros2Source
+from hybridlog.live.sources.text import one_line
+from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
+from tests.live.sources.heard import must_return
+from tests.live.sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until
+
+
+@pytest.fixture(autouse=True)
+def _no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (PYTHON_VARIABLE, "ROS_DISTRO", "AMENT_PREFIX_PATH", "ROS_DOMAIN_ID"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(ros2, "_PAUSE_S", 0.01)
+
+
+def _files() -> set[str]:
+    return {path.name for path in Path("/proc/self/fd").iterdir()}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left(tmp_path: Path) -> object:
+    before = set(threading.enumerate())
+    files = _files()
+    yield
+    assert set(threading.enumerate()) <= before
+    assert len(_files()) <= len(files)
+    assert not [pid for pid in starts(tmp_path) if is_alive(pid)]
+
+
+# Children that do well.
+
+
+def test_messages_and_events_reach_the_sink(tmp_path: Path) -> None:
+    child = fake_child(
+        tmp_path,
+        """
+        hello()
+        event(event="candidate", topic="/a", type="std_msgs/msg/String")
+        event(event="candidate", topic="/no", type="std_msgs/msg/String")
+        assert json.loads(file.readline()) == {"subscribe": "/a", "type": "std_msgs/msg/String"}
+        event(event="topic", topic="/a", type="std_msgs/msg/String", publishers=2)
+        channel(offered="- durability: 1", hash="RIHS01_x")
+        message(0, b"first", 7)
+        message(0, bytes(3 << 20), 8)
+        event(event="lost", topic="/a", cause="transport", count=3, first=1, last=2,
+              detail="from \\x1b[31m/n")
+        event(event="say", text="a\\nb")
+        event(event="gone", topic="/a")
+        wait()
+        message(0, b"last", -1)
+        event(event="bye")
+        """,
+    )
+    memory = Memory(lambda topic, _: topic != "/no")
+    with Ros2Source(child, domain_id=5) as source:
+        source.start(memory)
+        assert source.address == "domain 5, rmw_fake"
+        memory.wait(lambda: memory.gone, "the topic should be gone")
+    assert [taken.payload for taken in memory.taken] == [b"first", bytes(3 << 20), b"last"]
+    assert [taken.sequence for taken in memory.taken] == [7, 8, None]
+    assert {taken.sent for taken in memory.taken} == {None}
+    channel = memory.taken[0].channel
+    assert (memory.expected, memory.unexpected) == ([channel], [])
+    assert (channel.topic, channel.message_encoding) == ("/a", "cdr")
+    assert channel.has_publish_time
+    assert channel.metadata == {
+        "offered_qos_profiles": "- durability: 1",
+        "topic_type_hash": "RIHS01_x",
+    }
+    assert memory.came == [("/a", "std_msgs/msg/String", 2)]
+    assert memory.losses == [("/a", Cause.TRANSPORT, 3, 1, 2, "from ?[31m/n")]
+    assert memory.said == ["ROS 2: a b"]
+    assert memory.ends == []
+
+
+def test_the_child_gets_its_settings(tmp_path: Path) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text("/a: {depth: 5}\nb: {reliability: Best_Effort}")
+    child = fake_child(
+        tmp_path,
+        """
+        assert os.environ["ROS_DOMAIN_ID"] == "7"
+        hello()
+        event(event="say", text=json.dumps(settings))
+        wait()
+        """,
+    )
+    memory = Memory()
+    with Ros2Source(child, path, 7) as source:
+        source.start(memory)
+        memory.wait(lambda: memory.said, "it should say")
+    said = 'ROS 2: {"overrides": {"/a": {"depth": 5}, "/b": {"reliability": 2}}}'
+    assert memory.said == [said]
+
+
+def test_stop_twice_and_without_start(tmp_path: Path) -> None:
+    source = Ros2Source(fake_child(tmp_path, "hello()\nwait()"))
+    source.stop()
+    other = Ros2Source(fake_child(tmp_path, "hello()\nwait()"))
+    other.start(Memory())
+    other.stop()
+    other.stop()
+
+
+def test_a_child_that_does_not_listen_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros2, "_HAND_OVER_S", 0.1)
+    monkeypatch.setattr(ros2, "_TERM_S", 0.1)
+    child = fake_child(
+        tmp_path,
+        """
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        hello()
+        event(event="say", text="deaf")
+        while True:
+            time.sleep(60)
+        """,
+    )
+    memory = Memory()
+    source = Ros2Source(child)
+    source.start(memory)
+    memory.wait(lambda: memory.said, "it should say")
+    source.stop()
+    assert not is_alive(starts(tmp_path)[0])
+
+
+def test_a_child_that_floods_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros2, "_HAND_OVER_S", 0.1)
+    child = fake_child(
+        tmp_path,
+        """
+        hello()
+        while True:
+            event(event="candidate", topic="/a", type="b")
+        """,
+    )
+    memory = Memory()
+    source = Ros2Source(child)
+    source.start(memory)
+    memory.wait(lambda: memory.asked, "it should ask")
+    source.stop()
+
+
+def test_nothing_outlives_a_recorder_that_is_killed(tmp_path: Path) -> None:
+    child = fake_child(tmp_path, "hello()\nwait()")
+    program = """
+        import os, signal, sys
+        from hybridlog.live.sources.ros2.source import Ros2Source
+        from tests.live.sources.ros2_peers import Memory
+        Ros2Source(sys.argv[1]).start(Memory())
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    root = Path(__file__).parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program), child], cwd=root, check=False
+    )
+    assert done.returncode < 0
+    [pid] = starts(tmp_path)
+    wait_until(lambda: not is_alive(pid), "the child should have ended")
+
+
+# Children that break.
+
+BROKEN = {
+    "a kind that does not exist": ('peer.sendall(HEADER.pack(9, 100) + b"x" * 100)', "kind 9"),
+    "4 GB": (
+        "peer.sendall(HEADER.pack(MESSAGE, 0xFFFFFFFF))",
+        "of 4294967295 bytes",
+    ),
+    "4 GB of events": (
+        "peer.sendall(HEADER.pack(EVENT, 0xFFFFFFFF))",
+        "of 4294967295 bytes",
+    ),
+    "a body that is too short": (
+        "peer.sendall(HEADER.pack(MESSAGE, 3))",
+        "of 3 bytes",
+    ),
+    "no JSON": ('peer.sendall(HEADER.pack(EVENT, 3) + b"{x}")', "JSON"),
+    "no UTF-8": ('peer.sendall(HEADER.pack(EVENT, 3) + b"\\xff\\xfe{")', "JSON"),
+    "JSON without end": ('peer.sendall(HEADER.pack(EVENT, 200000) + b"[" * 200000)', "JSON"),
+    "not an object": ('peer.sendall(HEADER.pack(EVENT, 4) + b"[ 1]")', "not an object"),
+    "no such event": ('event(event="what")', "an unknown event"),
+    "an event without a topic": ('event(event="gone", topic=5)', "without topic"),
+    "a channel without a number": ('channel(number="x")', "without number"),
+    "a definition that is no text": ('channel(definition="\\ud800")', "not text"),
+    "a loss without a cause": (
+        'event(event="lost", topic="/a", cause="x", count=1, first=1, last=1, detail="")',
+        "without a cause",
+    ),
+    "a negative loss": (
+        'event(event="lost", topic="/a", cause="queue", count=-1, first=1, last=1, detail="")',
+        "without count",
+    ),
+    "a channel that does not exist": ('message(99, b"x")', "an unknown channel"),
+    "a payload of another length": (
+        'peer.sendall(HEADER.pack(MESSAGE, ENTRY.size + 5) + ENTRY.pack(0, 4, 1, 1, 1) + b"12345")',
+        "not as long",
+    ),
+    "more messages than fit": (
+        "peer.sendall(HEADER.pack(MESSAGES, 4) + COUNT.pack(0xFFFFFFFF))",
+        "more messages",
+    ),
+    "a message longer than its batch": (
+        "peer.sendall(HEADER.pack(MESSAGES, 4 + ENTRY.size) + COUNT.pack(1)"
+        " + ENTRY.pack(0, 0xFFFFFFFF, 1, 1, 1))",
+        "longer than its frame",
+    ),
+    "an end in the middle of a header": ('peer.sendall(b"\\1\\0")\nos._exit(3)', "middle"),
+    "an end in the middle of a payload": (
+        "size = 1 << 30\n"
+        "peer.sendall(HEADER.pack(MESSAGE, size) + ENTRY.pack(0, size - ENTRY.size, 1, 1, 1)"
+        ' + b"x" * 1000)\nos._exit(3)',
+        "middle",
+    ),
+    "a death with words": (
+        'print("why", file=sys.stderr)\nprint("because\\x1b[2J", file=sys.stderr)\nos._exit(3)',
+        "exit code 3: because?[2J",
+    ),
+    "a violent death": ("os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_child_that_breaks_is_started_again(tmp_path: Path, case: str) -> None:
+    damage, reason = BROKEN[case]
+    body = """
+        hello()
+        event(event="topic", topic="/a", type="b", publishers=1)
+        channel()
+        message(0, b"%d" % start)
+        if start == 1:
+            time.sleep(0.01)
+            DAMAGE
+            wait()
+        wait()
+        event(event="bye")
+    """
+    body = textwrap.dedent(body).replace("DAMAGE", damage.replace("\n", "\n    "))
+    memory = Memory()
+    with Ros2Source(fake_child(tmp_path, body)) as source:
+        source.start(memory)
+        memory.wait(lambda: len(memory.taken) == 2, "the second child should be heard")
+    assert [taken.payload for taken in memory.taken] == [b"1", b"2"]
+    [said] = memory.said
+    assert reason in said
+    assert "restarting it" in said
+    assert said.isprintable()
+    [lost] = memory.losses
+    assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.CONNECTION, None)
+    assert 0 < lost.first <= lost.last <= time.time_ns()
+    assert memory.gone == ["/a"]
+    assert [topic for topic, *_ in memory.came] == ["/a", "/a"]
+
+
+def test_an_outage_that_never_ends_is_told_at_the_end(tmp_path: Path) -> None:
+    child = fake_child(
+        tmp_path,
+        """
+        if start == 1:
+            hello()
+            channel()
+            event(event="say", text="dying")
+            os._exit(1)
+        print("not again", flush=True)
+        os._exit(4)
+        """,
+    )
+    memory = Memory()
+    with Ros2Source(child) as source:
+        source.start(memory)
+        memory.wait(lambda: len(starts(tmp_path)) > 2, "it should be tried again")
+        # A child may be too slow in ending for its words to be heard; others come.
+        memory.wait(
+            lambda: any("exit code 4: not again" in said for said in memory.said),
+            "it should say so",
+        )
+        assert not memory.losses
+    [lost] = memory.losses
+    assert (lost.topic, lost.cause) == ("/a", Cause.CONNECTION)
+
+
+def test_stop_does_not_wait_for_a_child_that_does_not_greet(tmp_path: Path) -> None:
+    child = fake_child(
+        tmp_path,
+        """
+        if start == 1:
+            hello()
+            os._exit(1)
+        time.sleep(60)
+        """,
+    )
+    source = Ros2Source(child)
+    source.start(Memory())
+    wait_until(lambda: len(starts(tmp_path)) == 2, "it should be started again")
+    must_return(source.stop)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_sink_that_breaks_is_told_that_nothing_comes_any_more(tmp_path: Path) -> None:
+    class Broken(Memory):
+        def take(self, *_: object, **__: object) -> None:
+            raise ZeroDivisionError
+
+    memory = Broken()
+    with Ros2Source(fake_child(tmp_path, "hello()\nchannel()\nmessage(0, b'x')\nwait()")) as source:
+        source.start(memory)
+        memory.wait(lambda: memory.ends, "it should end")
+    assert "ZeroDivisionError" in memory.ends[0]
+
+
+# What never works.
+
+
+def test_no_python_has_rclpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = tmp_path / "nothing"
+    with pytest.raises(MissingDependencyError, match="cannot be started: No such file"):
+        Ros2Source(str(missing)).start(Memory())
+    monkeypatch.setenv(PYTHON_VARIABLE, str(missing))
+    with pytest.raises(MissingDependencyError, match=r"setup\.bash.*venv.*HYBRIDLOG_ROS2_PYTHON="):
+        Ros2Source().start(Memory())
+
+
+def test_a_python_without_rclpy() -> None:
+    with pytest.raises(MissingDependencyError, match="No module named 'rclpy'"):
+        Ros2Source(sys.executable).start(Memory())
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ('event(event="failed", missing=False, why="RCLError: no\\nroom")', "RCLError: no room"),
+        ('peer.sendall(b"GET / HTTP/1.1")', "unknown kind"),
+        ("peer.sendall(HEADER.pack(EVENT, 1 << 24))", "something else than a greeting"),
+        ('peer.sendall(HEADER.pack(EVENT, 2) + b"[]")', "not an object"),
+    ],
+)
+def test_ros_that_does_not_come_up(tmp_path: Path, body: str, reason: str) -> None:
+    with pytest.raises(SourceError, match=reason):
+        Ros2Source(fake_child(tmp_path, body + "\nwait()")).start(Memory())
+
+
+def test_a_child_that_never_greets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros2_process, "HELLO_S", 0.3)
+    with pytest.raises(SourceError, match="did not load rclpy within"):
+        Ros2Source(fake_child(tmp_path, 'peer.sendall(b"\\1")\nwait()')).start(Memory())
+
+
+@pytest.mark.parametrize("domain", [-1, 233, 10**9])
+def test_a_domain_that_is_none(domain: int) -> None:
+    with pytest.raises(UsageError, match="domains from 0 to 232"):
+        Ros2Source(domain_id=domain).start(Memory())
+
+
+def test_a_domain_of_the_environment_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "x")
+    with pytest.raises(UsageError, match="not 'x'"):
+        Ros2Source().start(Memory())
+
+
+# Which Python.
+
+
+def test_which_pythons_are_tried(tmp_path: Path) -> None:
+    python = tmp_path / "python3"
+    python.write_text("")
+    python.chmod(0o755)
+    assert candidates({PYTHON_VARIABLE: "mine", "ROS_DISTRO": "kilted"}) == ["mine"]
+    assert candidates({}) == [sys.executable]
+    found = candidates({"ROS_DISTRO": "kilted", "PATH": str(tmp_path)})
+    assert found[0] == str(python)
+    assert found[-1] == sys.executable
+
+
+def test_the_libraries_of_other_wheels_are_looked_for_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1")
+    assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in environment_for("other", 3)
+    assert environment_for("other", 3)["ROS_DOMAIN_ID"] == "3"
+    assert environment_for(sys.executable, None)["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] == "1"
+
+
+# Overrides.
+
+
+def test_overrides_as_rosbag2_has_them(tmp_path: Path) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text(
+        """
+/scan:
+  history: keep_all
+  depth: 10
+  reliability: best_effort
+  durability: transient_local
+  deadline:
+    sec: 1
+    nsec: 5
+  lifespan: {sec: 9999999999999, nsec: 0}
+  liveliness: manual_by_topic
+  liveliness_lease_duration: {sec: 0, nsec: 0}
+  avoid_ros_namespace_conventions: true
+"""
+    )
+    assert read_overrides(path) == {
+        "/scan": {
+            "history": 2,
+            "depth": 10,
+            "reliability": 2,
+            "durability": 1,
+            "deadline": 1_000_000_005,
+            "lifespan": 2**63 - 1,
+            "liveliness": 3,
+            "liveliness_lease_duration": 0,
+            "avoid_ros_namespace_conventions": True,
+        }
+    }
+    path.write_text("")
+    assert read_overrides(path) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[1, 2]", "topics with policies"),
+        ("/a: 5", "a topic with policies"),
+        ("5: {depth: 1}", "a topic with policies"),
+        ("/a: {depth: many}", "depth is a number"),
+        ("/a: {depth: 0}", "depth is a number"),
+        ("/a: {depth: true}", "depth is a number"),
+        ("/a: {reliability: reliabel}", "one of system_default, reliable, best_effort"),
+        ("/a: {reliability: [1]}", "one of"),
+        ("/a: {color: red}", "unknown policy 'color'"),
+        ("/a: {5: red}", "unknown policy 5"),
+        ("/a: {deadline: 5}", "is a duration"),
+        ("/a: {deadline: {sec: 1}}", "is a duration"),
+        ("/a: {deadline: {sec: -1, nsec: 0}}", "is a duration"),
+        ("/a: {avoid_ros_namespace_conventions: 1}", "true or false"),
+        ("/a: [", "invalid YAML"),
+        ("\x00", "invalid YAML"),
+        ("[" * 1000, "invalid YAML"),
+    ],
+)
+def test_overrides_that_are_none(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=reason):
+        Ros2Source(qos_overrides=path).start(Memory())
+
+
+def test_overrides_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        read_overrides(tmp_path / "none.yaml")
+    large = tmp_path / "large.yaml"
+    large.write_bytes(b"#" * ((1 << 20) + 1))
+    with pytest.raises(UsageError, match="more than 256 KiB"):
+        read_overrides(large)
+
+
+def test_one_line_is_one_line() -> None:
+    assert one_line("a\n\tb\x1b[0m\u202e") == "a b?[0m?"
+    assert len(one_line("x" * 10_000)) < 500

@@ -1,0 +1,965 @@
+"""The parts of the ROS 2 child that need no ROS."""
+
+from __future__ import annotations
+
+import ast
+import socket
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from hybridlog.live.sources.ros2.child import outbox as ros2_outbox
+from hybridlog.live.sources.ros2.child.child import Child
+from hybridlog.live.sources.ros2.child.definitions import (
+    Definitions,
+    UnknownTypeError,
+    parse_type,
+)
+from hybridlog.live.sources.ros2.child.event_sender import EventSender
+from hybridlog.live.sources.ros2.child.middleware import Offer
+from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
+from hybridlog.live.sources.ros2.child.outbox import Outbox
+from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
+from hybridlog.live.sources.ros2.child.publication_gaps import (
+    MAX_GAPS,
+    RECOVERED_AFTER,
+    SUSPICIOUS_NS,
+    Loss,
+    PublicationGapDetector,
+)
+from hybridlog.live.sources.ros2.child.qos import (
+    BEST_EFFORT,
+    DEPTH,
+    DEPTH_OF_ARRAYS,
+    DEPTH_OF_BYTES,
+    FOREVER,
+    RELIABLE,
+    TRANSIENT_LOCAL,
+    VOLATILE,
+    Profile,
+    conflicts,
+    offered_text,
+    request,
+)
+from hybridlog.live.sources.ros2.child.topics import Topics
+from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
+from hybridlog.live.sources.ros2.receiver import Receiver
+from hybridlog.schema.definition import parse_definition
+from hybridlog_storage.messages import Schema
+from tests.imports import ROOT, imports_of
+from tests.live.sources.ros2_peers import Memory
+
+CHILD = "hybridlog.live.sources.ros2.child"
+FOLDER = ROOT.joinpath(*CHILD.split("."))
+A, B = b"a" * 16, b"b" * 16
+
+
+# PublicationGapDetector.
+
+
+def seen(numbers: PublicationGapDetector, *sent: int, publisher: bytes = A) -> list[bool]:
+    return [numbers.see(publisher, number, 100 * number) for number in sent]
+
+
+def test_a_gap_is_told_at_the_second_look() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 5, 6, 9, 10)
+    assert numbers.losses() == []
+    assert numbers.losses() == [Loss(A, 2, 600, 900)]
+    assert numbers.losses() == []
+
+
+def test_the_last_look_does_not_wait() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 4)
+    assert numbers.losses(final=True) == [Loss(A, 2, 100, 400)]
+
+
+def test_publishers_are_told_apart() -> None:
+    numbers = PublicationGapDetector()
+    for number in range(1, 6):
+        seen(numbers, number)
+        seen(numbers, number + 1000, publisher=B)
+    seen(numbers, 1007, publisher=B)
+    assert numbers.losses(final=True) == [Loss(B, 1, 100500, 100700)]
+
+
+@pytest.mark.parametrize("late", [2, 3, 4])
+def test_a_late_message_fills_its_gap(late: int) -> None:
+    numbers = PublicationGapDetector()
+    assert all(seen(numbers, 1, 5, late, 6))
+    numbers.losses()
+    assert [loss.missing for loss in numbers.losses()] == [2]
+
+
+def test_numbers_that_begin_anew_are_no_loss() -> None:
+    numbers = PublicationGapDetector()
+    assert all(seen(numbers, 500, 501, 1, 2, 3))
+    assert numbers.losses(final=True) == []
+
+
+def test_what_comes_twice_is_taken_once_while_two_subscriptions_run() -> None:
+    numbers = PublicationGapDetector()
+    assert all(seen(numbers, 1, 2, 3))
+    numbers.is_doubled = True
+    assert seen(numbers, 2, 3, 4, 4, 6, 5) == [False, False, True, False, True, True]
+    assert numbers.losses(final=True) == []
+
+
+def test_a_jump_that_no_robot_makes_is_no_count() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 2**60)
+    assert numbers.losses() == [Loss(A, None, 100, 100 * 2**60)]
+
+
+def test_gaps_that_wait_are_bounded_and_none_is_forgotten() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, *range(0, 6 * MAX_GAPS, 2))
+    assert len(numbers._gaps) <= MAX_GAPS
+    lost = sum(loss.missing or 0 for loss in numbers.losses(final=True))
+    assert lost == 3 * MAX_GAPS - 1
+
+
+def test_unsure_gaps_are_dropped_when_numbers_begin_anew() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 5)
+    numbers.reset()
+    assert numbers.losses(final=True) == []
+
+
+def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not() -> None:
+    numbers = PublicationGapDetector()
+    numbers.see(A, 1, 500)
+    numbers.see(A, 4, 300)
+    assert numbers.losses(final=True) == [Loss(A, 2, 300, 500)]
+
+
+def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 5, 6)
+    seen(numbers, 1, 2, publisher=B)
+    loss = numbers.suspect(A, 10_000)
+    assert loss is not None
+    assert loss[:4] == (A, None, 600, 10_000)
+    assert numbers.suspect(A, 10_000) is None
+    assert numbers.suspect(B, 10_000) is None
+    assert numbers.suspect(b"nobody", 10_000) is None
+
+
+def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 5, *range(6, 6 + RECOVERED_AFTER))
+    assert numbers.suspect(A, 10_000) is None
+    numbers.see(B, 1, 0)
+    numbers.see(B, 3, 1)
+    numbers.see(B, 4, 2 + SUSPICIOUS_NS)
+    assert numbers.suspect(B, 10**18) is None
+    seen(numbers, 50, 100)
+    assert numbers.suspect(A, 100 * 100) is None
+
+
+def test_who_speaks_out_of_order_is_not_suspected() -> None:
+    numbers = PublicationGapDetector()
+    seen(numbers, 1, 3, 2)
+    assert numbers.suspect(A, 10_000) is None
+
+
+# What the middleware says.
+
+
+def test_what_the_middleware_says_of_gaps_is_not_told_twice() -> None:
+    told = MiddlewareLossCounter()
+    told.add(5)
+    assert told.unexplained(5, final=False) == 0
+    assert told.unreported(5) == 5
+    assert [told.unexplained(0, final=False) for _ in range(9)] == [0] * 9
+    assert told.unexplained(0, final=True) == 0
+
+
+def test_losses_before_the_first_message_are_told() -> None:
+    told = MiddlewareLossCounter()
+    told.add(3)
+    assert told.before_first(2) == 2
+    assert told.unexplained(0, final=True) == 1
+    told = MiddlewareLossCounter()
+    told.add(3)
+    assert told.before_first(100) == 3
+    assert told.unexplained(0, final=True) == 0
+
+
+def test_losses_after_the_last_message_are_told_after_a_while_and_once() -> None:
+    told = MiddlewareLossCounter()
+    told.add(2)
+    assert [told.unexplained(0, final=False) for _ in range(8)] == [0, 0, 0, 2, 0, 0, 0, 0]
+    # Now one comes, and shows the gap.
+    told.add(1)
+    assert told.unreported(3) == 1
+    assert told.unexplained(0, final=True) == 0
+
+
+def test_gaps_that_the_middleware_does_not_know_of_excuse_no_later_loss() -> None:
+    told = MiddlewareLossCounter()
+    assert told.unreported(10) == 10
+    assert told.unexplained(0, final=False) == 0
+    told.add(4)
+    assert told.unexplained(0, final=True) == 4
+
+
+# The profile.
+
+
+def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    environment: dict[str, str] = {"PATH": "x"}
+    with default_profile(environment) as is_used:
+        assert is_used
+        [name] = {environment[variable] for variable in VARIABLES}
+        tree = ET.parse(name)
+    assert environment == {"PATH": "x"}
+    assert not Path(name).exists()
+    found = {element.tag.rpartition("}")[2]: element.text for element in tree.iter()}
+    assert int(found["receiveBufferSize"] or 0) >= 1 << 17
+
+
+@pytest.mark.parametrize(
+    ("allowed", "size"),
+    [("212992\n", 212992), ("1000", 1 << 17), ("", 1 << 17), ("-5", 1 << 17), ("9" * 30, 32 << 20)],
+)
+def test_sockets_are_asked_for_what_the_kernel_allows(allowed: str, size: int) -> None:
+    assert f"<receiveBufferSize>{size}<" in profile(allowed)
+
+
+@pytest.mark.parametrize("name", [*VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE"])
+def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> None:
+    environment = {name: "theirs"}
+    assert is_set_up(environment, tmp_path)
+    with default_profile(environment) as is_used:
+        assert not is_used
+        assert environment == {name: "theirs"}
+    assert environment == {name: "theirs"}
+    assert not is_set_up({name: ""}, tmp_path)
+
+
+def test_a_profile_in_the_folder_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
+    assert is_set_up({}, tmp_path)
+
+
+def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    environment: dict[str, str] = {}
+    with default_profile(environment) as is_used:
+        assert not is_used
+        assert not environment
+
+
+# Quality of service.
+
+
+def test_what_is_asked_for_fits_all_publishers() -> None:
+    best = Profile(reliability=RELIABLE, durability=TRANSIENT_LOCAL)
+    poor = Profile(reliability=BEST_EFFORT, durability=VOLATILE)
+    assert request([best, best], 7, {})[:4] == (1, 7, RELIABLE, TRANSIENT_LOCAL)
+    mixed = request([best, poor], 7, {})
+    assert mixed[:4] == (1, 7, BEST_EFFORT, VOLATILE)
+    assert not conflicts(best, mixed)
+    assert not conflicts(poor, mixed)
+    assert request([best], 7, {"depth": 3, "durability": VOLATILE})[:4] == (1, 3, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("offer", "wanted", "names"),
+    [
+        ({"reliability": 2}, {"reliability": 1}, ["reliability"]),
+        ({"durability": 2}, {"durability": 1}, ["durability"]),
+        ({"deadline": FOREVER}, {"deadline": 10}, ["deadline"]),
+        ({"deadline": 9}, {"deadline": 10}, []),
+        ({}, {"deadline": 10}, ["deadline"]),
+        ({"liveliness": 1}, {"liveliness": 3}, ["liveliness"]),
+        ({}, {"liveliness_lease_duration": 5}, ["liveliness_lease_duration"]),
+        ({"reliability": 3, "durability": 3}, {"reliability": 1, "durability": 1}, []),
+    ],
+)
+def test_conflicts(offer: dict[str, int], wanted: dict[str, int], names: list[str]) -> None:
+    assert conflicts(Profile(**offer), Profile(**wanted)) == names  # type: ignore[arg-type]
+
+
+def test_offers_are_written_as_bags_have_them() -> None:
+    text = offered_text(
+        [Profile(3, 0, 1, 1, FOREVER, 10_000_000_000, 1, FOREVER), Profile(depth=5)]
+    )
+    assert text.startswith(
+        "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1\n"
+        "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  lifespan:\n    sec: 10\n    nsec: 0\n  liveliness: 1\n"
+        "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  avoid_ros_namespace_conventions: false\n- history: 1\n  depth: 5\n"
+    )
+
+
+# Definitions.
+
+
+def packages(folder: Path, files: dict[str, str]) -> Definitions:
+    for name, text in files.items():
+        path = folder / "share" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return Definitions([folder / "missing", folder / "share"])
+
+
+def test_a_definition_has_all_that_it_needs_once(tmp_path: Path) -> None:
+    definitions = packages(
+        tmp_path,
+        {
+            "a/msg/Top.msg": "b/Part[<=3] parts # c/Nothing\nOther[] more\nb/msg/Part one\n"
+            'uint8 X=1\nstring<=5 s "d/Nothing"\n\n',
+            "a/msg/Other.msg": "float32 f\nb/Part p",
+            "b/msg/Part.msg": "int8 i\n",
+        },
+    )
+    found = definitions.find("a/msg/Top")
+    assert found.encoding == "ros2msg"
+    assert not found.has_bytes
+    line = "=" * 80
+    assert found.text.decode().partition(line)[2] == (
+        f"\nMSG: b/Part\nint8 i\n\n{line}\nMSG: a/Other\nfloat32 f\nb/Part p"
+    )
+    read = parse_definition(Schema("a/msg/Top", found.encoding, found.text))
+    assert [name for name, _ in read.fields] == ["parts", "more", "one", "s"]
+
+
+def test_a_type_that_only_idl_defines(tmp_path: Path) -> None:
+    definitions = packages(
+        tmp_path,
+        {
+            "a/msg/Top.msg": "b/Part part",
+            "a/msg/Top.idl": '#include "b/msg/Part.idl"\nmodule a { module msg { struct Top {\n'
+            "b::msg::Part part; }; }; };",
+            "b/msg/Part.idl": "module b { module msg { struct Part {\nsequence<octet> d; }; }; };",
+        },
+    )
+    found = definitions.find("a/msg/Top")
+    assert found.encoding == "ros2idl"
+    assert found.has_bytes
+    assert found.text.count(b"IDL: a/msg/Top\n") == found.text.count(b"IDL: b/msg/Part\n") == 1
+    read = parse_definition(Schema("a/msg/Top", found.encoding, found.text))
+    assert [name for name, _ in read.fields] == ["part"]
+
+
+def test_events_of_services_and_feedback_of_actions(tmp_path: Path) -> None:
+    definitions = packages(
+        tmp_path,
+        {
+            "a/srv/Add.srv": "int64 a\n---\nint64 sum\n",
+            "a/action/Go.action": "int8 far\n---\nbool ok\n---\na/Step step\n",
+            "a/msg/Step.msg": "uint8[] data",
+        },
+    )
+    assert definitions.find("a/srv/Add_Event").text == b"int64 a\n---\nint64 sum\n"
+    feedback = definitions.find("a/action/Go_FeedbackMessage")
+    assert b"MSG: a/Step\n" in feedback.text
+    assert feedback.has_bytes
+    assert parse_type("a/action/Go_FeedbackMessage").part == "FeedbackMessage"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("c/msg/Top", "package c is not installed"),
+        ("a/msg/Nothing", "has no msg/Nothing"),
+        ("a/msg/Needy", "package c is not installed"),
+        ("a/msg/Wrong", "which is not a type"),
+        ("a/msg/../../x", "not a type name"),
+        ("../msg/X", "not a type name"),
+        ("a/msg/\x1b[31m", "not a type name"),
+        ("std_msgs/String", "not a type name"),
+        ("", "not a type name"),
+    ],
+)
+def test_types_that_cannot_be_said(tmp_path: Path, name: str, reason: str) -> None:
+    definitions = packages(
+        tmp_path,
+        {"a/msg/Top.msg": "", "a/msg/Needy.msg": "c/X x", "a/msg/Wrong.msg": "a/b/c/d x"},
+    )
+    with pytest.raises(UnknownTypeError, match=reason):
+        definitions.find(name)
+
+
+def test_types_that_need_each_other_end(tmp_path: Path) -> None:
+    definitions = packages(tmp_path, {"a/msg/X.msg": "Y y", "a/msg/Y.msg": "X x"})
+    assert definitions.find("a/msg/X").text.count(b"MSG: ") == 1
+
+
+# The outbox.
+
+
+def drained(peer: socket.socket, outbox: Outbox) -> Memory:
+    """What a receiver at the other end makes of all that an outbox holds."""
+    from threading import Thread
+
+    memory = Memory()
+    ours, theirs = peer, outbox._peer
+    receiver = Receiver(ours, memory, {})
+    reader = Thread(target=receiver.run)
+    reader.start()
+    deadline = time.monotonic() + 10
+    while not outbox.send():
+        assert time.monotonic() < deadline
+    theirs.shutdown(socket.SHUT_WR)
+    reader.join()
+    return memory
+
+
+def channel_event(number: int, topic: str) -> dict[str, Any]:
+    return {
+        "event": "channel",
+        "number": number,
+        "topic": topic,
+        "type": "a/msg/B",
+        "encoding": "ros2msg",
+        "definition": "caf\udcff",
+        "offered": "",
+        "hash": "",
+    }
+
+
+def test_small_and_large_messages_keep_their_order() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        outbox = Outbox(theirs)
+        outbox.event(channel_event(7, "/x"))
+        sizes = [0, 3, 40_000, 5, 1 << 20, 1, 2, 33_000] * 20
+        payloads = [bytes([at % 256]) * size for at, size in enumerate(sizes)]
+        for at, payload in enumerate(payloads):
+            outbox.message(7, payload, 1000 + at, 0 if at % 2 else 500, -1 if at % 3 else at)
+        memory = drained(ours, outbox)
+    assert [taken.payload for taken in memory.taken] == payloads
+    assert [taken.received for taken in memory.taken] == list(range(1000, 1000 + len(sizes)))
+    assert [taken.sent for taken in memory.taken[:2]] == [500, None]
+    assert [taken.sequence for taken in memory.taken[:4]] == [0, None, None, 3]
+    assert len({id(taken.channel) for taken in memory.taken}) == 1
+    schema = memory.taken[0].channel.schema
+    assert schema is not None
+    assert schema.data == b"caf\xff"
+    assert outbox.waiting == 0
+
+
+def test_what_finds_no_room_is_counted() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        outbox = Outbox(theirs, budget=1 << 20)
+        events = EventSender(outbox)
+        outbox.event(channel_event(0, "/x"))
+        events._channels.append("/x")
+        for at in range(100):
+            outbox.message(0, bytes(50_000), 10 + at, 0, -1)
+            outbox.send()
+        assert outbox.waiting <= 1 << 20
+        events.refusals()
+        memory = drained(ours, outbox)
+    [loss] = memory.losses
+    assert (loss.topic, loss.cause, loss.last) == ("/x", "queue", 109)
+    assert loss.count is not None
+    assert loss.count + len(memory.taken) == 100
+    assert loss.first == 10 + len(memory.taken)
+
+
+def test_a_message_larger_than_the_budget_goes_when_nothing_waits() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        outbox = Outbox(theirs, budget=1000)
+        outbox.message(0, bytes(5000), 1, 0, -1)
+        assert not outbox.refused
+
+
+def test_a_message_too_large_for_the_wire_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert MAX_PAYLOAD < 1 << 32
+    monkeypatch.setattr(ros2_outbox, "MAX_PAYLOAD", 10)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        outbox = Outbox(theirs)
+        outbox.message(0, bytes(11), 1, 0, -1)
+        assert outbox.refused[0].count == 1
+
+
+# Topics, against ROS as it might be.
+
+
+class FakeSubscription:
+    def __init__(self, profile: Profile) -> None:
+        self.profile = profile
+        self.queue: list[tuple[bytes, dict[str, Any]]] = []
+        self.told = 0
+        self.tells_losses = self.tells_all = True
+        self.is_closed = False
+
+    def take(self) -> tuple[bytes, dict[str, Any]] | None:
+        return self.queue.pop(0) if self.queue else None
+
+    def losses(self) -> int:
+        told, self.told = self.told, 0
+        return told
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+class FakeRos:
+    """The graph as a test wants it."""
+
+    def __init__(self) -> None:
+        self.graph: dict[tuple[str, str], list[Offer]] = {}
+        self.made: list[FakeSubscription] = []
+        self.invalid: dict[str, str] = {}
+
+    def publishers(self) -> dict[tuple[str, str], list[Offer]]:
+        return self.graph
+
+    def subscribe(self, _topic: str, kind: Any, profile: Profile) -> FakeSubscription:
+        if kind.name == "Bad":
+            raise ImportError("no Python")
+        self.made.append(FakeSubscription(profile))
+        return self.made[-1]
+
+    def wait(self, _seconds: float) -> list[FakeSubscription]:
+        return [made for made in self.made if made.queue]
+
+    def wake(self) -> None:
+        pass
+
+
+class Rig:
+    """Topics with a fake ROS below and an outbox above."""
+
+    def __init__(self, folder: Path, overrides: dict[str, dict[str, Any]] | None = None) -> None:
+        self.ros: Any = FakeRos()
+        self.events: list[dict[str, Any]] = []
+        self.messages: list[tuple[Any, ...]] = []
+        rig = self
+
+        class Box:
+            refused: dict[int, Any] = {}  # noqa: RUF012
+
+            def event(self, event: dict[str, Any]) -> None:
+                rig.events.append(event)
+
+            def message(self, *message: Any) -> None:
+                rig.messages.append(message)
+
+            def close_batch(self) -> None:
+                pass
+
+        self.box: Any = Box()
+        self.sender = EventSender(self.box)
+        found = packages(
+            folder,
+            {
+                "a/msg/T.msg": "int8 i",
+                "a/msg/Arrays.msg": "string s\n a/T[] t",
+                "a/msg/Bytes.msg": "uint8[] d",
+                "a/msg/Bad.msg": "",
+            },
+        )
+        self.topics = Topics(self.ros, self.sender, found, overrides or {})
+        self.child = Child(self.ros, self.topics, self.box, self.sender)
+
+    def told(self, kind: str) -> list[dict[str, Any]]:
+        return [event for event in self.events if event["event"] == kind]
+
+
+def offer(gid: bytes = A, node: str = "/n", type_hash: str = "", **profile: int) -> Offer:
+    return Offer(gid, node, Profile(**profile), type_hash)  # type: ignore[arg-type]
+
+
+def info(number: int | None, gid: bytes | None = A, **more: int) -> dict[str, Any]:
+    now = time.time_ns()
+    known: dict[str, Any] = {"source_timestamp": now, "received_timestamp": now, **more}
+    known["publication_sequence_number"] = number
+    if gid is not None:
+        known["publisher_gid"] = {"data": gid + bytes(8)}
+    return known
+
+
+def test_a_topic_is_subscribed_to_when_it_is_wanted(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(durability=TRANSIENT_LOCAL)], ("/u", "a/msg/T"): []}
+    rig.topics.look()
+    rig.topics.look()
+    assert [event["topic"] for event in rig.told("candidate")] == ["/t", "/u"]
+    assert not rig.ros.made
+    rig.topics.subscribe("/t", "a/msg/T")
+    rig.topics.subscribe("/t", "a/msg/T")
+    rig.topics.subscribe("/nothing", "a/msg/T")
+    [made] = rig.ros.made
+    assert made.profile == Profile(depth=DEPTH, durability=TRANSIENT_LOCAL)
+    [channel] = rig.told("channel")
+    assert (channel["topic"], channel["definition"]) == ("/t", "int8 i")
+    assert "durability: 1" in channel["offered"]
+    [came] = rig.told("topic")
+    assert came["publishers"] == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "depth"), [("T", DEPTH), ("Arrays", DEPTH_OF_ARRAYS), ("Bytes", DEPTH_OF_BYTES)]
+)
+def test_types_that_may_be_large_have_shorter_queues(tmp_path: Path, kind: str, depth: int) -> None:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", f"a/msg/{kind}"): [offer()]}
+    rig.topics.look()
+    rig.topics.subscribe("/t", f"a/msg/{kind}")
+    assert rig.ros.made[0].profile.depth == depth
+
+
+def test_a_subscription_outlives_its_publishers(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", "a/msg/T"): [offer()]}
+    rig.topics.look()
+    rig.topics.subscribe("/t", "a/msg/T")
+    rig.ros.graph = {}
+    rig.topics.look()
+    rig.topics.look()
+    assert len(rig.told("gone")) == 1
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(B)]}
+    rig.topics.look()
+    assert [event["publishers"] for event in rig.told("topic")] == [1, 1]
+    assert len(rig.ros.made) == 1
+    assert not rig.ros.made[0].is_closed
+
+
+def test_a_publisher_that_offers_less_is_heard_too(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", "a/msg/T"): [offer()]}
+    rig.topics.look()
+    rig.topics.subscribe("/t", "a/msg/T")
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, reliability=BEST_EFFORT)]}
+    rig.topics.look()
+    old, new = rig.ros.made
+    assert new.profile.reliability == BEST_EFFORT
+    assert not old.is_closed
+    old.queue = [(b"1", info(1)), (b"2", info(2))]
+    new.queue = [(b"2", info(2)), (b"x", info(1, B)), (b"3", info(3))]
+    rig.child._take(0.0)
+    old.queue = [(b"3", info(3)), (b"4", info(4))]
+    new.queue = [(b"4", info(4))]
+    rig.child._take(0.0)
+    assert [message[1] for message in rig.messages] == [b"1", b"2", b"x", b"3", b"4"]
+    assert len(rig.told("channel")) == 2
+    assert rig.messages[-1][0] == 1
+    rig.topics.doubled[0].stream._old_until = 0.0  # type: ignore[union-attr]
+    rig.child._take(0.0)
+    assert old.is_closed
+    # What the new one has of the time before may come late.
+    new.queue = [(b"2", info(2)), (b"5", info(5))]
+    rig.child._take(0.0)
+    assert [message[1] for message in rig.messages[5:]] == [b"5"]
+    rig.topics.account(final=True)
+    assert not rig.told("lost")
+
+
+def test_without_names_the_old_subscription_is_emptied_and_closed(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    unnamed(rig, 1)
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, durability=3, reliability=BEST_EFFORT)]}
+    rig.topics.look()
+    old, new = rig.ros.made
+    old.queue = [(b"2", info(2, None))]
+    new.queue = [(b"3", info(3, None))]
+    rig.child._take(0.0)
+    assert old.is_closed
+    rig.topics.look()
+    assert not rig.topics.doubled
+    assert [message[1] for message in rig.messages] == [b"", b"2", b"3"]
+
+
+def test_what_overrides_exclude_is_said(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, {"/t": {"reliability": RELIABLE, "depth": 3}})
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(node="/poor", reliability=BEST_EFFORT)]}
+    rig.topics.look()
+    rig.topics.subscribe("/t", "a/msg/T")
+    assert rig.ros.made[0].profile[:3] == (1, 3, RELIABLE)
+    assert not rig.told("say")
+    rig.topics.look()
+    rig.topics.look()
+    [said] = rig.told("say")
+    assert "/t: /poor is incompatible: its reliability" in said["text"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"), [("gone_msgs/msg/T", "not installed"), ("a/msg/Bad", "no Python")]
+)
+def test_a_type_that_nobody_knows_is_told_and_told_again(
+    tmp_path: Path, kind: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", kind): [offer()]}
+    rig.topics.look()
+    rig.topics.subscribe("/t", kind)
+    rig.topics.look()
+    [said] = rig.told("say")
+    assert reason in said["text"]
+    [lost] = rig.told("lost")
+    assert (lost["topic"], lost["cause"], lost["count"]) == ("/t", "unreadable", None)
+    later = time.monotonic() + 11
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    rig.topics.look()
+    assert len(rig.told("lost")) == 2
+    rig.ros.graph = {}
+    rig.topics.look()
+    assert len(rig.told("gone")) == 1
+    rig.ros.graph = {("/t", kind): [offer()]}
+    rig.topics.look()
+    assert len(rig.told("candidate")) == 2
+
+
+def live_topic(tmp_path: Path, *offers: Offer) -> Rig:
+    rig = Rig(tmp_path)
+    rig.ros.graph = {("/t", "a/msg/T"): list(offers)}
+    rig.topics.look()
+    rig.topics.subscribe("/t", "a/msg/T")
+    rig.topics.look()
+    return rig
+
+
+def test_losses_name_the_publisher(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"), offer(B, node="/two"))
+    rig.ros.made[0].queue = [
+        (b"", info(number, gid)) for number in (1, 2, 3, 7, 8) for gid in (A, B) if number != gid[0]
+    ]
+    rig.child._take(0.0)
+    rig.topics.look()
+    rig.topics.look()
+    assert [(lost["count"], lost["detail"]) for lost in rig.told("lost")] == [
+        (3, "from /one"),
+        (3, "from /two"),
+    ]
+
+
+def test_the_last_messages_of_who_goes_in_an_overload_are_feared_for(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"), offer(B, node="/two"))
+    rig.ros.made[0].queue = [
+        *((b"", info(number, A)) for number in (1, 5, 6)),
+        *((b"", info(number, B)) for number in (1, 2, 3)),
+    ]
+    rig.child._take(0.0)
+    rig.topics.look()
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(B, node="/two")]}
+    rig.topics.look()
+    rig.topics.account(final=True)
+    rows = [(lost["count"], lost["detail"]) for lost in rig.told("lost")]
+    assert rows == [
+        (None, "from /one, after its last message, probably"),
+        (3, "from /one"),
+    ]
+
+
+@pytest.mark.parametrize("gid", [A, None])
+@pytest.mark.parametrize(
+    ("reliability", "ago", "feared"),
+    [(RELIABLE, 1, True), (RELIABLE, 5, False), (BEST_EFFORT, 5, True)],
+)
+def test_what_a_silent_publisher_sent_last_at_the_end(
+    tmp_path: Path, gid: bytes | None, reliability: int, ago: int, feared: bool
+) -> None:
+    rig = live_topic(tmp_path, offer(reliability=reliability))
+    at = time.time_ns() - ago * 10**9
+    rig.ros.made[0].queue = [(b"", info(n, gid, received_timestamp=at)) for n in (1, 5)]
+    rig.child._take(0.0)
+    rig.topics.end()
+    rig.topics.account(final=True)
+    counts = [lost["count"] for lost in rig.told("lost")]
+    assert counts == ([None, 3] if feared else [3])
+
+
+def test_the_end_waits_for_those_that_spoke_a_moment_ago(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(), offer(B))
+    assert rig.topics.has_caught_up()
+    old = time.time_ns() - 2 * 10**9
+    rig.ros.made[0].queue = [(b"", info(1)), (b"", info(1, B, received_timestamp=old))]
+    rig.child._take(0.0)
+    rig.topics.end()
+    assert not rig.topics.has_caught_up()
+    rig.ros.made[0].queue = [(b"", info(4))]
+    rig.child._take(0.0)
+    assert rig.topics.has_caught_up()
+    rig.topics.account(final=True)
+    assert [lost["count"] for lost in rig.told("lost")] == [2]
+
+
+def test_what_the_middleware_lost_before_and_after_is_told(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"))
+    made = rig.ros.made[0]
+    made.told = 2
+    # Of the nine before the first, seven were sent before anybody listened.
+    made.queue = [(b"", info(number)) for number in (10, 11, 14)]
+    rig.child._take(0.0)
+    made.told = 2 + 5
+    rig.topics.look()
+    rig.topics.look()
+    rig.topics.account(final=True)
+    assert [(lost["count"], lost["detail"].partition(", ")[2]) for lost in rig.told("lost")] == [
+        (2, "before the first message that came"),
+        (2, ""),
+        (None, "after its last message, probably"),
+        (5, "before the first message that came or after the last, as the middleware counts"),
+    ]
+    assert all(lost["detail"].startswith("from /one") for lost in rig.told("lost"))
+
+
+def test_other_middlewares_are_believed_where_there_are_no_numbers_only(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    made = rig.ros.made[0]
+    made.tells_all = False
+    made.told = 9
+    made.queue = [(b"", info(number)) for number in range(10, 30)]
+    rig.child._take(0.0)
+    made.told = 9
+    rig.topics.account(final=True)
+    assert not rig.told("lost")
+
+
+def unnamed(rig: Rig, *numbers: int) -> None:
+    rig.ros.made[0].queue = [(b"", info(number, None)) for number in numbers]
+    rig.child._take(0.0)
+
+
+def test_without_names_one_publisher_is_judged(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(node="/one"))
+    unnamed(rig, 1, 2, 3, 4, 8)
+    rig.topics.look()
+    rig.topics.look()
+    [lost] = rig.told("lost")
+    assert (lost["count"], lost["detail"]) == (3, "from /one")
+
+
+def test_without_names_nobody_is_accused_when_publishers_change(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    unnamed(rig, 1, 2)
+    rig.topics.look()
+    # The second publisher speaks before the graph has it.
+    unnamed(rig, 3, 500, 4, 501)
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B)]}
+    rig.topics.look()
+    unnamed(rig, 5, 503)
+    rig.topics.look()
+    rig.topics.account(final=True)
+    assert not rig.told("lost")
+    [said] = rig.told("say")
+    assert "does not name the publishers of messages" in said["text"]
+    assert len(rig.messages) == 8
+
+
+def test_without_names_the_middleware_is_believed_of_several(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(), offer(B))
+    unnamed(rig, 1, 500, 4, 502)
+    rig.ros.made[0].told = 3
+    rig.topics.account(final=True)
+    [lost] = rig.told("lost")
+    assert (lost["count"], lost["detail"]) == (3, "as the middleware counts")
+
+
+def test_without_numbers_the_middleware_is_believed(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.made[0].queue = [(b"", info(None))]
+    rig.child._take(0.0)
+    rig.ros.made[0].told = 4
+    rig.topics.look()
+    [lost] = rig.told("lost")
+    assert (lost["cause"], lost["count"]) == ("transport", 4)
+    assert rig.messages[0][4] == -1
+    assert not rig.told("say")
+    rig.ros.made[0].tells_losses = False
+    rig.topics.look()
+    assert "does not number messages" in rig.told("say")[0]["text"]
+
+
+def test_names_that_ros_does_not_take_are_said_once(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.invalid = {"/my-topic\x1b": "must not contain"}
+    rig.topics.look()
+    rig.topics.look()
+    [said] = rig.told("say")
+    assert said["text"].startswith("'/my-topic\\x1b' is ignored")
+
+
+def test_times_that_make_no_sense_are_not_believed(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    before = time.time_ns()
+    rig.ros.made[0].queue = [
+        (b"", info(1, received_timestamp=0, source_timestamp=0)),
+        (b"", info(2, received_timestamp=before + 3600 * 10**9, source_timestamp=-5)),
+        (b"", info(3, received_timestamp=before - 5 * 10**9, source_timestamp=7)),
+        (b"", info(4, received_timestamp=2**63, source_timestamp=2**64)),
+    ]
+    rig.child._take(0.0)
+    received = [message[2] for message in rig.messages]
+    assert received[2] == before - 5 * 10**9
+    assert all(before <= received[at] <= time.time_ns() for at in (0, 1, 3))
+    assert [message[3] for message in rig.messages] == [0, 0, 7, 0]
+
+
+def test_a_message_that_cannot_be_taken_costs_one(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+
+    def fail() -> None:
+        raise RuntimeError("serialized nonsense")
+
+    rig.ros.made[0].queue = [(b"", {})]
+    rig.ros.made[0].take = fail
+    rig.child._take(0.0)
+    [lost] = rig.told("lost")
+    assert (lost["cause"], lost["count"]) == ("unreadable", 1)
+    assert "serialized nonsense" in rig.told("say")[0]["text"]
+
+
+def test_different_versions_of_a_type_are_said(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"), offer(B, type_hash="RIHS01_b"))
+    assert "different versions of a/msg/T" in rig.told("say")[0]["text"]
+    assert rig.told("channel")[0]["hash"] == ""
+
+
+# Where it runs.
+
+
+def child_modules() -> list[str]:
+    """What the child loads: its start, and all that it imports."""
+    found, waiting = [], ["__main__"]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.append(name)
+        waiting += [
+            used.module.removeprefix(f"{CHILD}.").partition(".")[0]
+            for used in imports_of(FOLDER / f"{name}.py", f"{CHILD}.{name}")
+            if used.module.startswith(f"{CHILD}.") and not used.typing
+        ]
+    return found
+
+
+def test_the_child_runs_under_older_pythons_and_with_nothing_installed() -> None:
+    modules = child_modules()
+    assert sorted(modules) == sorted(
+        path.stem for path in FOLDER.glob("*.py") if path.stem != "__init__"
+    )
+    for name in modules:
+        path = FOLDER / f"{name}.py"
+        ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 10))
+        for used in imports_of(path, f"{CHILD}.{name}"):
+            top = used.module.partition(".")[0]
+            assert (
+                used.typing
+                or top in sys.stdlib_module_names
+                or used.module.startswith(f"{CHILD}.")
+                or (name, top) == ("middleware", "rclpy")
+            ), f"{name} imports {used.module}"

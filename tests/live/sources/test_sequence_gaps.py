@@ -1,0 +1,209 @@
+"""Gaps in `header.seq`: ROS 1 and Foxglove must report the same losses for the same numbers."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.foxglove.session import Notifier, Session
+from hybridlog.live.sources.ros1.stream import Stream
+from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector, joined_gap
+from hybridlog_storage.messages import Channel, Schema
+from tests.live.sources.heard import Heard
+from tests.live.sources.ros1_peers import framed
+
+MODULUS = 1 << 32
+DEFINITION = "Header header\nfloat32 x"
+
+
+def payload(number: int) -> bytes:
+    return struct.pack("<I", number % MODULUS) + b"rest"
+
+
+def detected(numbers: Sequence[int]) -> list[SequenceGap]:
+    detector = SequenceGapDetector()
+    found = []
+    for at, number in enumerate(numbers):
+        detector.see(number % MODULUS, at)
+        found += detector.confirmed()
+    return found + detector.finish()
+
+
+def reported(heard: Heard) -> int:
+    assert {(loss.topic, loss.cause) for loss in heard.losses} <= {("/a", Cause.TRANSPORT)}
+    assert all(loss.count is not None and loss.count > 0 for loss in heard.losses)
+    return sum(loss.count or 0 for loss in heard.losses)
+
+
+# All that find gaps, each with the missing messages that it reports.
+
+
+def by_the_detector(numbers: Sequence[int]) -> int:
+    return sum(gap.missing for gap in detected(numbers))
+
+
+def by_ros1(numbers: Sequence[int], *, at_once: bool) -> int:
+    channel = Channel("/a", "ros1", Schema("a/B", "ros1msg", DEFINITION.encode()))
+    heard = Heard()
+    heard.expect(channel)
+    ours, peer = socket.socketpair()
+    ours.setblocking(False)
+    with peer:
+        stream = Stream(ours, channel, heard, 1 << 20, lambda _: None)
+        frames = [framed(payload(number)) for number in numbers]
+        for data in [b"".join(frames)] if at_once else frames:
+            peer.sendall(data)
+            assert stream.read()
+    while stream.read():
+        pass
+    stream.close()
+    assert [taken.sequence for taken in heard.taken] == [number % MODULUS for number in numbers]
+    return reported(heard)
+
+
+def by_ros1_one_by_one(numbers: Sequence[int]) -> int:
+    return by_ros1(numbers, at_once=False)
+
+
+def by_ros1_at_once(numbers: Sequence[int]) -> int:
+    return by_ros1(numbers, at_once=True)
+
+
+def by_foxglove(numbers: Sequence[int]) -> int:
+    heard = Heard()
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
+    session._advertise(
+        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
+    )
+    for number in numbers:
+        session.data(0, 1, payload(number))
+    session.end(is_stopped=True)
+    assert len(heard.taken) == len(numbers)
+    return reported(heard)
+
+
+USERS = [by_the_detector, by_ros1_one_by_one, by_ros1_at_once, by_foxglove]
+
+
+@pytest.mark.parametrize("missing_of", USERS)
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [
+        (range(1000), 0),
+        ([*range(20), *range(25, 50)], 5),
+        ([*range(100), *range(110, 200)], 10),
+        ([*range(9), 12], 3),
+        ([*range(8), 12], 0),  # too few messages to trust the numbers
+        ([*range(8), *range(20, 100)], 0),
+        ([*range(9), 12, 13, 15, 17], 5),  # trust survives a gap
+        ([*range(100), *range(100, 400, 3)], 2 * 99),  # gaps close together
+        ([*range(MODULUS - 10, MODULUS), 0, 1, 3], 1),  # wraps
+        ([*range(-100, -1), *range(5, 100)], 6),  # wraps within a gap
+        ([0] * 1000, 0),  # not numbered
+        ([*range(20), 5, 9, 30], 0),  # goes back, which ends the trust
+        ([*range(20), 19, 25], 0),  # repeats
+        ([*range(20), 5, *range(6, 14), 16], 2),  # trusted again
+        ([*range(100), *range(50)], 0),  # begins anew
+        (range(0, 10_000, 10), 0),  # throttled
+        ([*range(20), 2_000_020, 2_000_025], 0),  # too wide
+        ([*range(100), *range(1 << 20, (1 << 20) + 100)], 0),
+        ([*range(20), 1_000_020], 1_000_000),  # as wide as can be
+        ([*range(20), 1_000_021], 0),
+        ([7, 1, 9, 2, 8], 0),
+        # Two publishers alternate.
+        ([n for pair in zip(range(500), range(90_000, 90_500), strict=True) for n in pair], 0),
+        # A second publisher sends a few messages.
+        ([*range(100), *range(5000, 5004), *range(100, 200)], 0),
+        ([*range(100), *range(5000, 5008), *range(100, 200)], 0),
+    ],
+)
+def test_all_report_the_same_losses(
+    missing_of: Callable[[Sequence[int]], int], numbers: Sequence[int], missing: int
+) -> None:
+    assert missing_of(numbers) == missing
+
+
+# The detector.
+
+
+def test_a_gap_lies_between_two_messages() -> None:
+    assert detected([*range(100), *range(110, 200)]) == [SequenceGap(10, 99, 100, 99, 110)]
+    assert detected([*range(MODULUS - 20, MODULUS), 3]) == [SequenceGap(3, 19, 20, MODULUS - 1, 3)]
+
+
+def test_a_gap_is_confirmed_by_the_messages_after_it() -> None:
+    detector = SequenceGapDetector(trust_after=3, confirm_after=2, max_gap=10)
+    for number in [0, 1, 2, 3, 6, 7]:
+        detector.see(number, number)
+        assert detector.confirmed() == []
+    assert detector.waiting
+    detector.see(8, 8)
+    assert detector.confirmed() == [SequenceGap(2, 3, 6, 3, 6)]
+    assert detector.confirmed() == detector.waiting == detector.finish() == []
+
+
+def test_a_confirmed_gap_survives_a_number_that_goes_back() -> None:
+    detector = SequenceGapDetector(trust_after=3, confirm_after=2)
+    for number in [*range(5), 7, 8, 9, 2]:
+        detector.see(number, 0)
+    assert [gap.missing for gap in detector.confirmed()] == [2]
+    assert detector.finish() == []
+
+
+def test_the_widest_gap_and_the_first_trust_are_parameters() -> None:
+    for numbers, is_gap in [([0, 1, 2, 13], True), ([0, 1, 2, 14], False), ([0, 1, 12], False)]:
+        detector = SequenceGapDetector(trust_after=2, max_gap=10)
+        for number in numbers:
+            detector.see(number, 0)
+        assert bool(detector.finish()) is is_gap
+
+
+def test_gaps_of_messages_that_were_received_together_are_one() -> None:
+    detector = SequenceGapDetector()
+    for number in range(20):
+        detector.see(number, number)
+    for number in (22, 24, 26):
+        detector.jump(number, 19, 20)
+    assert detector.finish() == [SequenceGap(4, 19, 20, 19, 26)]
+
+
+def test_joined_gaps_span_all() -> None:
+    one, other = SequenceGap(2, 10, 11, 4, 7), SequenceGap(1, 12, 13, 8, 10)
+    assert joined_gap([one]) == one
+    assert joined_gap([one, other]) == SequenceGap(3, 10, 13, 4, 10)
+
+
+# Its users.
+
+
+def test_foxglove_puts_close_gaps_into_few_rows() -> None:
+    heard = Heard()
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
+    session._advertise(
+        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
+    )
+    for number in [*range(100), *range(100, 400, 3)]:
+        session.data(0, 1, payload(number))
+    session.end(is_stopped=True)
+    assert reported(heard) == 2 * 99
+    assert len(heard.losses) < 20
+
+
+@pytest.mark.parametrize("data", [b"", b"abc"])
+def test_a_payload_without_room_for_a_number_is_ignored(data: bytes) -> None:
+    heard = Heard()
+    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
+    session._advertise(
+        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
+    )
+    for number in range(20):
+        session.data(0, 1, payload(number))
+    session.data(0, 1, data)
+    session.data(0, 1, payload(20))
+    session.end(is_stopped=True)
+    assert heard.losses == []
+    assert len(heard.taken) == 22
