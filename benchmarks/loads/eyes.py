@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from hybridlog.demo.camera import HEIGHT, Camera
-from hybridlog.demo.plan import WALL_HEIGHT
-from hybridlog.demo.sensors import LaserScanner, mounted, returned_light
+from benchmarks.loads.simulation.camera import HEIGHT, Camera
+from benchmarks.loads.simulation.plan import WALL_HEIGHT
+from benchmarks.loads.simulation.sensors import LaserScanner, mounted, returned_light
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.demo.motion import State
-    from hybridlog.demo.robot import Robot
+    from benchmarks.loads.simulation.motion import State
+    from benchmarks.loads.simulation.robot import Robot
 
     Floats = NDArray[np.float64]
     Singles = NDArray[np.float32]

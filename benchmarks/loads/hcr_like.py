@@ -20,11 +20,11 @@ from benchmarks.loads import pr2, viewpoint
 from benchmarks.loads.arm import GRID as ARM_GRID
 from benchmarks.loads.arm import Drag, plan_drags
 from benchmarks.loads.jpegs import Jpegs
+from benchmarks.loads.simulation.wire import GRIPPER_COMMAND
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.timing import received, steady
 from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, RobotError, Truth
 from benchmarks.loads.viewpoint import GRASPS, TICK_NS, ViewpointPlan
-from hybridlog.demo.wire import GRIPPER_COMMAND
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

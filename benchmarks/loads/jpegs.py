@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlog.demo.camera import Camera
-from hybridlog.demo.robot import Robot
+from benchmarks.loads.simulation.camera import Camera
+from benchmarks.loads.simulation.robot import Robot
 from hybridlog_storage.errors import MissingDependencyError
 
 _SIZE = (640, 480)

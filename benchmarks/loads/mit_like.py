@@ -22,10 +22,10 @@ from benchmarks.loads.eyes import (
     StereoCamera,
     TiltLaser,
 )
+from benchmarks.loads.simulation.robot import MAX_DURATION_S, Robot
+from benchmarks.loads.simulation.sensors import Inertial, Odometer
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.timing import received, steady
-from hybridlog.demo.robot import MAX_DURATION_S, Robot
-from hybridlog.demo.sensors import Inertial, Odometer
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from benchmarks.loads.base import Load
-    from hybridlog.demo.camera import Camera
-    from hybridlog.demo.wire import Template
+    from benchmarks.loads.simulation.camera import Camera
+    from benchmarks.loads.simulation.wire import Template
 
     Floats = NDArray[np.float64]
     Times = NDArray[np.int64]

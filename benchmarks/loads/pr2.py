@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rosbags.typesys import get_types_from_msg
 
-from hybridlog.demo.wire import Types
+from benchmarks.loads.simulation.wire import Types
 from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.demo.wire import Template
+    from benchmarks.loads.simulation.wire import Template
 
     Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.demo.wire import Template
+    from benchmarks.loads.simulation.wire import Template
     from hybridlog_storage.messages import Channel
 
 _BUFFER = 1 << 20

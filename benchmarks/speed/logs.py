@@ -15,7 +15,7 @@ import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Reader, Writer
 
-from hybridlog.demo.wire import Template, Types
+from benchmarks.loads.simulation.wire import Template, Types
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.demo.plan import DEPTH, MATERIAL_NAMES, MATERIALS, WALL_HEIGHT, WIDTH
-from hybridlog.demo.sensors import mounted
+from benchmarks.loads.simulation.plan import DEPTH, MATERIAL_NAMES, MATERIALS, WALL_HEIGHT, WIDTH
+from benchmarks.loads.simulation.sensors import mounted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.demo.plan import FloorPlan, Hits
-    from hybridlog.demo.robot import Robot
+    from benchmarks.loads.simulation.plan import FloorPlan, Hits
+    from benchmarks.loads.simulation.robot import Robot
 
     Floats = NDArray[np.float64]
     Image = NDArray[np.float32]

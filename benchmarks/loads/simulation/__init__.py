@@ -1,0 +1,1 @@
+"""The simulated robot that logs are made from."""
