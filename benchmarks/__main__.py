@@ -1,11 +1,11 @@
-"""`python -m benchmarks COMMAND …`: the studies, their report, targets, hot paths."""
+"""`python -m benchmarks COMMAND …`: the studies and their report."""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
 
-_WITH_OPTIONS_OF_THEIR_OWN = ("speed", "live", "micro")
+_WITH_OPTIONS_OF_THEIR_OWN = ("live",)
 
 
 def main(arguments: list[str], program: str = "python -m benchmarks") -> int:

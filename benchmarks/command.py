@@ -409,16 +409,10 @@ def _forward(name: str, module: str, about: str) -> None:
     )(command)
 
 
-_forward("speed", "benchmarks.speed.command", "Hybridlog against its own speed targets.")
 _forward(
     "live",
     "benchmarks.live.command",
     "Recording a running robot under load, beside rosbag record.",
-)
-_forward(
-    "micro",
-    "benchmarks.micro.command",
-    "The hot paths, one at a time, and against another revision.",
 )
 
 

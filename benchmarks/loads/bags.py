@@ -1,4 +1,4 @@
-"""The logs that the speed study reads: ROS 1 bags and ordinary MCAP files, made from a seed.
+"""The logs of the speed and micro benchmarks: ROS 1 bags and MCAP files, made from a seed.
 
 Each is written a second of log time at a time, so that making a log of any length
 takes no more memory than making a short one.
