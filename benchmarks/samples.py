@@ -120,6 +120,13 @@ class Journal:
         """How often a run has been done to its end."""
         return self._successes[sample.key]
 
+    def settings_of(self, sample: Sample) -> Mapping[str, Any]:
+        """Settings of the study of a sample, in the run in which it was taken."""
+        run = self.runs[sample.key]
+        settings = self.headers[run].get("settings") if run >= 0 else None
+        found = settings.get(sample.study) if isinstance(settings, dict) else None
+        return found if isinstance(found, dict) else {}
+
     def _keep(self, sample: Sample) -> None:
         if sample.status == "ok":
             self._successes[sample.key] += 1

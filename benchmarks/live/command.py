@@ -14,7 +14,7 @@ from benchmarks.documents import replace_section
 from benchmarks.live.cases import CASES, Row
 from benchmarks.live.recorders import rosbag
 from benchmarks.machine import describe
-from benchmarks.progress import Steps, steps
+from benchmarks.progress import Steps
 from benchmarks.side import SideError
 
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
@@ -35,7 +35,8 @@ def main(arguments: list[str]) -> int:
     if rosbag() is None:
         print("There is no rosbag here: hybridlog runs alone (python3-rosbag).", file=sys.stderr)
     failed = False
-    with ExitStack() as stack, steps(total) as progress:
+    progress = Steps(total)
+    with ExitStack() as stack:
         if chosen.work is None:
             work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hybridlog-live-")))
         else:

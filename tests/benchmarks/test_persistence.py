@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmarks.campaign import _plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.backends.mcap_file import McapFile
 from benchmarks.backends.nothing import Nothing
-from benchmarks.campaign import _plain
 from benchmarks.loads.base import Load
 from benchmarks.loads.hcr_like import RIGHT_GRIPPER, TF, WEBCAM
 from benchmarks.loads.mit_like import KINECT_DEPTH
@@ -32,7 +32,7 @@ class Quiet(Steps):
     """Progress that nobody sees."""
 
     def __init__(self) -> None:
-        super().__init__(1.0, None, None)
+        super().__init__(1.0)
         self.texts: list[str] = []
 
     @contextmanager

@@ -61,7 +61,7 @@ def context(directory: Path, work: Path | None = None, **settings: Any) -> Conte
             "work": work or directory / "work",
             "backends": {},
             "journal": Journal(directory / "out"),
-            "steps": Steps(1, None, None),
+            "steps": Steps(1),
             "quick": True,
             **settings,
         }

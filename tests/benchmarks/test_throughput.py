@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmarks.campaign import _plain
 
 from benchmarks.backends.base import Backend
 from benchmarks.backends.nothing import Nothing
-from benchmarks.campaign import _plain
 from benchmarks.harness.run import Outcome, Setting
 from benchmarks.loads.base import Load
 from benchmarks.progress import Steps
@@ -32,7 +32,7 @@ def context(directory: Path, **settings: Any) -> Context:
             "work": directory / "work",
             "backends": {"nothing": Nothing},
             "journal": Journal(directory / "out"),
-            "steps": Steps(1, None, None),
+            "steps": Steps(1),
             **settings,
         }
     )
