@@ -20,7 +20,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from benchmarks.progress import Steps, short
 from benchmarks.samples import NAME, Journal
 from hybridlog.cli import stopping
 from hybridlog.cli.exit_codes import of_os_error
@@ -39,7 +38,7 @@ PARTS = {
     "queries": "benchmarks.studies.queries",
     "reading": "benchmarks.studies.reading",
 }
-"""Modules with `STUDY`, `Settings`, `run` and `expected_seconds`, in the order of a run."""
+"""Modules with `STUDY`, `Settings` and `run`, in the order of a run."""
 STUDIES = {
     "throughput": ("throughput", "ceilings"),
     "persistence": ("persistence", "speed-up"),
@@ -199,8 +198,15 @@ def _run(chosen: argparse.Namespace, command: list[str]) -> int:
         work = _work(chosen.work, stack)
         header = _header(chosen, planned, command, work)
         _check_settings(journal, header, chosen.out)
+        context = _context(journal, work, backends, chosen)
+        done = sum(sample.status == "ok" for sample in journal.samples.values())
+        if done:
+            note(f"benchmarks: going on with {journal.path}: {done} runs are not done again")
+        journal.begin(header)
         try:
-            _run_parts(planned, chosen, _context(journal, work, backends, chosen), header)
+            for part in planned:
+                speed = chosen.speed if part.name == "persistence" else 1.0
+                part.module.run(replace(context, speed=speed), part.settings)
         except stopping.Stopped as stopped:
             again = shlex.join(word for word in command if word != "--restart")
             done = sum(sample.status == "ok" for sample in journal.samples.values())
@@ -320,33 +326,8 @@ def _context(
     missing = {name: reason for name, kind in backends.items() if (reason := _missing_reason(kind))}
     for name, reason in missing.items():
         note(f"benchmarks: {name} is left out: {reason}")
-    steps = Steps(0.0)
     quick, seed = chosen.quick, chosen.seed
-    return Context(work, backends, journal, steps, quick=quick, seed=seed, missing=missing)
-
-
-def _run_parts(
-    planned: Sequence[Part],
-    chosen: argparse.Namespace,
-    context: Context,
-    header: Mapping[str, Any],
-) -> None:
-    speeds = [chosen.speed if part.name == "persistence" else 1.0 for part in planned]
-    contexts = [replace(context, speed=speed) for speed in speeds]
-    seconds = [
-        float(part.module.expected_seconds(its, part.settings))
-        for part, its in zip(planned, contexts, strict=True)
-    ]
-    done = sum(sample.status == "ok" for sample in context.journal.samples.values())
-    if done:
-        note(f"benchmarks: going on with {context.journal.path}: {done} runs are not done again")
-    if any(seconds):
-        note(f"benchmarks: about {short(sum(seconds))} to go; Ctrl-C keeps what is done")
-        context.journal.begin(header)
-    progress = Steps(sum(seconds))
-    for part, its in zip(planned, contexts, strict=True):
-        its.steps = progress
-        part.module.run(its, part.settings)
+    return Context(work, backends, journal, quick=quick, seed=seed, missing=missing)
 
 
 # --- a report -------------------------------------------------------------------------

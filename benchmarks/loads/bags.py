@@ -1,93 +1,71 @@
-"""The logs of the speed and micro benchmarks: ROS 1 bags and MCAP files, made from a seed.
-
-Each is written a second of log time at a time, so that making a log of any length
-takes no more memory than making a short one.
-"""
+"""The logs of the speed and micro benchmarks: ROS 1 bags and MCAP files, made from a seed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Reader, Writer
 
-from benchmarks.loads.simulation.wire import Template, Types
+from benchmarks.loads import made
+from benchmarks.loads.made import Moments, Topic, Values, diagonal, fixed, transforms, vector
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from numpy.typing import NDArray
+
+    from hybridlog.demo.topics import Types
 
 START_NS = 1_700_000_000 * 1_000_000_000
 IMAGE_SIDE = 800
 """Pixels; 800 by 800 `mono8` are 640 000 bytes."""
-CAMERA = (640, 480)
-"""Width and height in pixels of the cameras of the drive, `mono8`."""
-CAMERA_HZ = 15.0
-SCAN_HZ = 20.0
-SCAN_BEAMS = 720
-SCAN_TOPIC = "/scan"
-IMU_TOPIC = "/imu/data"
-
+CAMERA = (480, 640)
+"""Height and width in pixels of the cameras of the drive, `mono8`."""
+CAMERA_HZ, SCAN_HZ, SCAN_BEAMS = 15.0, 20.0, 720
+SCAN_TOPIC, IMU_TOPIC = "/scan", "/imu/data"
 _DELAY_NS = 1_000_000
-Columns = dict[str, "NDArray[Any]"]
-_Frames = Callable[[np.random.Generator, int, "NDArray[np.uint8]"], None]
-"""Fills frames, uint8[n, height, width], from a generator and the number of the first."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Stream:
-    """One topic of a log.
-
-    Attributes:
-        topic: Name.
-        msgtype: As rosbags spells it.
-        hz: Rate, evenly spaced.
-        template: A message of it.
-        values: Makes the values that vary of some messages, from a generator, the
-            number of the first message and their count.
-        phase_ns: Log time of the first message after the start, ns.
-    """
-
-    topic: str
-    msgtype: str
-    hz: float
-    template: Template
-    values: Callable[[np.random.Generator, int, int], Columns]
-    phase_ns: int = 0
+_NO_DELAY = (0.0, 0.0)
 
 
 def write_small(path: Path, messages: int, seed: int) -> None:
     """Poses, IMU, transforms and joint states, a quarter each, at 100 Hz each."""
-    types = Types(1)
-    streams = [_pose(types, 100.0), _imu(types, 100.0), _tf(types, 100.0), _joints(types, 100.0)]
-    _write(path, types, streams, messages / 400, seed)
+    _write(path, [_topic(kind, 100.0) for kind in _SMALL], messages / 400, seed)
 
 
 def write_imu(path: Path, messages: int, seed: int) -> None:
     """Nothing but IMU messages, at 200 Hz."""
-    types = Types(1)
-    _write(path, types, [_imu(types, 200.0)], messages / 200, seed)
+    _write(path, [_topic(IMU_TOPIC, 200.0)], messages / 200, seed)
 
 
 def write_images(path: Path, messages: int, seed: int) -> None:
     """Images of 640 kB at 10 Hz: one half of each is noise, the other a smooth surface."""
-    types = Types(1)
-    camera = _camera(types, "/camera/image_raw", (IMAGE_SIDE, IMAGE_SIDE), 10.0, _half_noise)
-    _write(path, types, [camera], messages / 10, seed)
+    shape = (IMAGE_SIDE, IMAGE_SIDE)
+    _write(path, [_camera("/camera/image_raw", shape, 10.0, _half_noise)], messages / 10, seed)
 
 
 def write_drive(path: Path, duration_s: float, seed: int) -> None:
     """Two cameras and a laser scanner."""
-    types = Types(1)
-    streams = [
-        _camera(types, "/camera/left/image_raw", CAMERA, CAMERA_HZ, _scene),
-        _camera(types, "/camera/right/image_raw", CAMERA, CAMERA_HZ, _scene, phase_ns=7_000_000),
-        _scan(types),
+    topics = [
+        _camera("/camera/left/image_raw", CAMERA, CAMERA_HZ, _scene),
+        _camera("/camera/right/image_raw", CAMERA, CAMERA_HZ, _scene, 0.007),
+        Topic(
+            *(SCAN_TOPIC, "sensor_msgs/msg/LaserScan", "", SCAN_HZ, 0.003, _NO_DELAY),
+            fixed(
+                header__frame_id="laser",
+                angle_min=-np.pi,
+                angle_max=np.pi,
+                angle_increment=2 * np.pi / SCAN_BEAMS,
+                scan_time=1 / SCAN_HZ,
+                range_min=0.1,
+                range_max=30.0,
+            ),
+            _scan,
+        ),
     ]
-    _write(path, types, streams, duration_s, seed)
+    _write(path, topics, duration_s, seed)
 
 
 def bag_to_mcap(bag: Path, path: Path) -> None:
@@ -97,232 +75,138 @@ def bag_to_mcap(bag: Path, path: Path) -> None:
         writer.start(profile="ros1")
         channels = {}
         for connection in reader.connections:
-            schema = writer.register_schema(
-                connection.msgtype.replace("/msg/", "/"),
-                "ros1msg",
-                connection.msgdef.data.encode(),
-            )
+            name = connection.msgtype.replace("/msg/", "/")
+            schema = writer.register_schema(name, "ros1msg", connection.msgdef.data.encode())
             channels[connection.id] = writer.register_channel(connection.topic, "ros1", schema)
         for connection, log_time, payload in reader.messages():
             writer.add_message(channels[connection.id], log_time, payload, log_time)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _write(path: Path, types: Types, streams: list[_Stream], duration_s: float, seed: int) -> None:
-    """Write a bag; it has its name only once it is whole, so it can be used again."""
-    part = path.with_suffix(".part")
-    part.unlink(missing_ok=True)
-    writer = Writer(part)
-    with writer:
+def _write(path: Path, topics: Sequence[Topic], duration_s: float, seed: int) -> None:
+    """Write a bag, a second of log time at a time."""
+    types = made.OldTypes()
+    random = [np.random.default_rng([seed, number]) for number in range(len(topics))]
+    values = [topic.values(types) for topic in topics]
+    done = [0] * len(topics)
+    with Writer(path) as writer:
         connections = [
-            writer.add_connection(s.topic, s.msgtype, typestore=types.store) for s in streams
+            writer.add_connection(t.name, t.msgtype, typestore=types.store) for t in topics
         ]
-        for messages in _spans(streams, duration_s, seed):
+        for second in range(1, int(np.ceil(duration_s)) + 1):
+            messages: list[tuple[int, int, bytes]] = []
+            for number, topic in enumerate(topics):
+                end = round(min(second, duration_s) * topic.hz)
+                ticks, done[number] = np.arange(done[number], end), end
+                if not len(ticks):
+                    continue
+                seconds = topic.phase + ticks / topic.hz
+                stamps = START_NS + np.rint(seconds * 1e9).astype(np.int64)
+                columns = topic.columns(Moments(seconds, stamps, random[number]))
+                prefix = "transforms.0." if "transforms" in values[number] else ""
+                columns |= {f"{prefix}header.stamp": stamps, f"{prefix}header.seq": ticks}
+                payloads = made.payloads(types, topic.msgtype, values[number], columns)
+                log_times = (stamps + _DELAY_NS).tolist()
+                messages += zip(log_times, [number] * len(ticks), payloads, strict=True)
+            messages.sort(key=lambda message: message[:2])
             for log_time, number, payload in messages:
                 writer.write(connections[number], log_time, payload)
-    part.rename(path)
 
 
-def _spans(
-    streams: list[_Stream], duration_s: float, seed: int
-) -> Iterator[list[tuple[int, int, bytes]]]:
-    """Log time in ns, number of the stream, payload: in order, a second at a time."""
-    random = [np.random.default_rng([seed, number]) for number in range(len(streams))]
-    made = [0] * len(streams)
-    for second in range(1, int(np.ceil(duration_s)) + 1):
-        messages: list[tuple[int, int, bytes]] = []
-        for number, stream in enumerate(streams):
-            end = round(min(second, duration_s) * stream.hz)
-            count = end - made[number]
-            if count < 1:
-                continue
-            ticks = np.arange(made[number], end)
-            stamp = START_NS + stream.phase_ns + np.rint(ticks * (1e9 / stream.hz)).astype(np.int64)
-            rows = stream.template.rows(
-                _with_stamps(stream, stamp, ticks, random[number], count), count
-            )
-            made[number] = end
-            messages.extend(
-                (log_time, number, row.tobytes())
-                for log_time, row in zip((stamp + _DELAY_NS).tolist(), rows, strict=True)
-            )
-        messages.sort(key=lambda message: message[:2])
-        yield messages
-
-
-def _with_stamps(
-    stream: _Stream,
-    stamp: NDArray[np.int64],
-    ticks: NDArray[np.int64],
-    random: np.random.Generator,
-    count: int,
-) -> Columns:
-    prefix = "transforms.0." if stream.msgtype.endswith("TFMessage") else ""
-    return {
-        f"{prefix}header.stamp": stamp,
-        f"{prefix}header.seq": ticks,
-        **stream.values(random, int(ticks[0]), count),
-    }
-
-
-def _turn(prefix: str, random: np.random.Generator, count: int) -> Columns:
+def _turn(path: str, moments: Moments) -> Values:
     """Unit quaternions."""
-    turn = random.standard_normal((count, 4))
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-    return {f"{prefix}.{name}": turn[:, column] for column, name in enumerate("xyzw")}
+    turn = moments.rng.standard_normal((4, len(moments.seconds)))
+    turn /= np.linalg.norm(turn, axis=0)
+    return {f"{path}.{axis}": column for axis, column in zip("xyzw", turn, strict=True)}
 
 
-def _vector(prefix: str, random: np.random.Generator, count: int) -> Columns:
-    values = random.standard_normal((count, 3))
-    return {f"{prefix}.{name}": values[:, column] for column, name in enumerate("xyz")}
+def _vector(path: str, moments: Moments) -> Values:
+    return vector(path, moments.rng, len(moments.seconds))
 
 
-def _pose(types: Types, hz: float) -> _Stream:
-    msgtype = "geometry_msgs/msg/PoseStamped"
-    template = types.template(msgtype, {"header": {"frame_id": "map"}})
-
-    def values(random: np.random.Generator, _: int, count: int) -> Columns:
-        return {
-            **_vector("pose.position", random, count),
-            **_turn("pose.orientation", random, count),
-        }
-
-    return _Stream("/pose", msgtype, hz, template, values)
+def _imu(moments: Moments) -> Values:
+    columns = _turn("orientation", moments) | _vector("angular_velocity", moments)
+    return columns | _vector("linear_acceleration", moments)
 
 
-def _imu(types: Types, hz: float) -> _Stream:
-    msgtype = "sensor_msgs/msg/Imu"
-    spread = [0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.01]
-    covariances = ("orientation", "angular_velocity", "linear_acceleration")
-    template = types.template(
-        msgtype,
-        {
-            "header": {"frame_id": "imu_link"},
-            **{f"{name}_covariance": spread for name in covariances},
-        },
-    )
-
-    def values(random: np.random.Generator, _: int, count: int) -> Columns:
-        return {
-            **_turn("orientation", random, count),
-            **_vector("angular_velocity", random, count),
-            **_vector("linear_acceleration", random, count),
-        }
-
-    return _Stream(IMU_TOPIC, msgtype, hz, template, values)
+def _link(moments: Moments) -> Values:
+    path = "transforms.0.transform"
+    return _vector(f"{path}.translation", moments) | _turn(f"{path}.rotation", moments)
 
 
-def _tf(types: Types, hz: float) -> _Stream:
-    msgtype = "tf2_msgs/msg/TFMessage"
-    one = {"header": {"frame_id": "odom"}, "child_frame_id": "base_link"}
-    template = types.template(msgtype, {"transforms": [one]})
-
-    def values(random: np.random.Generator, _: int, count: int) -> Columns:
-        return {
-            **_vector("transforms.0.transform.translation", random, count),
-            **_turn("transforms.0.transform.rotation", random, count),
-        }
-
-    return _Stream("/tf", msgtype, hz, template, values)
+def _joints(moments: Moments) -> Values:
+    shape = (len(moments.seconds), 7)
+    names = ("position", "velocity", "effort")
+    return {name: moments.rng.standard_normal(shape) for name in names}
 
 
-def _joints(types: Types, hz: float) -> _Stream:
-    msgtype = "sensor_msgs/msg/JointState"
-    names = [f"arm_joint_{number}" for number in range(1, 8)]
-    zeros = [0.0] * len(names)
-    template = types.template(
-        msgtype, {"name": names, "position": zeros, "velocity": zeros, "effort": zeros}
-    )
+_COVARIANCES = ("orientation", "angular_velocity", "linear_acceleration")
+_SMALL: dict[str, tuple[str, Callable[[Types], Values], Callable[[Moments], Values]]] = {
+    "/pose": (
+        "geometry_msgs/msg/PoseStamped",
+        fixed(header__frame_id="map"),
+        lambda m: _vector("pose.position", m) | _turn("pose.orientation", m),
+    ),
+    IMU_TOPIC: (
+        "sensor_msgs/msg/Imu",
+        fixed(
+            header__frame_id="imu_link",
+            **{f"{name}_covariance": diagonal(1e-4, 1e-4, 4e-4) for name in _COVARIANCES},
+        ),
+        _imu,
+    ),
+    "/tf": ("tf/msg/tfMessage", transforms(("odom", "base_link")), _link),
+    "/joint_states": (
+        "sensor_msgs/msg/JointState",
+        fixed(name=[f"arm_joint_{number}" for number in range(1, 8)]),
+        _joints,
+    ),
+}
 
-    def values(random: np.random.Generator, _: int, count: int) -> Columns:
-        fields = ("position", "velocity", "effort")
-        return {name: random.standard_normal((count, len(names))) for name in fields}
 
-    return _Stream("/joint_states", msgtype, hz, template, values)
+def _topic(name: str, hz: float) -> Topic:
+    msgtype, values, columns = _SMALL[name]
+    return Topic(name, msgtype, "", hz, 0.0, _NO_DELAY, values, columns)
 
 
 def _camera(
-    types: Types,
-    topic: str,
-    size: tuple[int, int],
+    name: str,
+    shape: tuple[int, int],
     hz: float,
-    frames: _Frames,
-    *,
-    phase_ns: int = 0,
-) -> _Stream:
-    msgtype = "sensor_msgs/msg/Image"
-    width, height = size
-    template = types.template(
-        msgtype,
-        {
-            "header": {"frame_id": "camera"},
-            "height": height,
-            "width": width,
-            "encoding": "mono8",
-            "step": width,
-            "data": np.zeros(width * height, np.uint8),
-        },
-    )
+    frames: Callable[[np.random.Generator, int, tuple[int, int, int]], NDArray[np.uint8]],
+    phase: float = 0.0,
+) -> Topic:
+    height, width = shape
 
-    def values(random: np.random.Generator, first: int, count: int) -> Columns:
-        out = np.empty((count, height, width), np.uint8)
-        frames(random, first, out)
-        return {"data": out.reshape(count, -1)}
+    def columns(moments: Moments) -> Values:
+        first = round(moments.seconds[0] * hz)
+        drawn = frames(moments.rng, first, (len(moments.seconds), height, width))
+        return {"data": drawn.reshape(len(drawn), -1)}
 
-    return _Stream(topic, msgtype, hz, template, values, phase_ns)
+    about: dict[str, Any] = {"height": height, "width": width, "encoding": "mono8", "step": width}
+    values = fixed(header__frame_id="camera", **about)
+    return Topic(name, "sensor_msgs/msg/Image", "", hz, phase, _NO_DELAY, values, columns)
 
 
-def _half_noise(random: np.random.Generator, first: int, out: NDArray[np.uint8]) -> None:
+_scene = made.scene
+
+
+def _half_noise(
+    rng: np.random.Generator, first: int, shape: tuple[int, int, int]
+) -> NDArray[np.uint8]:
     """The upper half cannot be compressed at all, the lower half is a smooth surface."""
-    count, height, width = out.shape
+    count, height, width = shape
     upper = height // 2
-    out[:, :upper] = random.integers(0, 256, (count, upper, width), np.uint8)
+    frames = np.empty(shape, np.uint8)
+    frames[:, :upper] = rng.integers(0, 256, (count, upper, width), np.uint8)
     moment = (np.arange(first, first + count) % 256).astype(np.uint8)[:, None, None]
-    np.add(_surface(height - upper, width), moment, out=out[:, upper:])
+    np.add(made.smooth(height - upper, width), moment, out=frames[:, upper:])
+    return frames
 
 
-def _scene(random: np.random.Generator, first: int, out: NDArray[np.uint8]) -> None:
-    """Smooth surfaces under the noise of a sensor, one grey level in the mean square.
-
-    It is the noise that makes camera frames slow to compress and to unpack.
-    """
-    count, height, width = out.shape
-    size = height * width
-    noise = np.rint(random.standard_normal(size + (1 << 16))).astype(np.int8).view(np.uint8)
-    surface = _surface(height, width) // 2 + 30
-    shifts = cast("list[int]", random.integers(0, 1 << 16, count).tolist())
-    for row, shift in enumerate(shifts):
-        moved = np.roll(surface, first + row, axis=1)
-        np.add(moved, noise[shift : shift + size].reshape(height, width), out=out[row])
-
-
-def _surface(height: int, width: int) -> NDArray[np.uint8]:
-    slope = np.arange(height)[:, None] // 4 + np.arange(width) // 4
-    return (slope % 256).astype(np.uint8)
-
-
-def _scan(types: Types) -> _Stream:
-    msgtype = "sensor_msgs/msg/LaserScan"
+def _scan(moments: Moments) -> Values:
     angles = np.linspace(-np.pi, np.pi, SCAN_BEAMS)
-    template = types.template(
-        msgtype,
-        {
-            "header": {"frame_id": "laser"},
-            "angle_min": -np.pi,
-            "angle_max": np.pi,
-            "angle_increment": 2 * np.pi / SCAN_BEAMS,
-            "scan_time": 1 / SCAN_HZ,
-            "range_min": 0.1,
-            "range_max": 30.0,
-            "ranges": np.zeros(SCAN_BEAMS),
-            "intensities": np.zeros(SCAN_BEAMS),
-        },
-    )
-
-    def values(random: np.random.Generator, first: int, count: int) -> Columns:
-        moment = (first + np.arange(count))[:, None] / SCAN_HZ
-        noise = random.normal(0.0, 0.01, (count, SCAN_BEAMS))
-        ranges = 5 + 3 * np.sin(3 * angles + moment / 5) + noise
-        return {"ranges": ranges, "intensities": np.rint(4000 / ranges)}
-
-    return _Stream(SCAN_TOPIC, msgtype, SCAN_HZ, template, values, phase_ns=3_000_000)
+    noise = moments.rng.normal(0.0, 0.01, (len(moments.seconds), SCAN_BEAMS))
+    ranges = 5 + 3 * np.sin(3 * angles + moments.seconds[:, None] / 5) + noise
+    intensities = np.rint(4000 / ranges)
+    return {"ranges": ranges.astype(np.float32), "intensities": intensities.astype(np.float32)}

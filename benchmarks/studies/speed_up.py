@@ -10,15 +10,13 @@ from typing import Any
 from benchmarks.numbers import Spread
 from benchmarks.samples import Sample
 from benchmarks.studies.replays import MADE, LogSettings, Replay
-from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
+from benchmarks.studies.runs import Context, chosen
 from benchmarks.studies.search import (
-    TRIALS,
     Bounds,
     Search,
     Trial,
     bracket,
     is_over,
-    next_trial,
     take_turns,
     verdict,
 )
@@ -107,19 +105,6 @@ def speeds(
     return found
 
 
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the searches take that are not at their end."""
-    settings = settings or Settings.usual(quick=context.quick)
-    # Each trial takes half as long as the one before.
-    return sum(
-        2 * replay.seconds / settings.start + TRIALS * RUN_OVERHEAD_S
-        for replay in settings.replays(context.seed)
-        for searches in _rounds(context, settings, replay)
-        for search in searches
-        if next_trial(context, search) is not None
-    )
-
-
 def run(context: Context, settings: Settings | None = None) -> None:
     """Look for the speeds that are not known yet; the backends take turns.
 
@@ -149,9 +134,8 @@ def _search(
 ) -> Search:
     def trial(speed: float) -> Trial:
         case = {**replay.case, _SPEED: short(speed)}
-        seconds = replay.seconds / speed + RUN_OVERHEAD_S
         load = partial(replay.load, context)
-        return Trial(Sample(STUDY, case, name, repetition), load, seconds, speed)
+        return Trial(Sample(STUDY, case, name, repetition), load, speed)
 
     bounds = Bounds(settings.start, settings.lowest, settings.highest, settings.halvings)
     return Search(_SPEED, bounds, trial)

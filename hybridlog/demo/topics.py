@@ -77,6 +77,17 @@ class Types:
         is_list = int(inner) == 2 or base == "string"
         return [] if is_list else np.zeros(length, {"bool": "u1", "octet": "u1"}.get(base, base))
 
+    def filled(self, message: Any, columns: Values, count: int) -> Iterator[Any]:
+        """The message again and again, with the values of each row of columns by path."""
+        places = []
+        for path, column in columns.items():
+            is_time = path.endswith("stamp") and isinstance(column, np.ndarray)
+            places.append((*_find(message, path), self.times(column) if is_time else column))
+        for row in range(count):
+            for place, name, column in places:
+                setattr(place, name, column[row])
+            yield message
+
     def times(self, nanoseconds: NDArray[np.int64]) -> list[Any]:
         """Times since the epoch."""
         time = self.store.types["builtin_interfaces/msg/Time"]
@@ -188,15 +199,7 @@ class Topic(NamedTuple):
         message = speaker.types.make(self.type_in(speaker.types), values)
         if hasattr(message, "header"):
             columns |= {"header.stamp": ticks.stamp, "header.seq": ticks.number}
-        places = []
-        for path, column in columns.items():
-            is_time = path.endswith("stamp")
-            filled = speaker.types.times(column) if is_time else column
-            places.append((*_find(message, path), filled))
-        for row in range(len(ticks.seconds)):
-            for place, name, column in places:
-                setattr(place, name, column[row])
-            yield message
+        yield from speaker.types.filled(message, columns, len(ticks.seconds))
 
 
 TOPICS: list[Topic] = []

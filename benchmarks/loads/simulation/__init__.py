@@ -1,1 +1,0 @@
-"""The simulated robot that logs are made from."""
