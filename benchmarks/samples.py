@@ -85,18 +85,22 @@ class Journal:
         self.runs: dict[str, int] = {}
         """By the same keys: in which run each was taken, as a place in `headers`."""
         self._successes: Counter[str] = Counter()
+        self._pending: dict[str, Any] | None = None
         self._end = 0
         """Of the last whole line. What is behind it was cut off in the middle, and goes when
         the next one is written: not before, since another process may be writing it."""
         self._read()
 
     def begin(self, header: Mapping[str, Any]) -> None:
-        """Note that a run starts, with machine, versions, settings and seeds."""
-        self.headers.append(dict(header))
-        self._append({"kind": "run", **header})
+        """Note with the first sample that a run started: machine, versions, settings, seeds."""
+        self._pending = dict(header)
 
     def add(self, sample: Sample) -> None:
         """Note a sample; it is on the disk when this returns."""
+        header, self._pending = self._pending, None
+        if header is not None:
+            self.headers.append(header)
+            self._append({"kind": "run", **header})
         self._keep(sample)
         self._append(
             {
@@ -119,6 +123,13 @@ class Journal:
     def successes(self, sample: Sample) -> int:
         """How often a run has been done to its end."""
         return self._successes[sample.key]
+
+    def settings_of(self, sample: Sample) -> Mapping[str, Any]:
+        """Settings of the study of a sample, in the run in which it was taken."""
+        run = self.runs[sample.key]
+        settings = self.headers[run].get("settings") if run >= 0 else None
+        found = settings.get(sample.study) if isinstance(settings, dict) else None
+        return found if isinstance(found, dict) else {}
 
     def _keep(self, sample: Sample) -> None:
         if sample.status == "ok":

@@ -75,7 +75,7 @@ def warm_cache(places: Sequence[Path]) -> None:
 
 
 def _main() -> None:
-    from benchmarks.memory import own_peak
+    from benchmarks.usage import own_peak
 
     module, _, name = sys.argv[1].partition(":")
     result: Values = getattr(import_module(module), name)(**json.load(sys.stdin))

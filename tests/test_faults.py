@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.demo.config import RobotConfig
+from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.config import RobotConfig
+from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.data import DATA

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
-from benchmarks.backends.processes import working_below
-from benchmarks.memory import wait_for_mongods
+from benchmarks.usage import wait_for_mongods, working_below
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 

@@ -151,7 +151,7 @@ def _as_another_user() -> tuple[tuple[str, ...], int]:
         prefix = (
             *(setpriv, f"--reuid={account.pw_uid}", f"--regid={account.pw_gid}"),
             *("--clear-groups", f"--inh-caps={privilege}", f"--ambient-caps={privilege}"),
-            # Set by the keeper, but lost with the change of the user.
+            # Set by the server's parent, but lost with the change of the user.
             *("--pdeathsig", "INT", "--"),
         )
         if subprocess.run([*prefix, "true"], capture_output=True, check=False).returncode == 0:

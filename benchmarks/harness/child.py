@@ -18,8 +18,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from benchmarks.harness.usage import marked
 from benchmarks.side import LINGER_S, Values
+from benchmarks.usage import marked
 
 MARK = "HYBRIDLOG_BENCHMARK_RUN"
 """Environment variable of all processes of a run: its directory."""

@@ -21,8 +21,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
-from benchmarks.harness import usage
 from benchmarks.harness.counters import Counters
 from benchmarks.harness.publisher import READY
 from benchmarks.harness.subscribers import Subscribers

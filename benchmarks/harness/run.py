@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from benchmarks import usage
 from benchmarks.backends.base import Backend
-from benchmarks.harness import usage
 from benchmarks.harness.child import ChildError, run_child
 from benchmarks.harness.counters import Counters
 from benchmarks.loads.base import Load

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError
-from benchmarks.harness import usage
 from benchmarks.harness.publisher import TOKEN
 from hybridlog_storage.buffers import new_memory
 

@@ -14,12 +14,11 @@ from os import kill
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.backends.processes import working_below
-from benchmarks.harness.usage import machine, rss, with_children
 from benchmarks.live.master import Master
 from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
 from benchmarks.live.talker import Data, Load
 from benchmarks.side import SideError
+from benchmarks.usage import machine, rss, with_children, working_below
 
 _FLUSH_S = 1.0
 """The recorder's own interval between flushes, as it is by default."""

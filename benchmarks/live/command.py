@@ -14,8 +14,8 @@ from benchmarks.documents import replace_section
 from benchmarks.live.cases import CASES, Row
 from benchmarks.live.recorders import rosbag
 from benchmarks.machine import describe
-from benchmarks.progress import Steps, steps
 from benchmarks.side import SideError
+from benchmarks.studies.runs import step
 
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 
@@ -31,18 +31,17 @@ def main(arguments: list[str]) -> int:
     names = [name for name in CASES if not chosen.only or name in chosen.only]
     header: dict[str, Any] = {"benchmark": "live", "quick": chosen.quick, **describe(chosen.work)}
     rows: list[Row] = []
-    total = sum(CASES[name].seconds[chosen.quick] for name in names)
     if rosbag() is None:
         print("There is no rosbag here: hybridlog runs alone (python3-rosbag).", file=sys.stderr)
     failed = False
-    with ExitStack() as stack, steps(total) as progress:
+    with ExitStack() as stack:
         if chosen.work is None:
             work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hybridlog-live-")))
         else:
             work = chosen.work.resolve()
         for name in names:
             try:
-                _run(name, work / "live", rows, progress, quick=chosen.quick)
+                _run(name, work / "live", rows, quick=chosen.quick)
             except SideError as error:
                 print(f"{name} failed: {error}", file=sys.stderr)
                 failed = True
@@ -50,9 +49,9 @@ def main(arguments: list[str]) -> int:
     return int(failed or not all(row.holds for row in rows if row.recorder == "hybridlog"))
 
 
-def _run(name: str, work: Path, rows: list[Row], progress: Steps, *, quick: bool) -> None:
+def _run(name: str, work: Path, rows: list[Row], *, quick: bool) -> None:
     case = CASES[name]
-    with progress.step(f"{name}: {case.about}", case.seconds[quick]):
+    with step(f"{name}: {case.about}"):
         rows.extend(case.run(work, quick))
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from benchmarks.harness.usage import cpu_s, with_children
 from benchmarks.live.talker import Load
 from benchmarks.side import SideError
+from benchmarks.usage import cpu_s, with_children
 
 _STOP_S = 120.0
 _START_S = 2.5

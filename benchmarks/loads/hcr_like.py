@@ -10,22 +10,20 @@ is made: `truth.json` beside it.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.loads import pr2, viewpoint
-from benchmarks.loads.arm import GRID as ARM_GRID
-from benchmarks.loads.arm import Drag, plan_drags
-from benchmarks.loads.jpegs import Jpegs
+from benchmarks.loads import made, user
+from benchmarks.loads import mit_like as pr2
+from benchmarks.loads.made import OldTypes, Values, payloads, scene, yaw
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.timing import received, steady
-from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, RobotError, Truth
-from benchmarks.loads.viewpoint import GRASPS, TICK_NS, ViewpointPlan
-from hybridlog.demo.wire import GRIPPER_COMMAND
-from hybridlog_storage.errors import UsageError
+from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, NAME, RobotError, Truth
+from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
+from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +32,7 @@ if TYPE_CHECKING:
 
     from benchmarks.loads.base import Load
 
-    Times = NDArray[np.int64]
+Times = np.ndarray[Any, np.dtype[np.int64]]
 
 RIGHT_GRIPPER = "/r_gripper_controller/command"
 LEFT_GRIPPER = "/l_gripper_controller/command"
@@ -49,6 +47,7 @@ KINECT = "/head_mount_kinect/rgb/image_color/compressed"
 JOINT_STATES = "/joint_states"
 TF = "/tf"
 
+_GRIPPER = "pr2_controllers_msgs/msg/Pr2GripperCommand"
 START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
 GAP_S = 1200
 """Seconds between two sessions: another user comes."""
@@ -62,7 +61,16 @@ _REST = {RIGHT_ARM: 20, LEFT_ARM: 400}
 """Mean ticks between two drags of an arm."""
 _MARKERS = {RIGHT_ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
 _POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
-_CAMERA_HZ = 30.0
+_REGULAR = {
+    DIAGNOSTICS: (1.0, 0.4, 0.004, 0.001),
+    WEBCAM: (30.0, 0.012, 0.03, 0.002),
+    KINECT: (30.0, 0.021, 0.04, 0.003),
+    JOINT_STATES: (100.0, 0.003, 0.0006, 0.0002),
+    TF: (50.0, 0.005, 0.001, 0.0003),
+    "pose": (30.0, 0.009, 0.001, 0.0003),
+}
+"""Rate, phase, and least and mean delay of what the robot says by itself."""
+_PICTURES = 16
 _ERRORS = (
     "EtherCAT dropped a packet: motors halted",
     "r_wrist_roll_joint: motor over-temperature, motors halted",
@@ -77,8 +85,8 @@ _REMARKS = (
 )
 
 _TYPES = {
-    RIGHT_GRIPPER: (GRIPPER_COMMAND, "/pr2_marker_control"),
-    LEFT_GRIPPER: (GRIPPER_COMMAND, "/pr2_marker_control"),
+    RIGHT_GRIPPER: (_GRIPPER, "/pr2_marker_control"),
+    LEFT_GRIPPER: (_GRIPPER, "/pr2_marker_control"),
     VIEWPOINT: ("geometry_msgs/msg/Pose", "/rviz"),
     RIGHT_ARM: ("geometry_msgs/msg/PoseStamped", "/pr2_marker_control"),
     LEFT_ARM: ("geometry_msgs/msg/PoseStamped", "/pr2_marker_control"),
@@ -88,7 +96,7 @@ _TYPES = {
     WEBCAM: ("sensor_msgs/msg/CompressedImage", "/webcam_node"),
     KINECT: ("sensor_msgs/msg/CompressedImage", "/head_mount_kinect"),
     JOINT_STATES: ("sensor_msgs/msg/JointState", "/realtime_loop"),
-    TF: (pr2.TF_TYPE, "/robot_state_publisher"),
+    TF: (made.TF_TYPE, "/robot_state_publisher"),
 }
 """Type and node of each topic."""
 _CAMERAS = (WEBCAM, KINECT)
@@ -126,18 +134,18 @@ def hcr_like(
             f"no load of {sessions} sessions of {minutes:g} minutes from seed {seed}; choose at "
             "least 1 session of at least 1 minute, and a seed that is not negative"
         )
-    types = pr2.Pr2Types()
+    types = OldTypes()
     left_out = (() if cameras else _CAMERAS) + (() if state else _STATE)
     topics = [topic for topic in _TYPES if topic not in left_out]
     channels = [types.channel(topic, *_TYPES[topic]) for topic in topics]
     ticks = round(minutes * 60e9 / TICK_NS)
-    writer = _Writer(types, topics, Jpegs(seed) if cameras else None)
+    pictures = _jpegs(seed) if cameras else []
     plans = []
     with Spool(directory) as spool:
         for number in range(sessions):
             start = START_NS + number * round((minutes * 60 + GAP_S) * 1e9)
             plan = _plan(seed, number, start, ticks, topics)
-            writer.write(spool, plan)
+            _write(spool, types, topics, plan, pictures)
             plans.append(plan)
         load = spool.finish(name, seed, channels)
     _truth(plans).save(directory)
@@ -170,7 +178,7 @@ class _Plan:
 
     def rng(self, use: str) -> np.random.Generator:
         """The random numbers of one part of the session."""
-        return pr2.generator(self.seed, self.number, use)
+        return made.generator(self.seed, self.number, use)
 
     @property
     def seconds(self) -> float:
@@ -184,7 +192,7 @@ class _Plan:
 
 def _plan(seed: int, number: int, start: int, ticks: int, topics: Sequence[str]) -> _Plan:
     """Plan a session; the order of the ways to grasp goes on from session to session."""
-    rng = pr2.generator(seed, number, "user")
+    rng = made.generator(seed, number, "user")
     first = number % len(GRASPS)
     plan = _Plan(
         seed,
@@ -192,7 +200,7 @@ def _plan(seed: int, number: int, start: int, ticks: int, topics: Sequence[str])
         start,
         ViewpointPlan(ticks, rng, GRASPS[first:] + GRASPS[:first]),
         {arm: plan_drags(ticks, rng, rest) for arm, rest in _REST.items()},
-        np.resize([0.0, viewpoint.OPEN], int(rng.integers(2, 3 + ticks // 1000))),
+        np.resize([0.0, user.OPEN], int(rng.integers(2, 3 + ticks // 1000))),
     )
     times = plan.times
     jitter = rng.uniform(0, 3e6, ticks).astype(np.int64)
@@ -221,21 +229,18 @@ def _plan_robot(plan: _Plan, topics: Sequence[str]) -> None:
     times, seconds = plan.times, plan.seconds
     rng = plan.rng("robot")
 
-    def regular(hz: float, phase: float, least: float, mean: float) -> Times:
-        stamps = plan.start + steady(rng, hz, seconds - 0.2, phase=phase)
-        return received(rng, stamps, least, mean)
+    def regular(topic: str) -> Times:
+        hz, phase, least, mean = _REGULAR[topic]
+        stamps = plan.start + made.steady(rng, hz, seconds - 0.2, phase=phase)
+        return made.received(rng, stamps, least, mean)
 
-    times[DIAGNOSTICS] = regular(1.0, 0.4, 0.004, 0.001)
     remarks = np.sort(rng.choice(int(seconds * 1000), int(seconds / 4), replace=False))
     times[ROSOUT] = plan.start + remarks * 1_000_000 + 500_000
-    if WEBCAM in topics:
-        times[WEBCAM] = regular(_CAMERA_HZ, 0.012, 0.03, 0.002)
-        times[KINECT] = regular(_CAMERA_HZ, 0.021, 0.04, 0.003)
+    for topic in (DIAGNOSTICS, WEBCAM, KINECT, JOINT_STATES):
+        if topic in topics:
+            times[topic] = regular(topic)
     if TF in topics:
-        times[JOINT_STATES] = regular(pr2.JOINTS_HZ, 0.003, 0.0006, 0.0002)
-        links = regular(pr2.STATE_TF_HZ, 0.005, 0.001, 0.0003)
-        pose = regular(pr2.POSE_TF_HZ, 0.009, 0.001, 0.0003)
-        times[TF] = np.concatenate(pr2.of_two_sources(links, pose))
+        times[TF] = np.concatenate(made.of_two_sources(regular(TF), regular("pose")))
 
 
 def _plan_errors(plan: _Plan) -> None:
@@ -282,7 +287,7 @@ def _truth(plans: Sequence[_Plan]) -> Truth:
         for begin, end in windows:
             errors.append(RobotError(end, _between(times, begin, end)))
         before_errors += sum(_between(times, *window) for window in _joined(windows))
-    sums = np.concatenate(behind).sum(axis=0) / viewpoint.GRID
+    sums = np.concatenate(behind).sum(axis=0) / user.GRID
     return Truth(
         sessions=tuple((p.start, p.start + round(p.seconds * 1e9)) for p in plans),
         messages=counts,
@@ -321,195 +326,149 @@ def _joined(windows: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return found
 
 
-class _Writer:
-    """Makes the messages that a plan wants.
+def _write(
+    spool: Spool,
+    types: OldTypes,
+    topics: Sequence[str],
+    plan: _Plan,
+    pictures: Sequence[NDArray[np.uint8]],
+) -> None:
+    """Add the messages of a session."""
 
-    Args:
-        types: Message types.
-        topics: In the order of the load's channels.
-        jpegs: Images of the cameras; None without cameras.
-    """
+    def add(topic: str, times: Times, values: Values, columns: Values) -> None:
+        if len(times):
+            rows = payloads(types, _TYPES[topic][0], values, columns)
+            spool.messages(np.full(len(times), topics.index(topic)), rows, times)
 
-    def __init__(self, types: pr2.Pr2Types, topics: Sequence[str], jpegs: Jpegs | None) -> None:
-        self._types = types
-        self._number = {topic: number for number, topic in enumerate(topics)}
-        self._jpegs = jpegs
-        self._gripper = types.template(GRIPPER_COMMAND, {})
-        self._pose = types.template("geometry_msgs/msg/Pose", {})
-        self._arm = types.template(
-            "geometry_msgs/msg/PoseStamped", {"header": {"frame_id": "base_link"}}
-        )
-        self._feedback = {
-            arm: types.template(
-                _TYPES[FEEDBACK][0],
-                {
-                    "header": {"frame_id": "base_link"},
-                    "client_id": "/rviz/PR2 control markers",
-                    "marker_name": marker,
-                    "control_name": "move",
-                },
-            )
-            for arm, marker in _MARKERS.items()
-        }
-        self._diagnostics = types.template(_TYPES[DIAGNOSTICS][0], _diagnostics())
-        self._joints = pr2.joint_template(types)
-        self._links = pr2.links_template(types)
-        self._base = pr2.pose_template(types)
-        self._steps: tuple[Callable[[Spool, _Plan], None], ...] = (
-            self._write_viewpoint,
-            self._write_grippers,
-            self._write_arms,
-            self._write_diagnostics,
-            self._write_rosout,
-            *((self._write_cameras,) if jpegs is not None else ()),
-            *((self._write_state,) if TF in topics else ()),
-        )
-
-    def write(self, spool: Spool, plan: _Plan) -> None:
-        """Add the messages of a session."""
-        for step in self._steps:
-            step(spool, plan)
-
-    def _write_viewpoint(self, spool: Spool, plan: _Plan) -> None:
-        position = plan.viewpoint.points() / viewpoint.GRID
-        # It looks at the robot; so it turns when it moves, and only then.
-        heading = np.arctan2(-position[:, 1], -position[:, 0])
-        columns = {
-            **_axes("position", position),
-            "orientation.z": np.sin(heading / 2),
-            "orientation.w": np.cos(heading / 2),
-        }
-        spool.template(self._number[VIEWPOINT], self._pose, columns, plan.times[VIEWPOINT])
-
-    def _write_grippers(self, spool: Spool, plan: _Plan) -> None:
-        commands = plan.viewpoint.commands
-        right = {
-            "position": np.array([command.position for command in commands]),
-            "max_effort": np.array([command.max_effort for command in commands]),
-        }
-        left = {"position": plan.left, "max_effort": np.full(len(plan.left), 100.0)}
-        for topic, columns in ((RIGHT_GRIPPER, right), (LEFT_GRIPPER, left)):
-            spool.template(self._number[topic], self._gripper, columns, plan.times[topic])
-
-    def _write_arms(self, spool: Spool, plan: _Plan) -> None:
-        first = 0
-        for arm, drags in plan.drags.items():
-            times = plan.times[arm]
-            points = [drag.points for drag in drags]
-            where = np.concatenate([np.empty((0, 3), np.int64), *points]) / ARM_GRID
-            columns = {
-                **pr2.stamped(times - 2_000_000),
-                **_axes("pose.position", where),
-                **_turned("pose.orientation", where),
-            }
-            spool.template(self._number[arm], self._arm, columns, times)
-            # The button goes down on the first point and up on the last one.
-            held = [np.pad(p, ((1, 1), (0, 0)), mode="edge") for p in points]
-            where = np.concatenate([np.empty((0, 3), np.int64), *held]) / ARM_GRID
-            events = [np.pad(np.full(len(p), _POSE_UPDATE), 1) for p in points]
-            for event in events:
-                event[0], event[-1] = _MOUSE_DOWN, _MOUSE_UP
-            times = plan.times[FEEDBACK][first : first + len(where)]
-            first += len(where)
-            columns = {
-                **pr2.stamped(times),
-                "event_type": np.concatenate([np.empty(0, np.int64), *events]),
-                **_axes("pose.position", where),
-                **_turned("pose.orientation", where),
-            }
-            spool.template(self._number[FEEDBACK], self._feedback[arm], columns, times)
-
-    def _write_diagnostics(self, spool: Spool, plan: _Plan) -> None:
-        times = plan.times[DIAGNOSTICS]
-        warns = plan.rng("warnings").random(len(times)) < 0.05
-        columns = {**pr2.stamped(times - 4_000_000), "status.3.level": warns.astype(np.uint8)}
-        spool.template(self._number[DIAGNOSTICS], self._diagnostics, columns, times)
-
-    def _write_rosout(self, spool: Spool, plan: _Plan) -> None:
-        rng = plan.rng("texts")
-        chosen = rng.integers(0, len(_REMARKS), len(plan.times[ROSOUT]))
-        said = [
-            (time, *_REMARKS[choice], "/pr2_marker_control")
-            for time, choice in zip(plan.times[ROSOUT].tolist(), chosen.tolist(), strict=True)
-        ]
-        said += [
-            (time, ERROR_LEVEL, _ERRORS[int(rng.integers(len(_ERRORS)))], "/realtime_loop")
-            for time in plan.errors
-        ]
-        said.sort()
-        payloads = [
-            self._types.encode(
-                _TYPES[ROSOUT][0],
-                {
-                    "header": {"seq": number, "stamp": time - 500_000},
-                    "level": level,
-                    "name": node,
-                    "msg": text,
-                    "topics": ["/rosout", *_MARKERS],
-                },
-            )
-            for number, (time, level, text, node) in enumerate(said)
-        ]
-        times = np.array([time for time, *_ in said], np.int64)
-        spool.messages(np.full(len(said), self._number[ROSOUT], np.int32), payloads, times)
-
-    def _write_cameras(self, spool: Spool, plan: _Plan) -> None:
-        assert self._jpegs is not None
-        for topic, frame in ((WEBCAM, "webcam"), (KINECT, "head_mount_kinect_rgb_optical_frame")):
+    at = plan.viewpoint.points() / user.GRID
+    # It looks at the robot; so it turns when it moves, and only then.
+    turned = yaw("orientation", np.arctan2(-at[:, 1], -at[:, 0]))
+    add(VIEWPOINT, plan.times[VIEWPOINT], {}, made.xyz("position", *at.T) | turned)
+    commands = plan.viewpoint.commands
+    right = {name: [getattr(c, name) for c in commands] for name in ("position", "max_effort")}
+    add(RIGHT_GRIPPER, plan.times[RIGHT_GRIPPER], {}, right)
+    left = {"position": plan.left, "max_effort": np.full(len(plan.left), 100.0)}
+    add(LEFT_GRIPPER, plan.times[LEFT_GRIPPER], {}, left)
+    _write_arms(add, plan)
+    times = plan.times[DIAGNOSTICS]
+    warns = plan.rng("warnings").random(len(times)) < 0.05
+    columns = _stamped(times, 4_000_000) | {"status.3.level": warns.astype(np.uint8)}
+    add(DIAGNOSTICS, times, {"status": _diagnostics(types)}, columns)
+    _write_rosout(add, plan)
+    for topic, frame in ((WEBCAM, "webcam"), (KINECT, "head_mount_kinect_rgb_optical_frame")):
+        if topic in topics:
             times = plan.times[topic]
-            for picture, rows in self._jpegs.shown(len(times)):
-                template = self._types.template(
-                    _TYPES[topic][0],
-                    {"header": {"frame_id": frame}, "format": "jpeg", "data": picture},
-                )
-                columns = {"header.stamp": times[rows] - 30_000_000, "header.seq": rows}
-                spool.template(self._number[topic], template, columns, times[rows])
-
-    def _write_state(self, spool: Spool, plan: _Plan) -> None:
-        rng = plan.rng("state")
-        times = plan.times[JOINT_STATES]
-        seconds = (times - plan.start) / 1e9
-        still = np.zeros(len(times))
-        columns = {
-            **pr2.stamped(times - 600_000),
-            **pr2.joint_columns(rng, seconds, still, pr2.tilt(seconds)),
-        }
-        spool.template(self._number[JOINT_STATES], self._joints, columns, times)
-        for is_pose in (False, True):
-            # The two publishers tell themselves apart by odd and even nanoseconds.
-            times = plan.times[TF][plan.times[TF] % 2 == is_pose]
-            still = np.zeros(len(times))
-            if is_pose:
-                columns = pr2.pose_columns(times - 1_000_000, still, still, still)
-            else:
-                columns = pr2.links_columns(rng, times - 1_000_000, [still])
-            template = self._base if is_pose else self._links
-            spool.template(self._number[TF], template, columns, times)
+            # A short drive, shown forwards and backwards for ever.
+            turn = np.arange(len(times)) % (2 * _PICTURES - 2)
+            shown = np.minimum(turn, 2 * _PICTURES - 2 - turn)
+            columns = _stamped(times, 30_000_000) | {"data": [pictures[n] for n in shown]}
+            add(topic, times, {"header.frame_id": frame, "format": "jpeg"}, columns)
+    if TF in topics:
+        # The two publishers of /tf tell themselves apart by odd and even nanoseconds.
+        tf = plan.times[TF]
+        of = ((pr2.JOINT_TOPIC, plan.times[JOINT_STATES]), (pr2.LINKS_TOPIC, tf[tf % 2 == 0]))
+        for row, log_times in (*of, (pr2.BASE_TOPIC, tf[tf % 2 == 1])):
+            since = log_times - plan.start
+            both = (since - 600_000, since)
+            made.write(
+                spool, topics.index(row.name), types, row, (plan.start, *both), seed=plan.seed
+            )
 
 
-def _axes(prefix: str, values: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Columns of float64[n, 3]."""
-    return {f"{prefix}.{axis}": values[:, number] for number, axis in enumerate("xyz")}
+_Add = Callable[[str, Times, Values, Values], None]
 
 
-def _turned(prefix: str, where: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+def _write_arms(add: _Add, plan: _Plan) -> None:
+    first = 0
+    nowhere = np.empty((0, 3), np.int64)
+    for arm, drags in plan.drags.items():
+        times, points = plan.times[arm], [drag.points for drag in drags]
+        where = np.concatenate([nowhere, *points]) / ARM_GRID
+        columns = _stamped(times, 2_000_000) | _posed("pose.", where)
+        add(arm, times, {"header.frame_id": "base_link"}, columns)
+        # The button goes down on the first point and up on the last one.
+        held = [np.pad(p, ((1, 1), (0, 0)), mode="edge") for p in points]
+        where = np.concatenate([nowhere, *held]) / ARM_GRID
+        events = [np.pad(np.full(len(p), _POSE_UPDATE), 1) for p in points]
+        for event in events:
+            event[0], event[-1] = _MOUSE_DOWN, _MOUSE_UP
+        times = plan.times[FEEDBACK][first : first + len(where)]
+        first += len(where)
+        columns = _stamped(times, 0) | _posed("pose.", where)
+        columns["event_type"] = np.concatenate([nowhere[:, 0], *events])
+        values = {"header.frame_id": "base_link", "client_id": "/rviz/PR2 control markers"}
+        values |= {"marker_name": _MARKERS[arm], "control_name": "move"}
+        add(FEEDBACK, times, values, columns)
+
+
+def _write_rosout(add: _Add, plan: _Plan) -> None:
+    rng = plan.rng("texts")
+    chosen = rng.integers(0, len(_REMARKS), len(plan.times[ROSOUT]))
+    said: list[tuple[int, int, str, str]] = [
+        (time, *_REMARKS[choice], "/pr2_marker_control")
+        for time, choice in zip(plan.times[ROSOUT].tolist(), chosen.tolist(), strict=True)
+    ]
+    said += [
+        (time, ERROR_LEVEL, _ERRORS[int(rng.integers(len(_ERRORS)))], "/realtime_loop")
+        for time in plan.errors
+    ]
+    said.sort()
+    times = np.array([time for time, *_ in said], np.int64)
+    names = ("level", "msg", "name")
+    columns = {name: [line[n] for line in said] for n, name in enumerate(names, 1)}
+    add(ROSOUT, times, {"topics": ["/rosout", *_MARKERS]}, _stamped(times, 500_000) | columns)
+
+
+def _stamped(times: Times, before_ns: int) -> Values:
+    return {"header.stamp": times - before_ns, "header.seq": np.arange(len(times))}
+
+
+def _posed(path: str, where: NDArray[np.float64]) -> Values:
     """The hand points away from the shoulder."""
     heading = np.arctan2(where[:, 1] + 0.2, where[:, 0])
-    return {f"{prefix}.z": np.sin(heading / 2), f"{prefix}.w": np.cos(heading / 2)}
+    return made.xyz(f"{path}position", *where.T) | yaw(f"{path}orientation", heading)
 
 
-def _diagnostics() -> dict[str, object]:
-    parts = ("Cameras", "Computers", "Controllers", "EtherCAT Master", "Joints", "Lasers", "Power")
+def _diagnostics(types: OldTypes) -> list[Any]:
     keys = ("state", "temperature", "last update", "errors since start")
-    return {
-        "status": [
-            {
-                "name": f"/{part}/{number}",
-                "message": "OK",
-                "hardware_id": "pr2",
-                "values": [{"key": key, "value": "nominal"} for key in keys],
-            }
-            for part in parts
-            for number in range(3)
-        ]
-    }
+    kind = "diagnostic_msgs/msg/KeyValue"
+    pairs = [types.make(kind, {"key": key, "value": "nominal"}) for key in keys]
+    parts = ("Cameras", "Computers", "Controllers", "EtherCAT Master", "Joints", "Lasers", "Power")
+    about = {"message": "OK", "hardware_id": "pr2", "values": pairs}
+    names = [f"/{part}/{number}" for part in parts for number in range(3)]
+    kind = "diagnostic_msgs/msg/DiagnosticStatus"
+    return [types.make(kind, {"name": name, **about}) for name in names]
+
+
+def _jpegs(seed: int) -> list[NDArray[np.uint8]]:
+    """Pictures as JPEG files, of the quality that the image transport of ROS sets.
+
+    Raises:
+        MissingDependencyError: Pillow is not installed.
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingDependencyError(
+            "JPEG images need Pillow; install it with: pip install 'hybridlog[images]'"
+        ) from error
+    found = []
+    for frame in scene(np.random.default_rng([seed, 0x19E6]), 0, (_PICTURES, 480, 640)):
+        stream = io.BytesIO()
+        Image.fromarray(frame).convert("RGB").save(stream, "JPEG", quality=80)
+        found.append(np.frombuffer(stream.getvalue(), np.uint8))
+    return found
+
+
+def cut(load: Load, seconds: float) -> Load:
+    """Keep what is due in the first seconds, and save that in the place of the whole.
+
+    A truth beside it goes: it is one of the whole load. At least the first message stays.
+    """
+    directory = load.payloads.parent
+    (directory / NAME).unlink(missing_ok=True)
+    rows = slice(max(1, int(np.searchsorted(load.due, round(seconds * 1e9)))))
+    names = ("channel", "due", "log_time", "offset", "length")
+    shorter = replace(load, **{name: getattr(load, name)[rows] for name in names})
+    shorter.save(directory)
+    return shorter

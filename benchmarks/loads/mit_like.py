@@ -1,45 +1,39 @@
-"""A load like the recordings of a PR2 that drives through a building: many bytes.
+"""The topics of a PR2 that drives through a building, and a load of them: many bytes.
 
 Topics, types and rates are those of the published recordings and of the robot's own
-launch files; `docs/benchmarks-loads.md` has the sources. What the sensors see is the
-building of hybridlog's own simulator, with the noise and the jitter of real drivers.
+launch files; `docs/benchmarks-loads.md` has the sources.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.loads import pr2
-from benchmarks.loads.eyes import (
-    BASELINE,
-    IMAGE_SIZE,
-    BaseLaser,
-    DepthCamera,
-    StereoCamera,
-    TiltLaser,
+from benchmarks.loads import made
+from benchmarks.loads.made import (
+    TF_TYPE,
+    Moments,
+    OldTypes,
+    Topic,
+    Values,
+    diagonal,
+    fixed,
+    room,
+    scene,
+    transforms,
+    xyz,
+    yaw,
 )
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.timing import received, steady
-from hybridlog.demo.robot import MAX_DURATION_S, Robot
-from hybridlog.demo.sensors import Inertial, Odometer
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from benchmarks.loads.base import Load
-    from hybridlog.demo.camera import Camera
-    from hybridlog.demo.wire import Template
-
-    Floats = NDArray[np.float64]
-    Times = NDArray[np.int64]
-    Columns = dict[str, NDArray[Any]]
+    from hybridlog.demo.topics import Types
 
 BASE_SCAN = "/base_scan"
 TILT_SCAN = "/tilt_scan"
@@ -53,43 +47,219 @@ KINECT_IMAGE = "/camera/rgb/image_raw"
 KINECT_DEPTH = "/camera/depth/image_raw"
 
 START_NS = 1_327_493_665_000_000_000  # 2012-01-25 12:14:25 UTC
-BASE_SCAN_HZ, BASE_BEAMS = 40.0, 1040
-TILT_SCAN_HZ, TILT_BEAMS = 20.0, 380
-IMU_HZ = 100.0
-ODOMETRY_HZ = 100.0
-STEREO_HZ = 25.0
-KINECT_HZ = 15.0
+MAX_SECONDS = 7 * 86_400.0
+IMAGE_SIZE = (640, 480)
+"""Width and height of all images, pixels."""
 
-_SPAN_S = 0.5
-"""Seconds of log time that are made at once."""
+_ARM = ("upper_arm_roll", "shoulder_pan", "shoulder_lift", "forearm_roll", "elbow_flex")
+_HAND = ("", "_l_finger", "_r_finger", "_r_finger_tip", "_l_finger_tip")
+JOINTS = (
+    *(
+        f"{caster}_caster_{part}_joint"
+        for caster in ("fl", "fr", "bl", "br")
+        for part in ("rotation", "l_wheel", "r_wheel")
+    ),
+    *("torso_lift_joint", "torso_lift_motor_screw_joint", "head_pan_joint", "head_tilt_joint"),
+    "laser_tilt_mount_joint",
+    *(
+        f"{side}_{joint}_joint"
+        for side in ("r", "l")
+        for joint in (
+            *(*_ARM, "wrist_flex", "wrist_roll"),
+            *(f"gripper{part}" for part in (*_HAND, "_motor_screw", "_motor_slider")),
+        )
+    ),
+)
+"""Joints of the robot's description, in the order of `/joint_states`."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Stream:
-    """One publisher.
+def _where(moments: Moments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x and y in metres, and heading: an eight through the building."""
+    at = moments.seconds / 10
+    return 5 * np.sin(at), 3 * np.sin(2 * at), np.arctan2(6 * np.cos(2 * at), 5 * np.cos(at))
 
-    Attributes:
-        topic: Name.
-        msgtype: As rosbags spells it.
-        node: Who publishes it.
-        hz: Rate.
-        template: A message of it.
-        values: Makes the columns of some messages, from their seconds since the start,
-            their header stamps (ns since the epoch) and a generator.
-        phase: Seconds after the start of the first message.
-        delay: Seconds from header stamp to log time: the least, and the mean on top.
-        clock: Streams with the same clock have the same stamps.
-    """
 
-    topic: str
-    msgtype: str
-    node: str
-    hz: float
-    template: Template
-    values: Callable[[Floats, Times, np.random.Generator], Columns]
-    phase: float
-    delay: tuple[float, float]
-    clock: str = ""
+def _imu(moments: Moments) -> Values:
+    rng, count = moments.rng, len(moments.seconds)
+    heading = _where(moments)[2]
+    columns = xyz("orientation", *(0.002 * rng.standard_normal((2, count))))
+    columns |= yaw("orientation", heading) | made.vector("angular_velocity", rng, count, 0.01)
+    pushed = 0.1 * rng.standard_normal((3, count))
+    pushed[2] += 9.80665
+    return columns | xyz("linear_acceleration", *pushed)
+
+
+def _odometry(moments: Moments) -> Values:
+    x, y, heading = _where(moments)
+    columns = xyz("pose.pose.position", x, y) | yaw("pose.pose.orientation", heading)
+    columns["twist.twist.linear.x"] = 0.5 + 0.01 * moments.rng.standard_normal(len(x))
+    return columns | {"twist.twist.angular.z": 0.1 * moments.rng.standard_normal(len(x))}
+
+
+def _pose(moments: Moments) -> Values:
+    x, y, heading = _where(moments)
+    noise = 0.005 * moments.rng.standard_normal((2, len(x)))
+    columns = xyz("pose.pose.position", x + noise[0], y + noise[1])
+    return columns | yaw("pose.pose.orientation", heading)
+
+
+def _joints(moments: Moments) -> Values:
+    shape = (len(moments.seconds), len(JOINTS))
+    rest = np.random.default_rng(len(JOINTS)).uniform(-1.5, 1.5, len(JOINTS))
+    position = rest + 0.2 * np.sin(moments.seconds[:, None] + rest)
+    position += 2e-4 * moments.rng.standard_normal(shape)
+    velocity = 0.2 * np.cos(moments.seconds[:, None] + rest)
+    velocity += 0.02 * moments.rng.standard_normal(shape)
+    effort = rest * 3 + 0.15 * moments.rng.standard_normal(shape)
+    return {"position": position, "velocity": velocity, "effort": effort}
+
+
+def _links(moments: Moments) -> Values:
+    columns: Values = {}
+    angles = np.sin(moments.seconds + np.arange(len(JOINTS))[:, None])
+    angles += 2e-4 * moments.rng.standard_normal(angles.shape)
+    for number, angle in enumerate(angles):
+        columns |= yaw(f"transforms.{number}.transform.rotation", angle)
+    return columns
+
+
+def _base(moments: Moments) -> Values:
+    x, y, heading = _where(moments)
+    columns = xyz("transforms.0.transform.translation", x, y)
+    return columns | yaw("transforms.0.transform.rotation", heading)
+
+
+def _frames(moments: Moments) -> Values:
+    first = int(moments.seconds[0] * 25)
+    frames = scene(moments.rng, first, (len(moments.seconds), *IMAGE_SIZE[::-1]))
+    return {"data": frames.reshape(len(frames), -1)}
+
+
+def _depths(moments: Moments) -> Values:
+    """Millimetres to a floor below, and a wall behind it."""
+    width, height = IMAGE_SIZE
+    rows = np.maximum(np.arange(height) - height / 2, 1)[:, None]
+    metres = np.minimum(0.9 * 440 / rows, 3 + np.sin(np.arange(width) / 90))
+    frames = []
+    for _ in moments.seconds:
+        noise = 0.0012 * metres**2 * moments.rng.standard_normal((height, width), np.float32)
+        depth = metres + noise
+        depth[(depth < 0.5) | (depth > 9)] = 0
+        frames.append(np.rint(depth * 1000).astype("<u2").view(np.uint8).ravel())
+    return {"data": frames}
+
+
+def _scan(frame: str, angle: float, beams: int, hz: float) -> Callable[[Types], Values]:
+    step = 2 * angle / (beams - 1)
+    turn = {"angle_min": -angle, "angle_max": angle, "angle_increment": step, "scan_time": 1 / hz}
+    ranges = {"time_increment": 0.025 / 1440, "range_min": 0.023, "range_max": 30.0}
+    return lambda _types: {"header.frame_id": frame, **turn, **ranges}
+
+
+def _image(frame: str, encoding: str, depth: int) -> Callable[[Types], Values]:
+    width, height = IMAGE_SIZE
+    about = {"header.frame_id": frame, "height": height, "width": width}
+    return lambda _types: {**about, "encoding": encoding, "step": width * depth}
+
+
+def _camera_info(_types: Types) -> Values:
+    width, height = IMAGE_SIZE
+    f, cx, cy = 440.0, (width - 1) / 2, (height - 1) / 2
+    values: Values = {"header.frame_id": "wide_stereo_optical_frame", "height": height}
+    values |= {"width": width, "distortion_model": "plumb_bob", "D": np.zeros(5)}
+    values |= {"K": np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]), "R": np.eye(3).ravel()}
+    return values | {"P": np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0])}
+
+
+def _lit(moments: Moments) -> Values:
+    ranges = room(moments, 380)
+    return {"ranges": ranges, "intensities": np.rint(4000 / ranges).astype(np.float32)}
+
+
+_POSITION = "geometry_msgs/msg/PoseWithCovarianceStamped"
+JOINT_TOPIC = Topic(
+    *(JOINT_STATES, "sensor_msgs/msg/JointState", "/realtime_loop", 100.0, 0.003),
+    *((0.0006, 0.0003), fixed(name=list(JOINTS)), _joints),
+)
+LINKS_TOPIC = Topic(
+    *(TF, TF_TYPE, "/robot_state_publisher", 50.0, 0.005, (0.0009, 0.0003)),
+    transforms(*(("torso_lift_link", name.replace("_joint", "_link")) for name in JOINTS)),
+    _links,
+)
+BASE_TOPIC = Topic(
+    *(TF, TF_TYPE, "/robot_pose_ekf", 30.0, 0.017, (0.0015, 0.0005)),
+    *(transforms(("odom_combined", "base_footprint")), _base, "ekf"),
+)
+_SPREAD = diagonal(4e-6, 4e-6, 1e6, 1e6, 1e6, 2.89e-4)
+_MODERN = (
+    Topic(
+        *(BASE_SCAN, "sensor_msgs/msg/LaserScan", "/base_hokuyo_node", 40.0, 0.004),
+        *((0.019, 0.0008), _scan("base_laser_link", 2.2689, 1040, 40.0)),
+        # The launch file asks this scanner for ranges only.
+        *(lambda moments: {"ranges": room(moments, 1040)}, "", 4227),
+    ),
+    Topic(
+        *(TILT_SCAN, "sensor_msgs/msg/LaserScan", "/tilt_hokuyo_node", 20.0, 0.011),
+        *((0.008, 0.0008), _scan("laser_tilt_link", 0.829, 380, 20.0), _lit, "", 3107),
+    ),
+    Topic(
+        *(IMU, "sensor_msgs/msg/Imu", "/imu_node", 100.0, 0.002, (0.0012, 0.0006)),
+        fixed(
+            header__frame_id="imu_link",
+            orientation_covariance=diagonal(*[2.89e-08] * 3),
+            angular_velocity_covariance=diagonal(*[1.0966e-04] * 3),
+            linear_acceleration_covariance=diagonal(*[9.2e-03] * 3),
+        ),
+        _imu,
+    ),
+    Topic(
+        *(ODOMETRY, "nav_msgs/msg/Odometry", "/realtime_loop", 100.0, 0.001, (0.0006, 0.0003)),
+        fixed(
+            header__frame_id="odom",
+            child_frame_id="base_footprint",
+            pose__covariance=_SPREAD,
+            twist__covariance=_SPREAD,
+        ),
+        _odometry,
+    ),
+    Topic(
+        *(POSE, _POSITION, "/robot_pose_ekf", 30.0, 0.017, (0.0015, 0.0005)),
+        fixed(
+            header__frame_id="odom_combined",
+            pose__covariance=diagonal(2.5e-5, 2.5e-5, 1e-6, 1e-6, 1e-6, 1e-4),
+        ),
+        *(_pose, "ekf"),
+    ),
+    JOINT_TOPIC,
+    LINKS_TOPIC,
+    BASE_TOPIC,
+    *(
+        topic
+        for side in ("left", "right")
+        for topic in (
+            Topic(
+                *(STEREO.format(side, "image_rect"), "sensor_msgs/msg/Image"),
+                *(f"/wide_stereo_{side}", 25.0, 0.013, (0.027, 0.0015)),
+                *(_image("wide_stereo_optical_frame", "mono8", 1), _frames, "stereo", 307_300),
+            ),
+            Topic(
+                *(STEREO.format(side, "camera_info"), "sensor_msgs/msg/CameraInfo"),
+                *(f"/wide_stereo_{side}", 25.0, 0.013, (0.025, 0.0008), _camera_info),
+                clock="stereo",
+            ),
+        )
+    ),
+)
+_KINECT = (
+    Topic(
+        *(KINECT_IMAGE, "sensor_msgs/msg/Image", "/camera/driver", 15.0, 0.031, (0.035, 0.003)),
+        *(_image("camera_rgb_optical_frame", "bayer_grbg8", 1), _frames, "", 307_300),
+    ),
+    Topic(
+        *(KINECT_DEPTH, "sensor_msgs/msg/Image", "/camera/driver", 15.0, 0.047, (0.04, 0.003)),
+        *(_image("camera_depth_optical_frame", "16UC1", 2), _depths, "", 614_500),
+    ),
+)
 
 
 def mit_like(
@@ -106,401 +276,28 @@ def mit_like(
         directory: Where it goes; what lies there is replaced.
         seconds: Length of the drive, above 0, up to a week. A second has 16 MB, 30 MB
             with the Kinect.
-        seed: Not negative. Gives the furniture, the speed and the noise.
+        seed: Not negative. Gives the noise.
         kinect: With colour and depth images, as the later recordings have.
         name: Of the load.
 
     Raises:
         UsageError: An argument is out of its range, or the directory cannot be written.
     """
-    if not 0 < seconds <= MAX_DURATION_S or seed < 0:
+    if not 0 < seconds <= MAX_SECONDS or seed < 0:
         raise UsageError(
             f"no drive of {seconds:g} s from seed {seed}; choose more than 0 s, up to "
-            f"{MAX_DURATION_S:.0f} s, and a seed that is not negative"
+            f"{MAX_SECONDS:.0f} s, and a seed that is not negative"
         )
-    types = pr2.Pr2Types()
-    streams = _Drive(types, Robot(seconds, seed), kinect=kinect).streams()
-    topics: dict[str, _Stream] = {}
-    for stream in streams:
-        topics.setdefault(stream.topic, stream)
-    number = {topic: place for place, topic in enumerate(topics)}
-    schedules = _schedules(streams, seconds, seed)
+    types = OldTypes()
+    topics = (*_MODERN, *(_KINECT if kinect else ()))
+    times = [made.schedule(topic, seconds, seed, place) for place, topic in enumerate(topics)]
+    links, base = topics.index(LINKS_TOPIC), topics.index(BASE_TOPIC)
+    both = made.of_two_sources(times[links][1], times[base][1])
+    times[links], times[base] = (times[links][0], both[0]), (times[base][0], both[1])
+    nodes = {topic.name: topic for topic in reversed(topics)}
+    numbers = list(dict.fromkeys(topic.name for topic in topics))
+    channels = [types.channel(name, nodes[name].msgtype, nodes[name].node) for name in numbers]
     with Spool(directory) as spool:
-        for span in range(int(np.ceil(seconds / _SPAN_S))):
-            edges = round(span * _SPAN_S * 1e9), round((span + 1) * _SPAN_S * 1e9)
-            for place, (stream, (stamps, times)) in enumerate(zip(streams, schedules, strict=True)):
-                first, last = (int(row) for row in np.searchsorted(stamps, edges))
-                if first == last:
-                    continue
-                rng = pr2.generator(seed, place, "values", span)
-                here = stamps[first:last]
-                columns = stream.values(here / 1e9, START_NS + here, rng)
-                if stream.topic != TF:  # each transform has a header of its own
-                    columns |= pr2.stamped(START_NS + here)
-                for path in columns:
-                    if path.endswith("header.seq"):
-                        columns[path] = columns[path] + first
-                log_time = START_NS + times[first:last]
-                spool.template(number[stream.topic], stream.template, columns, log_time)
-        channels = [types.channel(t.topic, t.msgtype, t.node) for t in topics.values()]
+        for topic, of in zip(topics, times, strict=True):
+            made.write(spool, numbers.index(topic.name), types, topic, (START_NS, *of), seed=seed)
         return spool.finish(name, seed, channels, seconds)
-
-
-def _schedules(streams: list[_Stream], seconds: float, seed: int) -> list[tuple[Times, Times]]:
-    """Header stamps and log times of each stream, ns since the start."""
-    found = []
-    for place, stream in enumerate(streams):
-        clock = pr2.generator(seed, "clock", stream.clock or str(place))
-        stamps = steady(clock, stream.hz, seconds, phase=stream.phase)
-        transport = pr2.generator(seed, "transport", place)
-        found.append((stamps, received(transport, stamps, *stream.delay)))
-    first, second = (place for place, stream in enumerate(streams) if stream.topic == TF)
-    links, pose = pr2.of_two_sources(found[first][1], found[second][1])
-    found[first], found[second] = (found[first][0], links), (found[second][0], pose)
-    return found
-
-
-class _Drive:
-    """The publishers of a robot that drives.
-
-    Args:
-        types: Message types.
-        robot: Where it is and what is round it.
-        kinect: With a colour and depth camera.
-    """
-
-    def __init__(self, types: pr2.Pr2Types, robot: Robot, *, kinect: bool) -> None:
-        self._types = types
-        self._robot = robot
-        self._kinect = kinect
-
-    def streams(self) -> list[_Stream]:
-        """All of them; two speak on /tf."""
-        return [
-            self._base_scan(),
-            self._tilt_scan(),
-            self._imu(),
-            self._odometry(),
-            self._pose(),
-            self._joints(),
-            self._links(),
-            self._base(),
-            *self._stereo("left", BASELINE / 2),
-            *self._stereo("right", -BASELINE / 2),
-            *(self._colour_and_depth() if self._kinect else ()),
-        ]
-
-    def _stream(
-        self,
-        topic: str,
-        msgtype: str,
-        message: dict[str, object],
-        values: Callable[[Floats, Times, np.random.Generator], Columns],
-        *,
-        node: str,
-        hz: float,
-        phase: float,
-        delay: tuple[float, float],
-        clock: str = "",
-    ) -> _Stream:
-        template = self._types.template(msgtype, message)
-        return _Stream(topic, msgtype, node, hz, template, values, phase, delay, clock)
-
-    def _base_scan(self) -> _Stream:
-        laser = BaseLaser(BASE_BEAMS, BASE_SCAN_HZ)
-
-        def values(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            # The launch file asks this scanner for ranges only.
-            return {"ranges": laser.scan(self._robot, seconds, rng)[0]}
-
-        message = _scan("base_laser_link", laser, laser.beams, BASE_SCAN_HZ)
-        return self._stream(
-            BASE_SCAN,
-            "sensor_msgs/msg/LaserScan",
-            message,
-            values,
-            node="/base_hokuyo_node",
-            hz=BASE_SCAN_HZ,
-            phase=0.004,
-            delay=(0.019, 0.0008),
-        )
-
-    def _tilt_scan(self) -> _Stream:
-        laser = TiltLaser(TILT_BEAMS)
-
-        def values(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            ranges, light = laser.scan(self._robot, seconds, pr2.tilt(seconds), rng)
-            return {"ranges": ranges, "intensities": light}
-
-        message = _scan("laser_tilt_link", laser, laser.beams, TILT_SCAN_HZ)
-        message["intensities"] = np.zeros(laser.beams)
-        return self._stream(
-            TILT_SCAN,
-            "sensor_msgs/msg/LaserScan",
-            message,
-            values,
-            node="/tilt_hokuyo_node",
-            hz=TILT_SCAN_HZ,
-            phase=0.011,
-            delay=(0.008, 0.0008),
-        )
-
-    def _imu(self) -> _Stream:
-        def values(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            state = self._robot.at(seconds)
-            felt = Inertial.measure(state, rng)
-            noise = rng.standard_normal((4, len(seconds)))
-            return {
-                "orientation.x": 0.002 * noise[0],
-                "orientation.y": 0.002 * noise[1],
-                "orientation.z": np.sin(state.heading / 2),
-                "orientation.w": np.cos(state.heading / 2),
-                "angular_velocity.x": Inertial.gyro_noise * noise[2],
-                "angular_velocity.y": Inertial.gyro_noise * noise[3],
-                "angular_velocity.z": felt.yaw_rate,
-                "linear_acceleration.x": felt.forward,
-                "linear_acceleration.y": felt.left,
-                "linear_acceleration.z": felt.up,
-            }
-
-        message: dict[str, object] = {
-            "header": {"frame_id": "imu_link"},
-            "orientation_covariance": _diagonal([2.89e-08] * 3),
-            "angular_velocity_covariance": _diagonal([1.0966e-04] * 3),
-            "linear_acceleration_covariance": _diagonal([9.2e-03] * 3),
-        }
-        return self._stream(
-            IMU,
-            "sensor_msgs/msg/Imu",
-            message,
-            values,
-            node="/imu_node",
-            hz=IMU_HZ,
-            phase=0.002,
-            delay=(0.0012, 0.0006),
-        )
-
-    def _odometry(self) -> _Stream:
-        odometer = Odometer(self._robot)
-
-        def values(seconds: Floats, stamps: Times, rng: np.random.Generator) -> Columns:
-            seen = odometer.at(int(stamps[0]), seconds, rng)
-            return {
-                "pose.pose.position.x": seen.x,
-                "pose.pose.position.y": seen.y,
-                "pose.pose.orientation.z": np.sin(seen.heading / 2),
-                "pose.pose.orientation.w": np.cos(seen.heading / 2),
-                "twist.twist.linear.x": seen.speed,
-                "twist.twist.angular.z": seen.yaw_rate,
-            }
-
-        spread = _diagonal([4e-6, 4e-6, 1e6, 1e6, 1e6, 2.89e-4])
-        message: dict[str, object] = {
-            "header": {"frame_id": "odom"},
-            "child_frame_id": "base_footprint",
-            "pose": {"covariance": spread},
-            "twist": {"covariance": spread},
-        }
-        return self._stream(
-            ODOMETRY,
-            "nav_msgs/msg/Odometry",
-            message,
-            values,
-            node="/realtime_loop",
-            hz=ODOMETRY_HZ,
-            phase=0.001,
-            delay=(0.0006, 0.0003),
-        )
-
-    def _pose(self) -> _Stream:
-        def values(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            state = self._robot.at(seconds)
-            x, y = 0.005 * rng.standard_normal((2, len(seconds)))
-            return {
-                "pose.pose.position.x": state.x + x,
-                "pose.pose.position.y": state.y + y,
-                "pose.pose.orientation.z": np.sin(state.heading / 2),
-                "pose.pose.orientation.w": np.cos(state.heading / 2),
-            }
-
-        message: dict[str, object] = {
-            "header": {"frame_id": "odom_combined"},
-            "pose": {"covariance": _diagonal([2.5e-5, 2.5e-5, 1e-6, 1e-6, 1e-6, 1e-4])},
-        }
-        return self._stream(
-            POSE,
-            "geometry_msgs/msg/PoseWithCovarianceStamped",
-            message,
-            values,
-            node="/robot_pose_ekf",
-            hz=pr2.POSE_TF_HZ,
-            phase=0.017,
-            delay=(0.0015, 0.0005),
-            clock="ekf",
-        )
-
-    def _joints(self) -> _Stream:
-        def values(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            driven = self._robot.at(seconds).distance
-            return pr2.joint_columns(rng, seconds, driven, pr2.tilt(seconds))
-
-        return _Stream(
-            JOINT_STATES,
-            "sensor_msgs/msg/JointState",
-            "/realtime_loop",
-            pr2.JOINTS_HZ,
-            pr2.joint_template(self._types),
-            values,
-            phase=0.003,
-            delay=(0.0006, 0.0003),
-        )
-
-    def _links(self) -> _Stream:
-        def values(seconds: Floats, stamps: Times, rng: np.random.Generator) -> Columns:
-            wheels = self._robot.at(seconds).distance / pr2.WHEEL_RADIUS
-            return pr2.links_columns(rng, stamps, [wheels] * 12 + [np.zeros(len(seconds))])
-
-        template = pr2.links_template(self._types)
-        hz, delay = pr2.STATE_TF_HZ, (0.0009, 0.0003)
-        node = "/robot_state_publisher"
-        return _Stream(TF, pr2.TF_TYPE, node, hz, template, values, 0.005, delay)
-
-    def _base(self) -> _Stream:
-        def values(seconds: Floats, stamps: Times, _: np.random.Generator) -> Columns:
-            state = self._robot.at(seconds)
-            return pr2.pose_columns(stamps, state.x, state.y, state.heading)
-
-        template = pr2.pose_template(self._types)
-        hz, delay = pr2.POSE_TF_HZ, (0.0015, 0.0005)
-        return _Stream(
-            TF, pr2.TF_TYPE, "/robot_pose_ekf", hz, template, values, 0.017, delay, "ekf"
-        )
-
-    def _stereo(self, side: str, left: float) -> list[_Stream]:
-        eye = StereoCamera()
-        frame, node = "wide_stereo_optical_frame", f"/wide_stereo_{side}"
-
-        def image(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            out = _pictures(len(seconds), 1)
-            eye.render(self._robot, seconds, left, out, rng)
-            return {"data": out}
-
-        shift = 0.0 if side == "left" else -eye.camera.focal * BASELINE
-        return [
-            self._stream(
-                STEREO.format(side, "image_rect"),
-                "sensor_msgs/msg/Image",
-                _image(frame, "mono8", 1),
-                image,
-                node=node,
-                hz=STEREO_HZ,
-                phase=0.013,
-                delay=(0.027, 0.0015),
-                clock="stereo",
-            ),
-            self._stream(
-                STEREO.format(side, "camera_info"),
-                "sensor_msgs/msg/CameraInfo",
-                _camera_info(frame, eye.camera, shift),
-                _nothing,
-                node=node,
-                hz=STEREO_HZ,
-                phase=0.013,
-                delay=(0.025, 0.0008),
-                clock="stereo",
-            ),
-        ]
-
-    def _colour_and_depth(self) -> list[_Stream]:
-        eye, depth = StereoCamera(), DepthCamera()
-
-        def image(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            out = _pictures(len(seconds), 1)
-            eye.render(self._robot, seconds, 0.0, out, rng)
-            return {"data": out}
-
-        def distances(seconds: Floats, _: Times, rng: np.random.Generator) -> Columns:
-            out = _pictures(len(seconds), 2)
-            depth.render(self._robot, seconds, out, rng)
-            return {"data": out}
-
-        node = "/camera/driver"
-        # The scene is grey, so it is the same behind the colour filter of the sensor.
-        return [
-            self._stream(
-                KINECT_IMAGE,
-                "sensor_msgs/msg/Image",
-                _image("camera_rgb_optical_frame", "bayer_grbg8", 1),
-                image,
-                node=node,
-                hz=KINECT_HZ,
-                phase=0.031,
-                delay=(0.035, 0.003),
-            ),
-            self._stream(
-                KINECT_DEPTH,
-                "sensor_msgs/msg/Image",
-                _image("camera_depth_optical_frame", "16UC1", 2),
-                distances,
-                node=node,
-                hz=KINECT_HZ,
-                phase=0.047,
-                delay=(0.04, 0.003),
-            ),
-        ]
-
-
-def _nothing(_seconds: Floats, _stamps: Times, _rng: np.random.Generator) -> Columns:
-    """The values of messages of which only the header changes."""
-    return {}
-
-
-def _pictures(count: int, depth: int) -> NDArray[np.uint8]:
-    """Room for images of so many bytes a pixel."""
-    width, height = IMAGE_SIZE
-    return np.empty((count, width * height * depth), np.uint8)
-
-
-def _diagonal(values: list[float]) -> list[float]:
-    return [float(value) for value in np.diag(values).ravel()]
-
-
-def _scan(frame: str, laser: BaseLaser | TiltLaser, beams: int, hz: float) -> dict[str, object]:
-    return {
-        "header": {"frame_id": frame},
-        "angle_min": laser.angle_min,
-        "angle_max": -laser.angle_min,
-        "angle_increment": laser.angle_increment,
-        "time_increment": laser.time_increment,
-        "scan_time": 1 / hz,
-        "range_min": laser.range_min,
-        "range_max": laser.range_max,
-        "ranges": np.zeros(beams),
-    }
-
-
-def _image(frame: str, encoding: str, depth: int) -> dict[str, object]:
-    width, height = IMAGE_SIZE
-    return {
-        "header": {"frame_id": frame},
-        "height": height,
-        "width": width,
-        "encoding": encoding,
-        "step": width * depth,
-        "data": np.zeros(width * height * depth),
-    }
-
-
-def _camera_info(frame: str, camera: Camera, shift: float) -> dict[str, object]:
-    width, height = IMAGE_SIZE
-    f, (cx, cy) = camera.focal, camera.center
-    return {
-        "header": {"frame_id": frame},
-        "height": height,
-        "width": width,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": [f, 0, cx, 0, f, cy, 0, 0, 1],
-        "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
-        "p": [f, 0, cx, shift, 0, f, cy, 0, 0, 0, 1, 0],
-    }

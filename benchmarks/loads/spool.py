@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -10,18 +10,15 @@ from benchmarks.loads.base import PAYLOADS, Load
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
     from types import TracebackType
 
     from numpy.typing import NDArray
 
-    from hybridlog.demo.wire import Template
     from hybridlog_storage.messages import Channel
 
 _BUFFER = 1 << 20
-_BLOCK = 16 << 20
-"""Bytes of payloads that are made at once."""
 _ABOUT = "load.json"
 
 _Columns = tuple["NDArray[np.int32]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]"]
@@ -68,46 +65,6 @@ class Spool:
         if kind is not None:
             (self._directory / PAYLOADS).unlink(missing_ok=True)
 
-    def rows(self, channel: int, rows: NDArray[np.uint8], log_time: NDArray[np.int64]) -> None:
-        """Add messages of one channel that are equally long.
-
-        Args:
-            channel: Its index.
-            rows: uint8[n, size], a payload each.
-            log_time: int64[n], ns since the epoch.
-        """
-        count, size = rows.shape
-        self._file.write(np.ascontiguousarray(rows).data)
-        self._add(
-            np.full(count, channel, np.int32),
-            log_time,
-            self._at + size * np.arange(count, dtype=np.int64),
-            np.full(count, size, np.int64),
-        )
-        self._at += count * size
-
-    def template(
-        self,
-        channel: int,
-        template: Template,
-        columns: Mapping[str, NDArray[Any]],
-        log_time: NDArray[np.int64],
-    ) -> None:
-        """Add copies of a message with other values, a block at a time.
-
-        Args:
-            channel: Its index.
-            template: The message.
-            columns: By field path, as `Template.rows` takes them.
-            log_time: int64[n], ns since the epoch.
-        """
-        step = max(1, _BLOCK // template.size)
-        for first in range(0, len(log_time), step):
-            part = slice(first, first + step)
-            times = log_time[part]
-            values = {path: column[part] for path, column in columns.items()}
-            self.rows(channel, template.rows(values, len(times)), times)
-
     def messages(
         self,
         channel: NDArray[np.int32],
@@ -123,8 +80,10 @@ class Spool:
         """
         length = np.fromiter(map(self._file.write, payloads), np.int64, len(log_time))
         ends = self._at + np.cumsum(length)
-        self._add(channel, log_time, ends - length, length)
         self._at += int(length.sum())
+        if len(log_time):
+            columns = (channel.astype(np.int32), log_time.astype(np.int64), ends - length, length)
+            self._columns.append(columns)
 
     def finish(
         self,
@@ -177,15 +136,3 @@ class Spool:
         )
         load.save(self._directory)
         return load
-
-    def _add(
-        self,
-        channel: NDArray[np.int32],
-        log_time: NDArray[np.int64],
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-    ) -> None:
-        if len(log_time):
-            self._columns.append(
-                (channel.astype(np.int32), log_time.astype(np.int64), offset, length)
-            )

@@ -12,7 +12,7 @@ from benchmarks.harness.run import Outcome
 from benchmarks.questions.base import SLOW_TIMES
 from benchmarks.samples import Sample
 from benchmarks.side import warm_cache
-from benchmarks.studies.runs import Context, run_directory
+from benchmarks.studies.runs import Context, run_directory, step
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -35,13 +35,11 @@ class Turn:
         rows: Rows of the tables that it fills, and who asks for each; empty when nobody
             does.
         samples: What is wanted of it.
-        seconds: About how long it takes.
     """
 
     backend: str
     rows: Mapping[str, str]
     samples: Sequence[Sample]
-    seconds: float
 
 
 def to_do(context: Context, turn: Turn) -> bool:
@@ -92,7 +90,7 @@ def do(
         outcome = Outcome("missing", {}, reason)
         _note(context, turn, outcome, [])
         return
-    with context.steps.step(f"{turn.samples[0].study}: {turn.backend}", turn.seconds):
+    with step(f"{turn.samples[0].study}: {turn.backend}"):
         outcome, results = _run(context, turn, side, load(), arguments)
     if outcome.status == "missing":
         context.missing[turn.backend] = outcome.reason

@@ -15,8 +15,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
-from benchmarks.harness import usage
 from benchmarks.harness.logger import StoppedError, ended_by_signals
 from benchmarks.loads.base import Load
 from benchmarks.questions import tasks

@@ -9,15 +9,13 @@ from functools import partial
 from typing import Any, Literal
 
 from benchmarks.samples import Sample
-from benchmarks.studies.runs import Context, chosen, overhead_s
+from benchmarks.studies.runs import Context, chosen
 from benchmarks.studies.search import (
-    TRIALS,
     Bounds,
     Search,
     Trial,
     bracket,
     is_over,
-    next_trial,
     take_turns,
     verdict,
 )
@@ -171,19 +169,6 @@ def _has_queues(backend: str) -> bool:
     return backend not in BACKENDS or BACKENDS[backend].intake == "threads"
 
 
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the searches take that are not at their end."""
-    settings = settings or Settings.usual(quick=context.quick)
-    return sum(
-        TRIALS * (settings.seconds + overhead_s(backend))
-        for name, backend in chosen(context.backends, settings.backends).items()
-        if name not in context.missing
-        for size in settings.sizes
-        for repetition in range(settings.repetitions)
-        if next_trial(context, _search(context, settings, name, size, repetition)) is not None
-    )
-
-
 def run(context: Context, settings: Settings | None = None) -> None:
     """Look for the ceilings that are not known yet; the backends take turns.
 
@@ -215,8 +200,7 @@ def _search(context: Context, settings: Settings, name: str, size: int, repetiti
         load = partial(
             make_stream, context, size=size, rate=rate, topics=settings.topics, messages=messages
         )
-        seconds = messages / rate + overhead_s(context.backends[name])
-        return Trial(Sample(STUDY, case, name, repetition), load, seconds)
+        return Trial(Sample(STUDY, case, name, repetition), load)
 
     bounds = Bounds(settings.start, settings.lowest, settings.highest, settings.halvings)
     return Search(_RATE, bounds, trial)

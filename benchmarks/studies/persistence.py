@@ -9,8 +9,8 @@ from typing import Any
 
 from benchmarks.samples import Sample
 from benchmarks.studies.replays import LogSettings, Replay
-from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
-from benchmarks.studies.throughput import Case, short
+from benchmarks.studies.runs import Context, chosen
+from benchmarks.studies.throughput import short
 
 STUDY = "persistence"
 QUICK_SECONDS = 5.0
@@ -33,7 +33,7 @@ class Settings(LogSettings):
         return cls(log_seconds=QUICK_SECONDS, chosen=False, repetitions=1) if quick else cls()
 
 
-def plan(context: Context, settings: Settings | None = None) -> list[Case]:
+def plan(context: Context, settings: Settings | None = None) -> list[Sample]:
     """All runs in the order in which they are done, those of the journal included.
 
     The backends take turns within a log, so that what disturbs the machine for a while
@@ -47,11 +47,6 @@ def plan(context: Context, settings: Settings | None = None) -> list[Case]:
     return _plan(context, settings, settings.replays(context.seed))
 
 
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the runs take that are still to be done."""
-    return sum(case.seconds for case in plan(context, settings) if context.to_do(case.sample))
-
-
 def run(context: Context, settings: Settings | None = None) -> None:
     """Do what is still to be done.
 
@@ -62,18 +57,15 @@ def run(context: Context, settings: Settings | None = None) -> None:
     settings = settings or Settings.usual(quick=context.quick)
     found = settings.replays(context.seed)
     by_name = {replay.name: replay for replay in found}
-    for sample, seconds in _plan(context, settings, found):
+    for sample in _plan(context, settings, found):
         replay = by_name[sample.case["log"]]
-        context.run(sample, partial(replay.load, context), seconds=seconds)
+        context.run(sample, partial(replay.load, context))
 
 
-def _plan(context: Context, settings: Settings, found: Sequence[Replay]) -> list[Case]:
+def _plan(context: Context, settings: Settings, found: Sequence[Replay]) -> list[Sample]:
     names = list(chosen(context.backends, settings.backends))
     return [
-        Case(
-            Sample(STUDY, _case(replay.case, context.speed), name, repetition),
-            replay.seconds / context.speed + RUN_OVERHEAD_S,
-        )
+        Sample(STUDY, _case(replay.case, context.speed), name, repetition)
         for repetition in range(settings.repetitions)
         for replay in found
         for name in names

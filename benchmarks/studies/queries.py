@@ -28,10 +28,6 @@ STUDY = "queries"
 _VERSION = 1
 """Goes up when the generator makes other messages from the same seed."""
 _SIDE = "benchmarks.questions.sides:ask"
-_OVERHEAD_S = 16.0
-# Seconds for each minute of the load, filled and asked about, on two processors.
-_PER_MINUTE_S = {"sqlite_udf": 7.0, "postgres_autocommit": 9.0, "postgres_tuned": 6.0}
-_USUAL_PER_MINUTE_S = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +60,6 @@ def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
         ValueError: A backend is not known.
     """
     settings = settings or Settings.usual(quick=context.quick)
-    minutes = settings.sessions * settings.minutes
     found = []
     for name, kind in chosen(context.backends, settings.backends).items():
         if kind.kind == "none" or name in SAME:
@@ -76,14 +71,8 @@ def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
             for question in QUESTIONS
             for repetition in range(settings.repetitions)
         ]
-        seconds = _OVERHEAD_S + minutes * _PER_MINUTE_S.get(name, _USUAL_PER_MINUTE_S)
-        found.append(Turn(name, rows, samples, seconds))
+        found.append(Turn(name, rows, samples))
     return found
-
-
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the turns take that are still to be done."""
-    return sum(turn.seconds for turn in plan(context, settings) if turns.to_do(context, turn))
 
 
 def run(context: Context, settings: Settings | None = None) -> None:

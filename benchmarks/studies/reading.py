@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 STUDY = "reading"
 _VERSION = 1
 _SIDE = "benchmarks.questions.sides:read"
-_OVERHEAD_S = 6.0
-# Seconds for each second of the load, filled and read.
-_PER_SECOND_S = 3.0
 _USUAL_MEASURES = ("first_ms", "ms", "total_ms", "answer")
 
 
@@ -71,13 +68,8 @@ def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
             for task in tasks.TASKS
             for repetition in range(settings.repetitions)
         ]
-        found.append(Turn(name, rows, samples, _OVERHEAD_S + settings.seconds * _PER_SECOND_S))
+        found.append(Turn(name, rows, samples))
     return found
-
-
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the turns take that are still to be done."""
-    return sum(turn.seconds for turn in plan(context, settings) if turns.to_do(context, turn))
 
 
 def run(context: Context, settings: Settings | None = None) -> None:

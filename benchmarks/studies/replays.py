@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.loads.base import Load
-from benchmarks.loads.cut import cut
 from benchmarks.loads.logs import from_log, log_name
 from hybridlog.cli.output import note
 from hybridlog.sources.detect import open_source
@@ -177,7 +176,7 @@ def _make_mit(directory: Path, *, name: str, seed: int, seconds: float, is_busy:
 
 
 def _make_hcr(directory: Path, *, name: str, seed: int, seconds: float, is_busy: bool) -> Load:
-    from benchmarks.loads.hcr_like import hcr_like
+    from benchmarks.loads.hcr_like import cut, hcr_like
 
     minutes = max(seconds, _LEAST_HCR_S) / 60
     load = hcr_like(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,12 +23,6 @@ from benchmarks.samples import DAMAGE, Journal, Sample, Status
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
-    from benchmarks.progress import Steps
-
-RUN_OVERHEAD_S = 3.0
-"""About what a run takes besides publishing: processes, counting."""
-SERVER_OVERHEAD_S = 5.0
-"""About what a server adds: it is started and ended twice."""
 
 _PART = "part-"
 _DIGESTED_S = 500e6  # bytes a second of what a run has kept that the machine is done with,
@@ -42,7 +37,6 @@ class Context:
         work: Directory for loads (kept) and the data of runs (removed after each).
         backends: Those that take part, by name, in the order in which they take turns.
         journal: Where samples go, and where those lie that need not be run again.
-        steps: Where the progress goes.
         quick: Small cases.
         seed: Of all loads.
         speed: Times as fast as the loads say.
@@ -55,7 +49,6 @@ class Context:
     work: Path
     backends: Mapping[str, type[Backend]]
     journal: Journal
-    steps: Steps
     quick: bool = False
     seed: int = 1
     speed: float = 1.0
@@ -100,19 +93,13 @@ class Context:
         )
 
     def run(
-        self,
-        wanted: Sample,
-        load: Callable[[], Load],
-        *,
-        seconds: float,
-        speed: float | None = None,
+        self, wanted: Sample, load: Callable[[], Load], *, speed: float | None = None
     ) -> Sample:
         """Run one case with one backend, unless the journal has it; again when disturbed.
 
         Args:
             wanted: Study, case, backend and repetition.
             load: Gives the load; called only when it is needed.
-            seconds: About how long it takes.
             speed: Times as fast as the load says; None for this context's.
 
         Returns:
@@ -126,7 +113,7 @@ class Context:
             self.journal.add(sample)
             return sample
         while self.to_do(wanted):
-            with self.steps.step(describe_run(wanted), seconds):
+            with step(describe_run(wanted)):
                 sample = self._run(wanted, load(), self.speed if speed is None else speed)
             self.journal.add(sample)
             if sample.status == "missing":
@@ -145,6 +132,14 @@ class Context:
         self.quiet_at = time.monotonic() + _digesting_s(outcome.values)
         damage = {DAMAGE: load.damage} if load.damage else {}
         return _filled(wanted, outcome.status, {**outcome.values, **damage}, outcome.reason)
+
+
+@contextmanager
+def step(text: str) -> Iterator[None]:
+    """Write a line to standard error when the block has ended well."""
+    started = time.monotonic()
+    yield
+    print(f"{text} ({time.monotonic() - started:.1f} s)", file=sys.stderr, flush=True)
 
 
 def chosen(
@@ -173,12 +168,6 @@ def describe_run(sample: Sample) -> str:
     """A run in a line of progress."""
     case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
     return f"{sample.study}: {sample.backend}, {case}, run {sample.repetition + 1}"
-
-
-def overhead_s(backend: type[Backend]) -> float:
-    """About what a run of a backend takes besides publishing, seconds."""
-    has_server = backend.kind in {"database", "hybrid"}
-    return RUN_OVERHEAD_S + (SERVER_OVERHEAD_S if has_server else 0.0)
 
 
 def _digesting_s(values: Mapping[str, Any]) -> float:

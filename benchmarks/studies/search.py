@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from benchmarks.loads.base import Load
     from benchmarks.studies.runs import Context
 
-TRIALS = 6
-"""About how many trials a search takes."""
-
 Verdict = Literal["kept", "lost", "late"]
 """`late`: the publisher could not keep its own schedule, so the load was not offered."""
 
@@ -53,13 +50,11 @@ class Trial:
     Attributes:
         sample: Study, case, backend and repetition.
         load: Gives what is published; called only when it is needed.
-        seconds: About how long it takes.
         speed: Times as fast as the load says.
     """
 
     sample: Sample
     load: Callable[[], Load]
-    seconds: float
     speed: float = 1.0
 
 
@@ -193,7 +188,7 @@ def _try(context: Context, search: Search, failed: set[str]) -> bool:
     trial = next_trial(context, search, failed)
     if trial is None:
         return False
-    found = context.run(trial.sample, trial.load, seconds=trial.seconds, speed=trial.speed)
+    found = context.run(trial.sample, trial.load, speed=trial.speed)
     if found.status == "failed":
         failed.add(found.key)
     return found.status != "missing"

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
+from benchmarks.numbers import Spread
 from benchmarks.samples import Sample
 from benchmarks.studies.replays import MADE, LogSettings, Replay
-from benchmarks.studies.runs import RUN_OVERHEAD_S, Context, chosen
-from benchmarks.studies.search import TRIALS, Bounds, Search, Trial, next_trial, take_turns
+from benchmarks.studies.runs import Context, chosen
+from benchmarks.studies.search import (
+    Bounds,
+    Search,
+    Trial,
+    bracket,
+    is_over,
+    take_turns,
+    verdict,
+)
 from benchmarks.studies.throughput import short
 
 STUDY = "speed-up"
@@ -61,17 +71,38 @@ class Settings(LogSettings):
         )
 
 
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the searches take that are not at their end."""
-    settings = settings or Settings.usual(quick=context.quick)
-    # Each trial takes half as long as the one before.
-    return sum(
-        2 * replay.seconds / settings.start + TRIALS * RUN_OVERHEAD_S
-        for replay in settings.replays(context.seed)
-        for searches in _rounds(context, settings, replay)
-        for search in searches
-        if next_trial(context, search) is not None
-    )
+def speeds(
+    samples: Iterable[Sample], settings: Callable[[Sample], Mapping[str, Any]]
+) -> dict[tuple[str, str], tuple[Spread, bool]]:
+    """The greatest speed at which a backend kept all of a log.
+
+    Args:
+        samples: Of any study.
+        settings: Those of this study in the run of a sample.
+
+    Returns:
+        By backend and log: the speed in the searches, 0 when something was lost at every
+        speed; and whether it may be above, since no higher one was planned or published.
+    """
+    searches: dict[tuple[str, str], dict[int, list[Sample]]] = {}
+    for one in samples:
+        if one.study == STUDY and one.status != "missing":
+            of = searches.setdefault((one.backend, str(one.case["log"])), {})
+            of.setdefault(one.repetition, []).append(one)
+    found = {}
+    for place, of in searches.items():
+        greatest, is_above = [], False
+        for trials in of.values():
+            verdicts = {float(trial.case[_SPEED]): verdict(trial) for trial in trials}
+            kept = {speed: shown == "kept" for speed, shown in verdicts.items()}
+            speed, lost = bracket(kept)
+            greatest.append(speed or 0.0)
+            over = is_over(kept, settings(trials[-1]))
+            is_above |= not over or lost is None or verdicts[lost] == "late"
+        spread = Spread.of(greatest)
+        assert spread is not None
+        found[place] = (spread, is_above)
+    return found
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
@@ -103,9 +134,8 @@ def _search(
 ) -> Search:
     def trial(speed: float) -> Trial:
         case = {**replay.case, _SPEED: short(speed)}
-        seconds = replay.seconds / speed + RUN_OVERHEAD_S
         load = partial(replay.load, context)
-        return Trial(Sample(STUDY, case, name, repetition), load, seconds, speed)
+        return Trial(Sample(STUDY, case, name, repetition), load, speed)
 
     bounds = Bounds(settings.start, settings.lowest, settings.highest, settings.halvings)
     return Search(_SPEED, bounds, trial)

@@ -8,11 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from benchmarks.loads import streams
 from benchmarks.samples import Sample
-from benchmarks.studies.runs import Context, chosen, overhead_s
+from benchmarks.studies.runs import Context, chosen
 
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
@@ -54,19 +54,7 @@ class Settings:
         return cls(sizes=QUICK_SIZES, rates=QUICK_RATES, messages=20, repetitions=1)
 
 
-class Case(NamedTuple):
-    """One run of the plan.
-
-    Attributes:
-        sample: Study, case, backend and repetition.
-        seconds: About how long it takes.
-    """
-
-    sample: Sample
-    seconds: float
-
-
-def plan(context: Context, settings: Settings | None = None) -> list[Case]:
+def plan(context: Context, settings: Settings | None = None) -> list[Sample]:
     """All runs in the order in which they are done, those of the journal included.
 
     The backends take turns within a stream, so that what disturbs the machine for a
@@ -78,24 +66,12 @@ def plan(context: Context, settings: Settings | None = None) -> list[Case]:
     settings = settings or Settings.usual(quick=context.quick)
     backends = chosen(context.backends, settings.backends)
     return [
-        Case(
-            Sample(STUDY, _case(size, rate, settings, context.speed), name, repetition),
-            settings.messages / rate / context.speed + overhead_s(backend),
-        )
+        Sample(STUDY, _case(size, rate, settings, context.speed), name, repetition)
         for repetition in range(settings.repetitions)
         for rate in settings.rates
         for size in settings.sizes
-        for name, backend in backends.items()
+        for name in backends
     ]
-
-
-def expected_seconds(context: Context, settings: Settings | None = None) -> float:
-    """About how long the runs take that are still to be done."""
-    return sum(
-        case.seconds
-        for case in plan(context, settings)
-        if context.to_do(case.sample) and case.sample.backend not in context.missing
-    )
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
@@ -104,8 +80,8 @@ def run(context: Context, settings: Settings | None = None) -> None:
     Raises:
         ValueError: A backend is not known.
     """
-    for sample, seconds in plan(context, settings):
-        context.run(sample, partial(_stream, context, sample.case), seconds=seconds)
+    for sample in plan(context, settings):
+        context.run(sample, partial(_stream, context, sample.case))
 
 
 def make_stream(context: Context, *, size: int, rate: float, topics: int, messages: int) -> Load:

@@ -1044,26 +1044,3 @@ def demo(
     from hybridlog.demo import tour
 
     raise typer.Exit(tour.run(directory, duration_s=duration, seed=seed))
-
-
-@app.command(
-    # What follows belongs to the benchmarks, their own --help included.
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
-)
-def bench(
-    arguments: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Of the benchmarks: all --quick, report, --list-backends, throughput --help.",
-            metavar="ARGUMENT",
-        ),
-    ] = None,
-) -> None:
-    """Measure it beside databases and files.
-
-    Needs the source tree. The arguments are those of `python -m benchmarks`; without any, it
-    lists what there is.
-    """
-    from hybridlog.cli import bench as command
-
-    command.run(arguments or [])

@@ -1,52 +1,83 @@
-"""The simulated robot: where it is, what it does, and what must be found in its log."""
+"""The simulated robot: its motion, a lap through the floor plan for ever, and its events."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.demo.motion import Lap
 from hybridlog.demo.plan import FloorPlan
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.demo.motion import State, Stop, StopKind
-
     Floats = NDArray[np.float64]
 
 MAX_DURATION_S = 7 * 86_400.0
-WHEEL_RADIUS = 0.1
-"""Metres."""
-TRACK = 0.42
-"""Metres between the wheels."""
-GRIPPER_OPEN = 0.08
-"""Opening in metres that the gripper is sent to when it lets go."""
 MOTOR_WARN, MOTOR_ERROR = 70.0, 80.0
 """Motor temperatures in degrees Celsius from which diagnostics complain."""
-DIAGNOSTICS_PHASE_S = 0.4
-"""Diagnostics come once a second, this long after the full second."""
 
-_OBJECT_WIDTH = 0.03
-_GRIPPER_SPEED = 0.1
-_HEAT_OF_BRAKING = 40.0
-_COOLING_S = 4.0
 _FIRST_DAY_S = 1_748_851_200  # 2025-06-02 08:00 UTC
+_STEP_S, _SMOOTHING_S = 0.002, 0.3
+_GRIPPER_OPEN, _GRIPPED = 0.08, 0.03  # Metres between the fingers.
+_ACCELERATION, _BRAKING, _HARD_BRAKING, _YAW_RATE = 0.6, 0.7, 3.5, 0.9
+
+# Control points of the closed path in metres, in driving order.
+_PATH = np.array(
+    [
+        *((2.9, 3.4), (2.9, 2.2), (4.3, 2.45), (6.0, 2.45), (7.7, 2.25), (9.2, 2.1)),
+        *((10.6, 2.1), (12.2, 2.6), (12.2, 5.0), (12.2, 7.3), (10.2, 7.6), (7.7, 7.35)),
+        *((6.0, 7.4), (4.3, 7.85), (3.2, 7.85), (2.3, 7.7), (2.9, 6.3), (2.9, 5.0)),
+    ]
+)
+# Kind, a point close by, seconds of standing. `brake` is a sudden stop for an obstacle.
+_STOPS = (
+    ("dock", 2.9, 3.4, 2.0),
+    ("pick", 9.2, 2.1, 3.0),
+    ("place", 12.2, 4.6, 2.4),
+    ("brake", 10.0, 7.6, 1.4),
+    ("pick", 4.0, 7.85, 4.2),
+    ("brake", 2.9, 5.9, 1.2),
+)
+_ARRIVALS = {
+    "dock": "dock reached, lap finished",
+    "pick": "shelf reached, arm takes over",
+    "place": "place reached, arm takes over",
+    "brake": "obstacle in the safety field: emergency stop",
+}
 
 
-@dataclass(frozen=True, slots=True)
-class GripperCommand:
-    """One command to the gripper.
+class Stop(NamedTuple):
+    """A stop: its kind, and seconds since the start when the robot stands and drives on."""
 
-    Attributes:
-        seconds: When, since the start.
-        position: Wanted opening in metres; 0 closes it.
-        max_effort: Newtons; -1 for no limit.
-        reaches: Opening in metres where the fingers come to rest.
+    kind: str
+    start: float
+    end: float
+
+
+class State(NamedTuple):
+    """The true motion at n moments, all float64[n]; metres, seconds and radians.
+
+    Position in the plan, heading unwrapped over laps, distance since the start, speed and
+    acceleration forward, yaw rate counter-clockwise.
     """
+
+    x: Floats
+    y: Floats
+    heading: Floats
+    distance: Floats
+    speed: Floats
+    acceleration: Floats
+    yaw_rate: Floats
+
+    def ahead(self, offset: float) -> tuple[Floats, Floats]:
+        """Position of something mounted `offset` metres in front of the centre."""
+        return self.x + offset * np.cos(self.heading), self.y + offset * np.sin(self.heading)
+
+
+class GripperCommand(NamedTuple):
+    """A command: its time, wanted opening (0 closes), effort, and the opening it reaches."""
 
     seconds: float
     position: float
@@ -54,31 +85,25 @@ class GripperCommand:
     reaches: float
 
 
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """A line of the robot's text log.
-
-    Attributes:
-        seconds: When, since the start.
-        severity: How bad.
-        node: Who says it.
-        text: What.
-    """
+class Remark(NamedTuple):
+    """A line of the text log: its time, severity, node and text."""
 
     seconds: float
-    severity: Literal["info", "warn", "error"]
+    severity: str
     node: str
     text: str
 
 
 class Robot:
-    """A differential-drive robot on its loop through the plan.
-
-    The same duration and seed give the same robot. Times are seconds since the start.
+    """A differential-drive robot. Times are seconds since the start.
 
     Args:
         duration_s: Seconds of simulated time, above 0, up to a week.
         seed: Not negative. Changes the furniture, the speeds, the noise, and the day.
+
+    Attributes:
+        start_ns: Log time of the start, nanoseconds since the epoch.
+        stops: Stops within the duration, in order; so are commands and remarks.
 
     Raises:
         UsageError: An argument is out of its range.
@@ -92,137 +117,171 @@ class Robot:
             )
         if seed < 0:
             raise UsageError(f"seed is {seed}; it must not be negative")
-        self.duration_s = float(duration_s)
-        self.seed = seed
+        self.duration_s, self.seed = float(duration_s), seed
         self.plan = FloorPlan(seed)
-        self.lap = Lap(seed)
-        # A day for each seed, so that several recordings do not lie over each other.
+        # A day for each seed, so that recordings do not overlap.
         self.start_ns = (_FIRST_DAY_S + seed % 3_000 * 86_400) * 1_000_000_000
-        """Log time at which the recording starts, nanoseconds since the epoch."""
-        self.stops: tuple[tuple[float, Stop], ...] = tuple(self._visits())
-        """Start of each stop within the duration, seconds, in order."""
-        self.gripper_commands = tuple(self._gripper_commands())
-        """Commands within the duration, in order."""
-        self.remarks = tuple(self._remarks())
-        """Lines of the text log within the duration, in order."""
-        self._braked: Floats = np.array([t for t, stop in self.stops if stop.kind == "brake"])
-        self._finger_times, self._finger_opening = self._fingers()
+        self._path_s, self._path_x, self._path_y, self._path_heading = _loop()
+        self._length = float(self._path_s[-1])
+        self._curvature = np.gradient(self._path_heading, self._path_s)
+        lap = self._drive_lap(np.random.default_rng([seed, 0x1A9]))
+        starts = np.arange(int(self.duration_s // self.period) + 1) * self.period
+        every = [Stop(s.kind, t + s.start, t + s.end) for t in starts.tolist() for s in lap]
+        self.stops = [stop for stop in every if stop.start < self.duration_s]
+        self.gripper_commands = self._gripper_commands()
+        self.remarks = self._remarks()
+        times, openings = [0.0], [_GRIPPER_OPEN]
+        for command in self.gripper_commands:
+            travel_s = abs(command.reaches - openings[-1]) / 0.1
+            times += [command.seconds, command.seconds + max(travel_s, 1e-6)]
+            openings += [openings[-1], command.reaches]
+        self._finger_times, self._finger_openings = times, openings
 
     def at(self, seconds: Floats) -> State:
-        """The true motion at float64[n] seconds."""
-        return self.lap.at(seconds)
-
-    @property
-    def gripper_closings(self) -> tuple[float, ...]:
-        """Seconds of each command that closes the gripper."""
-        return tuple(c.seconds for c in self.gripper_commands if c.position == 0.0)
-
-    @property
-    def hard_brakings(self) -> tuple[float, ...]:
-        """Seconds of each sudden stop."""
-        return tuple(float(t) for t in self._braked)
-
-    @property
-    def error_times(self) -> tuple[float, ...]:
-        """Seconds of each diagnostics message with an error in it."""
-        seconds = np.arange(DIAGNOSTICS_PHASE_S, self.duration_s, 1.0)
-        return tuple(float(t) for t in seconds[self.motor_temperature(seconds) >= MOTOR_ERROR])
-
-    @property
-    def min_clearance(self) -> float:
-        """Metres between the robot's centre and the nearest surface, at its smallest."""
-        seconds = np.arange(0.0, min(self.duration_s, self.lap.period), 0.02)
-        state = self.at(seconds)
-        return float(self.plan.clearance(state.x, state.y).min())
+        """The true motion at float64[n] seconds, from 0 on."""
+        laps = np.floor(seconds / self.period)
+        clock = seconds - laps * self.period
+        along = np.interp(clock, self._times, self._distance)
+        speed = np.interp(clock, self._times, self._speed)
+        curvature = np.interp(along, self._path_s, self._curvature, period=self._length)
+        whole, part = np.divmod(along, self._length)
+        turn = self._path_heading[-1] - self._path_heading[0]
+        return State(
+            x=np.asarray(np.interp(part, self._path_s, self._path_x)),
+            y=np.asarray(np.interp(part, self._path_s, self._path_y)),
+            heading=np.interp(part, self._path_s, self._path_heading) + (laps + whole) * turn,
+            distance=along + laps * self._length,
+            speed=speed,
+            acceleration=np.interp(clock, self._times, self._acceleration),
+            yaw_rate=curvature * speed,
+        )
 
     def motor_temperature(self, seconds: Floats) -> Floats:
         """Degrees Celsius of the drive motors, float64[n]: hard braking heats them."""
         temperature = 50.0 + 4.0 * self.at(seconds).speed
-        if len(seconds) and len(self._braked):
-            recent = self._braked[self._braked > seconds.min() - 20 * _COOLING_S]
-            for braked in recent[recent <= seconds.max()]:
-                since = seconds - braked
-                heat = _HEAT_OF_BRAKING * np.exp(-np.maximum(since, 0) / _COOLING_S)
+        for stop in self.stops:
+            if stop.kind == "brake" and len(seconds) and stop.start <= seconds[-1]:
+                since = seconds - stop.start
+                heat = 40.0 * np.exp(-np.maximum(since, 0) / 4.0)
                 temperature += np.where(since >= 0, heat, 0.0)
         return temperature
 
     def gripper_opening(self, seconds: Floats) -> Floats:
         """Metres between the fingers, float64[n]."""
-        return np.interp(seconds, self._finger_times, self._finger_opening)
+        return np.interp(seconds, self._finger_times, self._finger_openings)
 
-    def arm_moves(self, seconds: Floats) -> Floats:
-        """Part of the arm's movement done, float64[n]; NaN when the arm is still."""
-        part = np.full(len(seconds), np.nan)
-        for start, stop in self.stops:
-            if stop.kind in {"pick", "place"}:
-                length = stop.end - stop.start - 0.7
-                here = (seconds - start - 0.4) / length
-                inside = (here >= 0) & (here <= 1)
-                part[inside] = here[inside]
-        return part
-
-    def _visits(self) -> list[tuple[float, Stop]]:
-        laps = int(self.duration_s // self.lap.period) + 1
-        starts = [
-            (lap * self.lap.period + stop.start, stop)
-            for lap in range(laps)
-            for stop in self.lap.stops
-        ]
-        return [(start, stop) for start, stop in starts if start < self.duration_s]
+    def _drive_lap(self, rng: np.random.Generator) -> list[Stop]:
+        """Drive one lap from dock to dock, as fast as curves, acceleration and stops allow."""
+        s, length = self._path_s, self._length
+        top = float(rng.uniform(0.82, 0.95))
+        limit = np.minimum(top, _YAW_RATE / np.maximum(np.abs(self._curvature), 1e-6)) ** 2
+        plans = []
+        for kind, x, y, hold in _STOPS:
+            nearest = float(s[np.hypot(self._path_x - x, self._path_y - y).argmin()])
+            plans.append((nearest, kind, hold + float(rng.uniform(0, 0.4))))
+        plans.sort()
+        # The lap begins exactly where the path does, so that laps join.
+        plans[0] = (0.0, "dock", plans[0][2])
+        times: list[Floats] = []
+        distances: list[Floats] = []
+        stops, clock = [], 0.0
+        for (start, kind, hold), (end, next_kind, _) in zip(
+            plans, [*plans[1:], (length, "dock", 0.0)], strict=True
+        ):
+            stops.append(Stop(kind, clock, clock + hold))
+            leg = np.concatenate(([start], s[(s > start + 1e-6) & (s < end - 1e-6)], [end]))
+            braking = _HARD_BRAKING if next_kind == "brake" else _BRAKING
+            squared = np.minimum(np.interp(leg, s, limit), 2 * _ACCELERATION * (leg - start))
+            squared = np.minimum(squared, 2 * braking * (end - leg))
+            # Curves bind both ways: v^2 changes by at most 2 a per metre.
+            squared = _slope_limited(leg, squared, 2 * _ACCELERATION)
+            squared = _slope_limited(leg[::-1], squared[::-1], 2 * braking)[::-1]
+            speed = np.sqrt(squared)
+            spent = np.cumsum(2 * np.diff(leg) / (speed[1:] + speed[:-1]))
+            times.append(np.concatenate(([clock, clock + hold], clock + hold + spent)))
+            distances.append(np.concatenate(([start], leg)))
+            clock = clock + hold + float(spent[-1])
+        # A little rest at the end, so that smoothing carries no speed into the next lap.
+        self.period = clock + _SMOOTHING_S
+        count = round(self.period / _STEP_S)
+        self._times = np.arange(count + 1) * (self.period / count)
+        distance = np.interp(
+            self._times[:-1],
+            np.append(np.concatenate(times), self.period),
+            np.append(np.concatenate(distances), length),
+        )
+        # Averaging distance over a short window rounds the corners of the speed and
+        # keeps distance, speed and acceleration derivatives of one another.
+        window = round(_SMOOTHING_S / _STEP_S) | 1
+        padded = np.concatenate((distance[-window:] - length, distance, distance[:window] + length))
+        kernel = np.convolve(np.ones(window // 2), np.ones(window // 2))
+        smooth = np.convolve(padded, kernel / kernel.sum(), mode="same")
+        speed = np.gradient(smooth, self._times[1])
+        acceleration = np.gradient(speed, self._times[1])[window:-window]
+        smooth, speed = smooth[window:-window], np.maximum(speed[window:-window], 0.0)
+        # With the first value of the next lap, interpolation reaches the end.
+        self._distance = np.append(smooth, smooth[0] + length)
+        self._speed = np.append(speed, speed[0])
+        self._acceleration = np.append(acceleration, acceleration[0])
+        return stops
 
     def _gripper_commands(self) -> list[GripperCommand]:
         commands = []
-        for start, stop in self.stops:
-            if stop.kind == "pick" and stop.end - stop.start > 4.0:
+        for kind, start, end in self.stops:
+            if kind == "pick" and end - start > 4.0:
                 # The first grip at this shelf slips: it opens and closes again.
                 commands.append(GripperCommand(start + 0.8, 0.0, 50.0, 0.0))
-                commands.append(GripperCommand(start + 1.9, GRIPPER_OPEN, -1.0, GRIPPER_OPEN))
-                commands.append(GripperCommand(start + 3.0, 0.0, 75.0, _OBJECT_WIDTH))
-            elif stop.kind == "pick":
-                commands.append(GripperCommand(start + 0.8, 0.0, 50.0, _OBJECT_WIDTH))
-            elif stop.kind in {"place", "dock"}:
-                commands.append(GripperCommand(start + 0.8, GRIPPER_OPEN, -1.0, GRIPPER_OPEN))
+                commands.append(GripperCommand(start + 1.9, _GRIPPER_OPEN, -1.0, _GRIPPER_OPEN))
+                commands.append(GripperCommand(start + 3.0, 0.0, 75.0, _GRIPPED))
+            elif kind == "pick":
+                commands.append(GripperCommand(start + 0.8, 0.0, 50.0, _GRIPPED))
+            elif kind != "brake":
+                commands.append(GripperCommand(start + 0.8, _GRIPPER_OPEN, -1.0, _GRIPPER_OPEN))
         return [c for c in commands if c.seconds < self.duration_s]
-
-    def _fingers(self) -> tuple[Floats, Floats]:
-        times, openings = [0.0], [GRIPPER_OPEN]
-        for command in self.gripper_commands:
-            now = openings[-1]
-            travel = abs(command.reaches - now) / _GRIPPER_SPEED
-            times += [command.seconds, command.seconds + max(travel, 1e-6)]
-            openings += [now, command.reaches]
-        return np.array(times), np.array(openings)
 
     def _remarks(self) -> list[Remark]:
         remarks = [Remark(0.05, "info", "/move_base", "route loaded, leaving the dock")]
-        texts: dict[StopKind, str] = {
-            "dock": "dock reached, lap finished",
-            "pick": "shelf reached, arm takes over",
-            "place": "place reached, arm takes over",
-            "brake": "obstacle in the safety field: emergency stop",
-        }
-        for number, (start, stop) in enumerate(self.stops):
-            severity: Literal["info", "warn"] = "warn" if stop.kind == "brake" else "info"
+        for number, (kind, start, _) in enumerate(self.stops):
+            severity = "warn" if kind == "brake" else "info"
             if number:
-                remarks.append(Remark(start + 0.2, severity, "/move_base", texts[stop.kind]))
-            if stop.kind == "brake":
-                remarks.append(
-                    Remark(start + 0.5, "error", "/motor_driver", "drive motor over-temperature")
-                )
-        for before, command in zip(
-            (None, *self.gripper_commands), self.gripper_commands, strict=False
-        ):
-            slipped = command.position > 0 and before is not None and before.reaches == 0.0
-            text = "grip slipped, opening" if slipped else "opening"
-            if command.position == 0.0:
-                text = "closing"
-            remarks.append(
-                Remark(
-                    command.seconds + 0.01,
-                    "warn" if slipped else "info",
-                    "/r_gripper_controller",
-                    f"gripper: {text}",
-                )
-            )
+                remarks.append(Remark(start + 0.2, severity, "/move_base", _ARRIVALS[kind]))
+            if kind == "brake":
+                text = "drive motor over-temperature"
+                remarks.append(Remark(start + 0.5, "error", "/motor_driver", text))
+        reached, node = _GRIPPER_OPEN, "/r_gripper_controller"
+        for command in self.gripper_commands:
+            severity, text = "info", "opening" if command.position else "closing"
+            if command.position and reached == 0.0:
+                severity, text = "warn", "grip slipped, opening"
+            remarks.append(Remark(command.seconds + 0.01, severity, node, f"gripper: {text}"))
+            reached = command.reaches
         remarks.sort(key=lambda remark: remark.seconds)
         return [remark for remark in remarks if remark.seconds < self.duration_s]
+
+
+def _loop() -> tuple[Floats, Floats, Floats, Floats]:
+    """Distance, x, y and heading along the closed path, which starts at the dock.
+
+    A cubic B-spline: the curvature is continuous, so the yaw rate has no steps.
+    """
+    u = np.linspace(0, 1, 400, endpoint=False)[:, None]
+    basis = ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3)
+    pieces = [
+        sum((basis[k] * _PATH[(i + k - 1) % len(_PATH)] for k in range(4)), np.zeros((400, 2))) / 6
+        for i in range(len(_PATH))
+    ]
+    curve = np.concatenate(pieces)
+    closed = np.concatenate((curve, curve[:1]))
+    steps = np.diff(closed, axis=0)
+    distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+    # Heading of each chord belongs to its middle; back to the points by averaging.
+    chord = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    turn = 2 * np.pi * np.round((chord[-1] - chord[0]) / (2 * np.pi))
+    before, after = np.append(chord[-1] - turn, chord), np.append(chord, chord[0] + turn)
+    return distance, closed[:, 0], closed[:, 1], (before + after) / 2
+
+
+def _slope_limited(at: Floats, values: Floats, slope: float) -> Floats:
+    """The largest function below `values` that rises by at most `slope` a metre."""
+    ramp = slope * np.abs(at - at[0])
+    return np.asarray(np.minimum.accumulate(values - ramp) + ramp)

@@ -1,241 +1,173 @@
-"""What the laser scanner, the 3D lidar, the IMU and the wheel encoders measure."""
+"""The robot's sensors: laser scanner, 3D lidar, camera, wheel encoders, inertial unit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.demo.plan import DEPTH, WALL_HEIGHT, WIDTH
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.demo.motion import State
-    from hybridlog.demo.plan import FloorPlan, Hits
-    from hybridlog.demo.robot import Robot
+    from hybridlog.demo.robot import Robot, State
 
     Floats = NDArray[np.float64]
     Singles = NDArray[np.float32]
 
 GRAVITY = 9.80665
+GYRO_NOISE, ACCELERATION_NOISE = 0.002, 0.03
+LASER_OFFSET, LASER_HEIGHT, LIDAR_HEIGHT, CAMERA_HEIGHT = 0.2, 0.3, 1.05, 0.9
+"""Metres in front of the robot's centre, and above the floor."""
+SCAN_HZ = 20.0
+SCAN_ANGLE_MIN, SCAN_RANGE_MIN, SCAN_RANGE_MAX, SCAN_NOISE = -0.75 * np.pi, 0.05, 10.0, 0.008
+"""Radians, and metres."""
+RINGS = 16
+POINT = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("ring", "<u4")])
+"""A point of the lidar."""
+
+# Blue, green, red of asphalt, floor, sky, ceiling, walls and furniture.
+_GROUND, _ABOVE = ((84, 84, 84), (104, 112, 118)), ((244, 226, 200), (226, 230, 230))
+_PALETTE = np.array([*_GROUND, *_ABOVE, (200, 208, 212), (74, 122, 172)], np.float32)
+_GREY = np.array([0.114, 0.587, 0.299], np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class LaserScanner:
-    """A planar scanner on the robot's front, turning counter-clockwise.
+def scan_steps(beams: int) -> tuple[float, float]:
+    """Radians and seconds between two beams of a scan, three quarters of a turn."""
+    return -2 * SCAN_ANGLE_MIN / (beams - 1), 0.75 / SCAN_HZ / beams
+
+
+def scan(
+    robot: Robot, seconds: Floats, beams: int, rng: np.random.Generator
+) -> tuple[Singles, Singles]:
+    """Scans of a laser that turns counter-clockwise on the robot's front.
+
+    Returns:
+        Ranges in metres (infinite without return) and intensities, float32[n, beams].
+    """
+    number, (angle_step, time_step) = np.arange(beams), scan_steps(beams)
+    # The robot moves on while the scanner turns: every beam has its own pose.
+    state = robot.at((seconds[:, None] + number * time_step).ravel())
+    angle = np.tile(SCAN_ANGLE_MIN + number * angle_step, len(seconds))
+    hits = robot.plan.cast(*state.ahead(LASER_OFFSET), state.heading + angle)
+    light = 2800 * hits.cosine / (1 + (hits.distance / 4.0) ** 2)
+    light *= 1 + 0.03 * rng.standard_normal(len(light), np.float32)
+    distance = hits.distance + SCAN_NOISE * rng.standard_normal(len(light), np.float32)
+    gone = (light < 40.0) | (distance > SCAN_RANGE_MAX)
+    gone |= rng.random(len(light), np.float32) < 0.0005
+    ranges = np.where(gone, np.inf, np.maximum(distance, SCAN_RANGE_MIN)).astype(np.float32)
+    intensities = np.where(gone, 0, light).astype(np.float32)
+    return ranges.reshape(-1, beams), intensities.reshape(-1, beams)
+
+
+def cloud(robot: Robot, seconds: float, columns: int, rng: np.random.Generator) -> NDArray[np.void]:
+    """A turn of a lidar on the mast that sees walls, pillars and the floor.
+
+    Returns:
+        `POINT`[rings * columns] in the sensor's frame, metres; NaN without return.
+    """
+    state, plan = robot.at(np.array([seconds])), robot.plan
+    angle = np.linspace(-np.pi, np.pi, columns, endpoint=False)
+    origin = np.repeat(state.x, columns), np.repeat(state.y, columns)
+    walls = plan.cast(*origin, angle + state.heading, plan.tall)
+    slope = np.tan(np.radians(np.linspace(-15, 15, RINGS)))[:, None]
+    distance = np.minimum(walls.distance, np.where(slope < 0, -LIDAR_HEIGHT / slope, np.inf))
+    distance[np.isinf(distance)] = np.nan
+    distance += 0.01 * rng.standard_normal(distance.shape)
+    points = np.zeros(distance.shape, POINT)
+    points["x"], points["y"] = distance * np.cos(angle), distance * np.sin(angle)
+    points["z"], points["ring"] = distance * slope, np.arange(RINGS)[:, None]
+    points["intensity"] = np.nan_to_num(175 / (1 + (distance / 4.0) ** 2))
+    return points.ravel()
+
+
+class Camera:
+    """A pinhole camera, drawn column by column from ray casts.
+
+    Args:
+        size: Width and height in pixels.
+        yaw: Radians from the robot's heading.
+        offset: Metres in front of the robot's centre.
+        colour: bgr8 when true, else mono8.
 
     Attributes:
-        beams: Beams of a scan.
-        scan_hz: Scans a second; the field of view takes three quarters of a turn.
+        focal: Focal length in pixels.
+        center: Column and row of the optical axis.
     """
 
-    beams: int
-    scan_hz: float
+    def __init__(self, size: tuple[int, int], yaw: float, offset: float, *, colour: bool) -> None:
+        (self.width, self.height), self.channels = size, 3 if colour else 1
+        self.focal = self.width / 2 / float(np.tan(np.radians(72) / 2))
+        self.center = ((self.width - 1) / 2, (self.height - 1) / 2)
+        self._yaw, self._offset = yaw, offset
+        self._angle: Floats = np.arctan((self.center[0] - np.arange(self.width)) / self.focal)
+        # Downward slope of each row's rays; none is exactly level.
+        rows = np.arange(self.height)[:, None] - self.center[1] + 0.01
+        self._slope = (rows / self.focal).astype(np.float32)
+        level = np.where(rows > 0, CAMERA_HEIGHT, WALL_HEIGHT - CAMERA_HEIGHT).astype(np.float32)
+        self._away = level / np.abs(self._slope)
 
-    offset = 0.2
-    height = 0.3
-    angle_min = -0.75 * np.pi
-    range_min, range_max = 0.05, 10.0
-    range_noise = 0.008
-    least_intensity = 40.0
-
-    @property
-    def angle_increment(self) -> float:
-        """Radians between two beams."""
-        return -2 * self.angle_min / (self.beams - 1)
-
-    @property
-    def time_increment(self) -> float:
-        """Seconds between two beams."""
-        return 0.75 / self.scan_hz / self.beams
-
-    def rays(self, robot: Robot, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Origin x, y and angle in the plan of each beam, float64[n * beams].
-
-        The robot moves on while the scanner turns: every beam has its own pose.
-        """
-        number = np.arange(self.beams)
-        state = robot.at((seconds[:, None] + number * self.time_increment).ravel())
-        angle = np.tile(self.angle_min + number * self.angle_increment, len(seconds))
-        x, y = mounted(state, self.offset)
-        return x, y, state.heading + angle
-
-    def scan(
-        self, robot: Robot, seconds: Floats, rng: np.random.Generator
-    ) -> tuple[Singles, Singles]:
-        """Ranges in metres (infinite without return) and intensities, float32[n, beams]."""
-        hits = robot.plan.cast(*self.rays(robot, seconds))
-        light = returned_light(robot.plan, hits)
-        light *= 1 + 0.03 * rng.standard_normal(len(light), np.float32)
-        distance = hits.distance + self.range_noise * rng.standard_normal(len(light), np.float32)
-        gone = (light < self.least_intensity) | (distance > self.range_max)
-        gone |= rng.random(len(light), np.float32) < 0.0005
-        ranges = np.where(gone, np.inf, np.maximum(distance, self.range_min))
-        shape = (len(seconds), self.beams)
-        return (
-            ranges.astype(np.float32).reshape(shape),
-            np.where(gone, 0, light).astype(np.float32).reshape(shape),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Lidar:
-    """A 3D lidar of 16 rings on the robot's mast.
-
-    Attributes:
-        columns: Directions round the sensor.
-    """
-
-    columns: int
-
-    height = 1.05
-    rings = 16
-
-    POINT = np.dtype(
-        {
-            "names": ["x", "y", "z", "intensity", "ring"],
-            "formats": ["<f4", "<f4", "<f4", "<f4", "<u2"],
-            "offsets": [0, 4, 8, 12, 16],
-            "itemsize": 20,
-        }
-    )
-
-    def points(self, robot: Robot, seconds: float, rng: np.random.Generator) -> NDArray[np.void]:
-        """One turn, `POINT`[rings * columns] in the sensor's frame, metres; NaN: no return."""
-        state = robot.at(np.array([seconds]))
-        angle = np.linspace(-np.pi, np.pi, self.columns, endpoint=False)
-        x, y = (np.repeat(value, self.columns) for value in mounted(state, 0.0))
-        plan = robot.plan
-        walls = plan.cast(x, y, angle + state.heading, plan.tall)
-        things = plan.cast(x, y, angle + state.heading, ~plan.tall)
-        slope = np.tan(np.radians(np.linspace(-15, 15, self.rings)))[:, None]
-        # A ray that passes over a low thing goes on to the wall behind it.
-        over = self.height + slope * things.distance > plan.height[things.surface]
-        behind = over | (things.distance > walls.distance)
-        distance = np.where(behind, walls.distance, things.distance)
-        light = np.where(behind, returned_light(plan, walls), returned_light(plan, things))
-        with np.errstate(divide="ignore"):
-            ground = np.where(slope < 0, -self.height / slope, np.inf)
-        low = ground < distance
-        distance = np.where(low, ground, distance)
-        light = np.where(low, 900.0 / (1 + 0.05 * distance**2), light)
-        gone = ~np.isfinite(distance) | (light < 20)
-        distance = np.where(gone, np.nan, distance)
-        distance = distance + 0.01 * rng.standard_normal(distance.shape)
-        points = np.zeros(distance.shape, self.POINT)
-        points["x"] = distance * np.cos(angle)
-        points["y"] = distance * np.sin(angle)
-        points["z"] = distance * slope
-        points["intensity"] = np.where(gone, 0, light / 16)
-        points["ring"] = np.arange(self.rings)[:, None]
-        return points.ravel()
-
-
-def mounted(state: State, offset: float) -> tuple[Floats, Floats]:
-    """Position in the plan of something `offset` metres in front of the centre."""
-    return (
-        state.x + offset * np.cos(state.heading),
-        state.y + offset * np.sin(state.heading),
-    )
-
-
-def returned_light(plan: FloorPlan, hits: Hits) -> Floats:
-    """Intensity of each return, float64[n], about 0 to 4000: surface, angle, distance."""
-    light = np.zeros(len(hits.distance))
-    hit = hits.surface >= 0
-    surface = hits.surface[hit]
-    light[hit] = 4000 * plan.reflectivity[surface] * hits.cosine[hit] ** plan.sharpness[surface]
-    light[hit] /= 1 + (hits.distance[hit] / 4.0) ** 2
-    return light
-
-
-@dataclass(frozen=True, slots=True)
-class Odometry:
-    """What the wheel encoders say at n moments, all float64[n], in the odom frame.
-
-    Attributes:
-        x: Position, metres from where the robot started.
-        y: Position.
-        heading: Radians from where it looked at the start.
-        speed: Metres a second.
-        yaw_rate: Radians a second.
-    """
-
-    x: Floats
-    y: Floats
-    heading: Floats
-    speed: Floats
-    yaw_rate: Floats
+    def render(self, robot: Robot, seconds: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """The picture at a moment, uint8[height * width * channels]."""
+        state, plan = robot.at(np.array([seconds])), robot.plan
+        angle = state.heading + self._yaw + self._angle
+        x, y = state.ahead(self._offset)
+        # Floor and ceiling, as if there were no walls.
+        stretch = 1 / np.cos(self._angle)
+        px = x.astype(np.float32) + self._away * (np.cos(angle) * stretch).astype(np.float32)
+        py = y.astype(np.float32) + self._away * (np.sin(angle) * stretch).astype(np.float32)
+        material = ((px >= 0) & (px <= WIDTH) & (py >= 0) & (py <= DEPTH)) + 2 * (self._slope < 0)
+        shade = np.repeat(0.55 + 0.45 / (1 + self._away**2 / 30), self.width, axis=1)
+        rays = np.repeat(x, self.width), np.repeat(y, self.width), angle
+        walls, things = plan.cast(*rays, plan.tall), plan.cast(*rays, ~plan.tall)
+        for number, hits in enumerate((walls, things), 4):
+            columns = np.flatnonzero((hits.surface >= 0) & (hits.distance <= walls.distance))
+            distance = hits.distance[columns]
+            light = 0.4 + 0.6 * hits.cosine[columns]
+            light = (light * (0.35 + 0.65 / (1 + (distance / 7) ** 2))).astype(np.float32)
+            depth = (distance * np.cos(self._angle[columns])).astype(np.float32)
+            z = CAMERA_HEIGHT - self._slope * depth
+            drawn = (z >= 0) & (z <= plan.height[hits.surface[columns]])
+            # A dark skirting board where a surface meets the floor.
+            light = light * np.where(z < 0.08, np.float32(0.55), np.float32(1))
+            shade[:, columns] = np.where(drawn, light, shade[:, columns])
+            material[:, columns] = np.where(drawn, number, material[:, columns])
+        palette = _PALETTE if self.channels == 3 else (_PALETTE @ _GREY)[:, None]
+        flat = np.asarray(palette[material] * shade[:, :, None], np.float32).ravel()
+        flat += 2.0 * rng.standard_normal(flat.size, np.float32)
+        return np.asarray(np.clip(flat, 0, 255).astype(np.uint8))
 
 
 class Odometer:
-    """Integrates the wheels: a wrong radius, a wrong track and slip make it drift.
-
-    Moments must come in order; the state is carried from call to call.
-    """
-
-    scale_error = 1.006
-    turn_error = 0.994
+    """Wheel encoders: a wrong radius, a wrong track and slip make them drift."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = robot
-        first = robot.at(np.zeros(1))
-        self._distance, self._truth = float(first.distance[0]), float(first.heading[0])
-        self._x = self._y = self._heading = 0.0
-        self._key = -1
-        self._last: Odometry | None = None
+        self._robot, self._before = robot, robot.at(np.zeros(1))
+        self._pose = (0.0, 0.0, 0.0)
 
-    def at(self, key: int, seconds: Floats, rng: np.random.Generator) -> Odometry:
-        """The next moments, or the same again.
-
-        Args:
-            key: Names the moments; a repeated key gives the last answer again.
-            seconds: float64[n], rising, after those of the call before.
-            rng: Slip.
-        """
-        if self._last is not None and key == self._key:
-            return self._last
-        state = self._robot.at(seconds)
-        driven = np.diff(state.distance, prepend=self._distance)
-        turned = np.diff(state.heading, prepend=self._truth)
-        driven = driven * (self.scale_error + 0.01 * rng.standard_normal(len(driven)))
-        turned = turned * (self.turn_error + 0.01 * rng.standard_normal(len(turned)))
-        heading = self._heading + np.cumsum(turned)
-        middle = heading - turned / 2
-        odometry = Odometry(
-            x=self._x + np.cumsum(driven * np.cos(middle)),
-            y=self._y + np.cumsum(driven * np.sin(middle)),
-            heading=heading,
-            speed=state.speed * self.scale_error,
-            yaw_rate=state.yaw_rate * self.turn_error,
-        )
-        if len(seconds):
-            self._distance, self._truth = float(state.distance[-1]), float(state.heading[-1])
-            self._x, self._y = float(odometry.x[-1]), float(odometry.y[-1])
-            self._heading = float(heading[-1])
-        self._key, self._last = key, odometry
-        return odometry
+    def measure(self, seconds: Floats, rng: np.random.Generator) -> State:
+        """Motion in the odom frame at rising moments, which follow those of the last call."""
+        truth, before = self._robot.at(seconds), self._before
+        driven = np.diff(truth.distance, prepend=before.distance[-1])
+        turned = np.diff(truth.heading, prepend=before.heading[-1])
+        driven = driven * (1.006 + 0.01 * rng.standard_normal(len(driven)))
+        turned = turned * (0.994 + 0.01 * rng.standard_normal(len(turned)))
+        x, y, heading = self._pose
+        headings = heading + np.cumsum(turned)
+        xs = x + np.cumsum(driven * np.cos(headings - turned / 2))
+        ys = y + np.cumsum(driven * np.sin(headings - turned / 2))
+        self._before, self._pose = truth, (xs[-1], ys[-1], headings[-1])
+        speed, yaw_rate = truth.speed * 1.006, truth.yaw_rate * 0.994
+        return truth._replace(x=xs, y=ys, heading=headings, speed=speed, yaw_rate=yaw_rate)
 
 
-@dataclass(frozen=True, slots=True)
-class Inertial:
-    """What the IMU says at n moments: z turn rate and the acceleration, float64[n]."""
-
-    yaw_rate: Floats
-    forward: Floats
-    left: Floats
-    up: Floats
-
-    gyro_noise = 0.002
-    acceleration_noise = 0.03
-
-    @classmethod
-    def measure(cls, state: State, rng: np.random.Generator) -> Inertial:
-        """Turn rate, acceleration along, centripetal acceleration, gravity, and noise."""
-        noise = rng.standard_normal((4, len(state.x)))
-        return cls(
-            yaw_rate=state.yaw_rate + cls.gyro_noise * noise[0],
-            forward=state.acceleration + cls.acceleration_noise * noise[1],
-            left=state.speed * state.yaw_rate + cls.acceleration_noise * noise[2],
-            up=GRAVITY + cls.acceleration_noise * noise[3],
-        )
+def inertial(state: State, rng: np.random.Generator) -> tuple[Floats, Floats, Floats, Floats]:
+    """Turn rate about z, and acceleration forward, left and up, float64[n] each."""
+    noise = rng.standard_normal((4, len(state.x)))
+    return (
+        state.yaw_rate + GYRO_NOISE * noise[0],
+        state.acceleration + ACCELERATION_NOISE * noise[1],
+        state.speed * state.yaw_rate + ACCELERATION_NOISE * noise[2],
+        GRAVITY + ACCELERATION_NOISE * noise[3],
+    )

@@ -568,17 +568,6 @@ def test_a_killed_benchmark_takes_its_server_along(name: str, tmp_path: Path) ->
     assert not working_in(tmp_path)
 
 
-def test_a_killed_keeper_takes_its_server_along(tmp_path: Path) -> None:
-    with opened("postgres_autocommit", tmp_path) as backend:
-        servers = backend.processes()
-        keeper = psutil.Process(servers[0]).parent()
-        assert keeper is not None
-        assert "server_keeper" in " ".join(keeper.cmdline())
-        keeper.kill()
-    assert not working_in(tmp_path)
-    assert not any(is_alive(pid) for pid in servers)
-
-
 @pytest.mark.parametrize(
     ("name", "module"),
     [

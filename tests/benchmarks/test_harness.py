@@ -18,9 +18,9 @@ import numpy as np
 import psutil
 import pytest
 
+from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.backends.nothing import Nothing
-from benchmarks.harness import usage
 from benchmarks.harness.child import MARK
 from benchmarks.harness.counters import Counters
 from benchmarks.harness.run import Outcome, Setting, run

@@ -21,12 +21,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from benchmarks.loads import hcr_like as hcr
 from benchmarks.loads import mit_like as mit
 from benchmarks.loads.base import PAYLOADS, Load
-from benchmarks.loads.cut import cut
-from benchmarks.loads.hcr_like import hcr_like
+from benchmarks.loads.hcr_like import cut, hcr_like
 from benchmarks.loads.logs import from_log, log_name
+from benchmarks.loads.made import received, steady
 from benchmarks.loads.mit_like import mit_like
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.timing import received, steady
 from benchmarks.loads.truth import NAME, Truth
 from hybridlog.sources.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
@@ -476,12 +475,8 @@ def test_spool_against_a_model(
     rng = np.random.default_rng(0)
     with Spool(directory) as spool:
         for number, (channel, times, size) in enumerate(parts):
-            rows = rng.integers(0, 256, (len(times), size), np.uint8)
-            payloads = [row.tobytes() for row in rows]
-            if number % 2:
-                spool.rows(channel, rows, times)
-            else:
-                spool.messages(np.full(len(times), channel, np.int32), payloads, times)
+            payloads = [rng.bytes(size + number % 2) for _ in times]
+            spool.messages(np.full(len(times), channel, np.int32), payloads, times)
             model += zip(times.tolist(), [channel] * len(times), payloads, strict=True)
         channels = [Channel(f"/{n}", "raw", None) for n in range(3)]
         if not model:

@@ -13,10 +13,8 @@ import pytest
 
 from benchmarks.backends.base import Backend
 from benchmarks.backends.nothing import Nothing
-from benchmarks.campaign import _plain
 from benchmarks.harness.run import Outcome, Setting
 from benchmarks.loads.base import Load
-from benchmarks.progress import Steps
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import ceiling, runs, throughput
 from benchmarks.studies.runs import Context, chosen, run_directory
@@ -32,7 +30,6 @@ def context(directory: Path, **settings: Any) -> Context:
             "work": directory / "work",
             "backends": {"nothing": Nothing},
             "journal": Journal(directory / "out"),
-            "steps": Steps(1, None, None),
             **settings,
         }
     )
@@ -44,35 +41,29 @@ def context(directory: Path, **settings: Any) -> Context:
 def test_the_full_plan_is_that_of_the_paper(tmp_path: Path) -> None:
     cases = throughput.plan(context(tmp_path, backends=BACKENDS))
     assert len(cases) == 8 * 3 * 5 * 3
-    assert len({case.sample.key for case in cases}) == len(cases)
-    assert sorted({case.sample.case["size"] for case in cases}) == [
+    assert len({case.key for case in cases}) == len(cases)
+    assert sorted({case.case["size"] for case in cases}) == [
         5_000, 10_000, 20_000, 40_000, 80_000, 160_000, 320_000, 640_000,
     ]  # fmt: skip
-    assert {case.sample.case["rate"] for case in cases} == {4, 16, 64}
-    assert {(c.sample.case["topics"], c.sample.case["messages"]) for c in cases} == {(20, 500)}
+    assert {case.case["rate"] for case in cases} == {4, 16, 64}
+    assert {(c.case["topics"], c.case["messages"]) for c in cases} == {(20, 500)}
     # Backends take turns within a stream, all streams come before the next repetition.
-    assert [case.sample.backend for case in cases[:6]] == ["nothing", "missing", "slow"] * 2
-    assert [case.sample.repetition for case in cases] == [n for n in range(5) for _ in range(72)]
-    assert sum(case.seconds for case in cases) > 500 / 4 * 8 * 5 * 3
+    assert [case.backend for case in cases[:6]] == ["nothing", "missing", "slow"] * 2
+    assert [case.repetition for case in cases] == [n for n in range(5) for _ in range(72)]
 
 
 def test_a_quick_plan_has_the_extremes_and_says_so(tmp_path: Path) -> None:
     quick = context(tmp_path, quick=True)
     cases = throughput.plan(quick)
-    streams = {(case.sample.case["size"], case.sample.case["rate"]) for case in cases}
+    streams = {(case.case["size"], case.case["rate"]) for case in cases}
     assert streams == {(5000, 4), (5000, 64), (640_000, 4), (640_000, 64)}
-    assert {case.sample.case["messages"] for case in cases} == {20}
-    assert throughput.expected_seconds(quick) < 60
-    assert _plain(throughput.Settings.usual(quick=True))["messages"] == 20
+    assert {case.case["messages"] for case in cases} == {20}
 
 
 def test_another_speed_is_another_case(tmp_path: Path) -> None:
     one, other = context(tmp_path), context(tmp_path, speed=2.0)
-    keys = [{case.sample.key for case in throughput.plan(c, SMALL)} for c in (one, other)]
+    keys = [{case.key for case in throughput.plan(c, SMALL)} for c in (one, other)]
     assert not keys[0] & keys[1]
-    usual = throughput.plan(one, replace(SMALL, messages=1000))
-    faster = throughput.plan(other, replace(SMALL, messages=1000))
-    assert usual[0].seconds - faster[0].seconds == 10
 
 
 def test_backends_are_chosen_by_name() -> None:
@@ -128,10 +119,8 @@ def test_what_is_done_is_not_done_again(
 
     started.clear()
     again = context(tmp_path)
-    assert throughput.expected_seconds(again, one) == throughput.plan(again, one)[1].seconds
     throughput.run(again, one)
     assert started == ["2 kB 50 Hz"]
-    assert throughput.expected_seconds(context(tmp_path), one) == 0
     capsys.readouterr()
     throughput.run(context(tmp_path), one)
     assert capsys.readouterr().err == ""
@@ -165,7 +154,7 @@ def test_the_machine_is_left_alone_after_a_run_that_kept_much(
     where = context(tmp_path, quick=quick)
     for number in range(4):
         wanted = Sample("throughput", {"size": 1}, "nothing", number)
-        where.run(wanted, lambda: make_load(tmp_path / f"load{number}"), seconds=1)  # noqa: B023
+        where.run(wanted, lambda: make_load(tmp_path / f"load{number}"))  # noqa: B023
     assert clock.slept == ([] if quick else [0, 2, 12, 0])
 
 
@@ -343,8 +332,6 @@ def test_a_search_is_done_and_goes_on_where_it_was(
         ("slow", 40), ("missing", 40), ("dying", 40), ("nothing", 40), ("slow", 80),
     ]  # fmt: skip
     limit = 1000
-    left = ceiling.expected_seconds(context(tmp_path, backends=backends), settings)
-    assert left > ceiling.expected_seconds(context(tmp_path, backends={"slow": Slow}), settings) > 0
     ceiling.run(context(tmp_path, backends=backends), settings)
     tried: dict[str, list[float]] = {}
     for name, rate in done:
@@ -366,7 +353,6 @@ def test_a_search_is_done_and_goes_on_where_it_was(
     assert found["slow"].stored_bytes_s == found["slow"].offered_bytes_s / 2
     done.clear()
     again = context(tmp_path, backends={"slow": Slow, "nothing": Nothing})
-    assert ceiling.expected_seconds(again, settings) == 0
     ceiling.run(again, settings)
     assert done == []
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import resource
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 _PROC = Path("/proc")
+_MONGOD_END_S = 60.0
 _SPIN = 250_000
 
 
@@ -77,6 +80,43 @@ def peak_rss(pids: Iterable[int]) -> int:
 def rss(pids: Iterable[int]) -> int:
     """Bytes of memory that processes have now; what they share counts for each."""
     return 1024 * sum(_kilobytes(pid).get("VmRSS", 0) for pid in pids)
+
+
+def own_peak() -> int:
+    """Most bytes of memory that this process has had resident since it was started."""
+    # getrusage would include the parent's memory, which a fork shares for a moment.
+    kilobytes = _kilobytes(os.getpid()).get("VmHWM")
+    if kilobytes is None:
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        kilobytes = used // 1024 if sys.platform == "darwin" else used
+    return kilobytes * 1024
+
+
+def working_below(directory: Path, program: str) -> tuple[int, ...]:
+    """Processes whose command line names a program and a directory, or what lies below it."""
+    name = str(directory.resolve()).encode()
+    found = []
+    for pid in _pids():
+        try:
+            command = (_PROC / str(pid) / "cmdline").read_bytes()
+        except OSError:
+            continue  # it has just ended
+        if name in command and program.encode() in command:
+            found.append(pid)
+    return tuple(found)
+
+
+def wait_for_mongods(directory: Path) -> None:
+    """Wait until no mongod with its data below a directory is left.
+
+    Raises:
+        TimeoutError: One does not end within a minute.
+    """
+    deadline = time.monotonic() + _MONGOD_END_S
+    while working_below(directory, "mongod"):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"The mongod below {directory} does not end.")
+        time.sleep(0.05)
 
 
 def mapped_rss(path: Path) -> int:

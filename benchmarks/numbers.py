@@ -1,0 +1,117 @@
+"""Numbers and names for people: three digits, sizes, spreads, backends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from math import floor, isfinite, log10
+from statistics import median
+from typing import NamedTuple
+
+from hybridlog.cli.output import printable
+
+OURS = "hybridlog"
+FLOORS = frozenset({"nothing", "mcap", "bagfile"})
+"""Backends that are no databases: a file, or nothing at all."""
+
+TITLES = {
+    OURS: "hybridlog",
+    "hybridlog_recorder": "hybridlog (recorder)",
+    "hybridlog_api": "hybridlog (its own API)",
+    "hybridlog_indexed": "hybridlog (indexed)",
+    "hybridlog_api_indexed": "hybridlog (its own API, indexed)",
+    "mongo_json": "MongoDB",
+    "mongo_json_indexed": "MongoDB (indexed)",
+    "mongo_json_batched": "MongoDB (batched)",
+    "postgres_autocommit": "PostgreSQL (autocommit)",
+    "postgres_tuned": "PostgreSQL (tuned)",
+    "postgres_tuned_indexed": "PostgreSQL (tuned, indexed)",
+    "sqlite_udf": "SQLite (Python functions)",
+    "sqlite_json1": "SQLite (JSON1)",
+    "bagfile": "ROS bag",
+    "mcap": "plain MCAP",
+    "nothing": "harness alone",
+}
+"""Backends in the order of every table and legend."""
+
+
+class Spread(NamedTuple):
+    """A measure of several repetitions."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Iterable[float | None]) -> Spread | None:
+        """None when there is no value."""
+        known = [value for value in values if value is not None]
+        return cls(median(known), min(known), max(known)) if known else None
+
+
+def title(backend: str) -> str:
+    """A backend's name for people."""
+    return TITLES.get(backend, printable(backend))
+
+
+def ordered(backends: Iterable[str]) -> list[str]:
+    """Backends in the order of every table: ours, the paper's, the rest."""
+    places = {name: place for place, name in enumerate(TITLES)}
+    return sorted(set(backends), key=lambda name: (places.get(name, len(places)), name))
+
+
+def databases(backends: Iterable[str]) -> list[str]:
+    """Those that can be asked and are not ours."""
+    return [n for n in ordered(backends) if n not in FLOORS and not n.startswith(OURS)]
+
+
+def number(value: float) -> str:
+    """Three digits: `0.012`, `1.23`, `123`, `12,300`."""
+    if not isfinite(value):
+        return "∞" if value > 0 else "—"
+    if value == 0:
+        return "0"
+    digits = 2 - floor(log10(abs(value)))
+    rounded = round(value, digits)
+    if digits <= 0:
+        return f"{rounded:,.0f}"
+    # A number such as 9.999 has one digit less to show once it is rounded.
+    text = f"{rounded:,.{max(0, 2 - floor(log10(abs(rounded))))}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def size(count: float) -> str:
+    """Bytes: `5 kB`, `640 kB`, `1.5 GB`."""
+    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= unit:
+            return f"{number(count / unit)} {name}"
+    return f"{count:.0f} B"
+
+
+def percent(value: float) -> str:
+    """Percents: `100`, `98.2`, `99.997`; what is below 100 is never rounded up to it."""
+    if value >= 100:
+        return "100"
+    for places in (1, 2, 3, 4):
+        shown = f"{value:.{places}f}"
+        if float(shown) < 100:
+            return shown.rstrip("0").rstrip(".")
+    return "99.9999"
+
+
+def with_spread(value: Spread) -> str:
+    """`12.3 (11.9…12.8)`; a spread of less than a hundredth of the median is left out."""
+    low, middle, high = map(number, (value.low, value.median, value.high))
+    if low == high or value.high - value.low < 0.01 * abs(value.median):
+        return middle
+    return f"{middle} ({low}…{high})"
+
+
+def percents(value: Spread) -> str:
+    """`98.1 (97…99)`, in percent."""
+    low, middle, high = map(percent, (value.low, value.median, value.high))
+    return middle if low == high else f"{middle} ({low}…{high})"
+
+
+def listed(names: Sequence[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

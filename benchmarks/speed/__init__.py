@@ -1,1 +1,0 @@
-"""The speed targets, measured: each side in its own process, ratios from one run."""
