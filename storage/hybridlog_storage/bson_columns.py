@@ -45,7 +45,7 @@ _NUMBERS: dict[int, np.dtype[Any]] = {
 
 @dataclass(slots=True)
 class BsonStrings:
-    """One string or binary value a row.
+    """A column of strings or binary values.
 
     Attributes:
         data: uint8, the bytes of all rows one after the other, without terminating NUL.
@@ -65,7 +65,7 @@ class BsonStrings:
 
 @dataclass(slots=True)
 class BsonStringArrays:
-    """One array of strings a row, with the same number of strings in each.
+    """A column of string arrays of equal length.
 
     Attributes:
         strings: Row i of the arrays is rows `i * width` to `(i + 1) * width` of these.
@@ -82,12 +82,12 @@ class BsonStringArrays:
 
 BsonColumn: TypeAlias = "NDArray[Any] | BsonStrings | BsonStringArrays | list[Any] | None"
 """A column: numbers (n,), arrays of numbers (n, k), dates as datetime64[ms], strings and
-binary values, Python values where there is nothing better, None when all are null."""
+binary values, Python values for other types, None if all are null."""
 
 
 @dataclass(slots=True)
 class BsonGroup:
-    """Documents of one shape.
+    """Documents of one shape, as columns.
 
     Attributes:
         rows: Numbers of the documents in the batch, ascending.
@@ -102,7 +102,7 @@ class BsonGroup:
 
 
 def split(batch: bytes) -> NDArray[np.int64]:
-    """Find the documents in a concatenation of BSON documents.
+    """Start of each document in a concatenation of BSON documents.
 
     Args:
         batch: Documents one after the other, as `find_raw_batches` gives them.
@@ -144,7 +144,7 @@ def split(batch: bytes) -> NDArray[np.int64]:
 
 
 def _run(batch: bytes, position: int, length: int) -> int:
-    """How many documents of exactly `length` bytes follow each other from `position`."""
+    """Number of documents of exactly `length` bytes in a row from `position`."""
     possible = (len(batch) - position) // length
     count, window = 0, 32
     while count < possible:
@@ -196,7 +196,7 @@ def read_columns(batch: bytes) -> list[BsonGroup]:
                 break
             shape = _Shape.of(batch, int(start[rest[0]]), size)
             if shape is None:
-                # Each cost a walk for nothing; after a few the others are not tried.
+                # Each costs a walk without gain; after a few the others are not tried.
                 most_small -= 1
                 tried = 1 if most_small > 0 else len(rest)
                 singles.append(rest[:tried])
@@ -220,7 +220,7 @@ def read_columns(batch: bytes) -> list[BsonGroup]:
 def _decoded(
     batch: bytes, start: NDArray[np.int64], length: NDArray[np.int64], rows: NDArray[np.intp]
 ) -> BsonGroup:
-    """Documents read one by one."""
+    """Decode documents one by one."""
     documents = [
         _decode(batch[begin : begin + size], begin)
         for begin, size in zip(start[rows].tolist(), length[rows].tolist(), strict=True)
@@ -258,7 +258,7 @@ def _gather(batch: bytes, start: NDArray[np.int64], size: int) -> NDArray[np.uin
 
 
 def _matches(documents: NDArray[np.uint8], shape: _Shape) -> NDArray[np.bool_]:
-    """Which documents equal the shape's own outside its values, shape (n,)."""
+    """A mask of the documents that equal the template outside its values, shape (n,)."""
     words = documents.shape[1] // 8
     template = np.zeros(words * 8, np.uint8)
     template[: len(shape.template)] = shape.template
@@ -275,12 +275,12 @@ def _matches(documents: NDArray[np.uint8], shape: _Shape) -> NDArray[np.bool_]:
 
 
 class _Unshapely(Exception):  # noqa: N818
-    """A document with something that has no columns; it is decoded by `bson` instead."""
+    """A document with values that have no column form; `bson` decodes it."""
 
 
 @dataclass(slots=True)
 class _Leaf:
-    """Where a value lies in every document of a shape.
+    """Position of a value in every document of a shape.
 
     Attributes:
         code: BSON type of the value.
@@ -297,7 +297,7 @@ class _Leaf:
 
 @dataclass(slots=True)
 class _Shape:
-    """What documents of one group have in common.
+    """The common layout of a group of documents.
 
     Attributes:
         template: uint8, one of the documents.
@@ -397,7 +397,7 @@ def _strings(
 
 
 def _lists(values: NDArray[np.uint8]) -> list[Any]:
-    """Arrays of documents and the like: equal bytes are decoded once.
+    """Arrays of other values as lists; equal bytes are decoded once.
 
     Args:
         values: Shape (n, bytes of the array, which is a BSON document itself).
@@ -417,7 +417,7 @@ def _lists(values: NDArray[np.uint8]) -> list[Any]:
 
 
 class _Walk:
-    """One document, element by element, with every length checked."""
+    """Walks one document element by element and checks every length."""
 
     def __init__(self, document: bytes, origin: int) -> None:
         self._bytes = document
@@ -455,7 +455,7 @@ class _Walk:
             raise self._bad(position, "a document does not end with NUL")
 
     def _array(self, start: int, end: int, depth: int) -> _Leaf:
-        """An array: of numbers of one type, of strings, or else a list of Python values."""
+        """Collect an array: numbers of one type, strings, or a list of Python values."""
         spans: list[tuple[int, int]] = []
         codes: set[int] = set()
         for code, _, position in self._elements(start, end, depth):
@@ -467,7 +467,7 @@ class _Walk:
             return _Leaf(0x04, spans, item=codes.pop())
         if not codes:
             return _Leaf(0x04, [])
-        # All bytes but the length are the value: what is inside may differ.
+        # All bytes but the length are the value: its content may differ.
         return _Leaf(0x04, [(start, end - start)])
 
     def _value(self, code: int, position: int, size: int) -> _Leaf:
@@ -485,7 +485,7 @@ class _Walk:
         return _Leaf(code, [])
 
     def _elements(self, start: int, end: int, depth: int) -> list[tuple[int, bytes, int]]:
-        """Type, name and place of the value of each element of a document."""
+        """Type, name and position of each element of a document."""
         data = self._bytes
         (length,) = _LENGTH.unpack_from(data, start)
         if length != end - start or data[end - 1]:
@@ -506,7 +506,7 @@ class _Walk:
         return found
 
     def _size(self, code: int, position: int, end: int) -> int:
-        """Bytes of a value; it ends before byte `end - 1`."""
+        """Size of a value in bytes; it ends before byte `end - 1`."""
         if code in _NUMBERS:
             size = _NUMBERS[code].itemsize
         elif code == 0x0A:

@@ -1,11 +1,11 @@
-"""A file of columns: tables of many rows, of which each column can be read by itself.
+"""A file of tables in which each column can be read separately.
 
-What such a file holds follows from other files and can be made again. So nobody waits
-until it is on the disk; checksums say whether it got there. It grows a block at a time, a
-block being some rows of one column, and is visible under its name only when it is whole.
+The file is derived from other files and can be rebuilt. So it is not forced to the disk;
+checksums show whether it is intact. It grows by blocks, each with some rows of one column,
+and gets its final name when it is complete.
 
-What there is of a table stands on a page of its own, so that who asks about one table need
-not read about the others.
+The description of each table is a page of its own, so a reader of one table need not read
+those of others.
 
 ```
 magic, blocks, pages, directory, tail, magic
@@ -40,7 +40,7 @@ _TAIL = struct.Struct("<QI")  # bytes of the directory, its checksum
 
 
 class _Block(NamedTuple):
-    """An entry of the table of blocks."""
+    """Position and checksum of a block."""
 
     rows: int
     same: int
@@ -54,7 +54,7 @@ _ENTRY = np.dtype([*zip(_Block._fields, ("<u4", "<u4", "<u8", "<u8", "<u4", "<u4
 _TYPES = frozenset({"|b1", "|i1", "|u1", *(f"<{k}{n}" for k in "iu" for n in (2, 4, 8))})
 _KNOWN = _TYPES | {"<f4", "<f8", TEXT}
 _MOST_ROWS = 1 << 31  # of a block
-_MOST_DIRECTORY = 256 << 20  # bytes of the directory, and of all pages together
+_MOST_DIRECTORY = 256 << 20  # bytes of the directory, and of all pages
 _CURE = "Run `hybridlog reindex`; until then MongoDB answers."
 
 
@@ -75,19 +75,19 @@ Values = np.ndarray[Any, Any] | Text
 
 
 class ColumnFileWriter:
-    """Writes a file of columns under a name of its own until it is whole.
+    """Writes a file of columns under a temporary name.
 
     Args:
         path: Its final name, in a recording's folder.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: It cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._part = part_of(path)
-        # What lies there under that name is a crash's, or nothing to be written to.
+        # A file of that name is left from a crash, or must not be written.
         remove(self._part)
         self._fd = files.open_file(self._part, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._end = 0
@@ -108,12 +108,12 @@ class ColumnFileWriter:
             table: Its name.
             columns: By name, all of the same number of rows; the same names and types each
                 time.
-            place: Where they belong: after rows of a lower place and, of the same one, after
-                those that were added before.
+            place: Sort position: after rows of a lower place and, for the same place, after
+            those added before.
 
         Raises:
             OSError: They cannot be written.
-            ValueError: Names or types are others than before.
+            ValueError: Names or types differ from those before.
         """
         types = {name: _type_of(values) for name, values in columns.items()}
         if self._tables.setdefault(table, types) != types:
@@ -136,10 +136,10 @@ class ColumnFileWriter:
         self._write(everything)
 
     def close(self, tables: Mapping[str, Mapping[str, object]]) -> None:
-        """Give the file its name; without any table there is no file.
+        """Give the file its final name; without any table, create no file.
 
         Args:
-            tables: Names of those that are kept, and what is noted of each, as JSON.
+            tables: The tables to write, each with its notes as JSON.
 
         Raises:
             OSError: It cannot be written.
@@ -164,16 +164,16 @@ class ColumnFileWriter:
             self.discard()
 
     def _page(self, name: str, notes: Mapping[str, object]) -> tuple[bytes, bytes]:
-        """What there is of a table, and its blocks: those of a column together."""
+        """The description of a table and its blocks, column by column."""
         about = _as_json({"columns": [*self._tables[name].items()], "notes": notes})
         parts = sorted(self._blocks[name], key=lambda rows: rows.place)
         return about, np.array([rows.blocks for rows in parts]).T.tobytes()
 
     def discard(self) -> None:
-        """Leave nothing of what was not given its name, as far as the system lets us."""
+        """Remove the temporary file, if possible."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
-            with suppress(OSError):  # of a file that nobody will read
+            with suppress(OSError):  # errors of a file that will not be read
                 os.close(fd)
             with suppress(OSError):
                 files.unlink(self._part)
@@ -183,12 +183,12 @@ class ColumnFileWriter:
 
 
 def part_of(path: Path) -> Path:
-    """Name of a file of columns while it is written."""
+    """The temporary name of a file of columns."""
     return path.with_name(f"{path.name}.part")
 
 
 def remove(path: Path) -> None:
-    """Remove a file of columns, if it is there.
+    """Remove a file of columns, if it exists.
 
     Raises:
         OSError: It cannot be removed.
@@ -204,7 +204,7 @@ class ColumnFile:
         path: The file.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: It does not exist.
         StoreError: It cannot be read, or is damaged.
     """
 
@@ -225,25 +225,25 @@ class ColumnFile:
             os.close(self._fd)
 
     def rows(self, table: str) -> int:
-        """Rows of a table; 0 when there is none of that name.
+        """Number of rows of a table; 0 if it does not exist.
 
         Raises:
-            StoreError: What there is of it is damaged; so do all that name a table.
+            StoreError: Its page is damaged; the other methods that name a table raise this, too.
         """
         return self._table(table).rows if table in self._pages else 0
 
     def memory(self, table: str, column: str) -> int:
-        """Bytes that a column takes when it has been read, without where its strings begin."""
+        """Memory of a column in bytes, without the offsets of its strings."""
         blocks = self._table(table).blocks[column]
         times = np.where(blocks["same"] == 1, blocks["rows"], 1).astype(np.float64)
         return int((times * blocks["size"]).sum())
 
     def types(self, table: str) -> Mapping[str, str]:
-        """Types of a table's columns by name; none when there is no such table."""
+        """Types of a table's columns by name; empty if it does not exist."""
         return self._table(table).types if table in self._pages else {}
 
     def notes(self, table: str) -> Mapping[str, object]:
-        """What is noted of a table."""
+        """Notes of a table."""
         return self._table(table).notes
 
     def tables(self) -> AbstractSet[str]:
@@ -251,12 +251,12 @@ class ColumnFile:
         return self._pages.keys()
 
     def size(self, table: str, columns: Collection[str]) -> int:
-        """Bytes to be read for some columns of a table."""
+        """Bytes to read for some columns of a table."""
         found = self._table(table)
         return sum(int(found.blocks[name]["size"].sum()) for name in columns)
 
     def read(self, table: str, column: str) -> Values:
-        """A whole column.
+        """Read a whole column.
 
         Raises:
             StoreError: It is damaged.
@@ -273,7 +273,7 @@ class ColumnFile:
         return values
 
     def check(self) -> None:
-        """Read all of it.
+        """Read and check the whole file.
 
         Raises:
             StoreError: Something is damaged.
@@ -285,7 +285,7 @@ class ColumnFile:
                     self._raw(block)
 
     def _directory(self, size: int) -> tuple[int, dict[str, Any]]:
-        """Where it begins, and where the page of each table is, as it says."""
+        """Start of the directory, and the position of each table's page."""
         least = len(MAGIC) * 2 + _TAIL.size
         if size < least or self._read(0, len(MAGIC)) != MAGIC:
             raise self._damaged("it is too short, or no file of columns")
@@ -318,7 +318,7 @@ class ColumnFile:
         return page
 
     def _table(self, name: str) -> _Table:
-        """What there is of a table, read when it is first asked for."""
+        """The description of a table, read on first use."""
         table = self._tables.get(name)
         if table is None:
             table = self._tables[name] = self._read_table(name)
@@ -333,7 +333,7 @@ class ColumnFile:
             about = json.loads(data[: page.length])
             columns, notes = about["columns"], dict(about["notes"])
             types = {str(column): kind for column, kind in columns}
-            # Each time rows were added, every column got a block.
+            # Each addition of rows gave every column a block.
             blocks = np.frombuffer(data, _ENTRY, offset=page.length).reshape(len(types), -1)
             is_known = (
                 len(types) == len(columns) and blocks.size and _KNOWN.issuperset(types.values())
@@ -344,13 +344,13 @@ class ColumnFile:
         if not is_known or (rows != rows[0]).any() or int(rows.max()) >= _MOST_ROWS:
             raise self._damaged(f"columns of {name!r} are unknown or unequal")
         offset, ends = blocks["offset"], blocks["offset"] + blocks["size"]
-        # What is added up beyond 64 bits is less than its parts.
+        # A sum that overflows 64 bits is less than its parts.
         if (ends < offset).any() or int(ends.max()) > self._start:
             raise self._damaged(f"it names places outside of it for {name!r}")
         return _Table(types, notes, int(rows[0].sum()), dict(zip(types, blocks, strict=True)))
 
     def _fill(self, block: _Block, values: NDArray[Any]) -> None:
-        """Rows of a block of numbers, read to where they belong."""
+        """Read the rows of a block of numbers into place."""
         wanted = values.itemsize if block.same else values.nbytes
         if block.size != wanted:
             raise self._damaged(f"the block at byte {block.offset} has the wrong length")
@@ -405,7 +405,7 @@ class ColumnFile:
 
 
 class _Page(NamedTuple):
-    """Where a table's page is: its description in JSON, and its blocks behind that."""
+    """Position of a table's page: a description in JSON, followed by its blocks."""
 
     offset: int
     length: int  # of the description, bytes
@@ -414,21 +414,21 @@ class _Page(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of all of it."""
+        """Bytes of the page."""
         return self.length + self.blocks * _ENTRY.itemsize
 
 
 class _Table(NamedTuple):
-    """What there is of a table."""
+    """The description of a table."""
 
-    types: dict[str, str]  # of its columns, by name
+    types: dict[str, str]  # types of its columns, by name
     notes: dict[str, object]
     rows: int
-    blocks: dict[str, NDArray[np.void]]  # of each column, in order
+    blocks: dict[str, NDArray[np.void]]  # blocks of each column, in order
 
 
 class _Rows(NamedTuple):
-    """Rows of a table that were added together: where they belong, a block a column."""
+    """Rows of a table that were added together, with one block for each column."""
 
     place: tuple[int, int]
     blocks: NDArray[np.void]
@@ -451,7 +451,7 @@ def _rows(values: Values) -> int:
 
 
 def _is_same(values: Values) -> bool:
-    """Whether all rows have the same bytes."""
+    """True if all rows are equal byte for byte."""
     if isinstance(values, Text):
         size = np.diff(values.offset)
         if bool((size != size[0]).any()):
@@ -464,7 +464,7 @@ def _is_same(values: Values) -> bool:
 
 
 def _packed(values: Values, rows: int) -> list[Any]:
-    """The first rows as bytes; one string alone has no length."""
+    """The first rows as bytes; a single string has no length."""
     if not isinstance(values, Text):
         return [np.ascontiguousarray(values[:rows]).view(np.uint8).data]
     first, last = int(values.offset[0]), int(values.offset[rows])
