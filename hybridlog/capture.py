@@ -1,8 +1,7 @@
-"""One recording while it is being made: its directory, its segments and its way to the index.
+"""A recording in progress: its directory, its segments and its index.
 
-Whatever the messages come from, a log file or a running robot, they go through a
-`Capture`: it starts the recording, gives them a writer, and either brings it to its end
-or takes back that it was ever there.
+Messages of log files and of running robots both go through a `Capture`. It starts the
+recording, provides its writer, and completes or removes the recording.
 """
 
 from __future__ import annotations
@@ -40,20 +39,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What whoever cannot wait asks of segments and index.
+    """Settings of a live recording, which cannot wait for compression, disk and index.
 
     Attributes:
-        hurry: Says whether there is more than can be handed over. Only chunks that shrink to
-            little are compressed then.
-        behind: Says whether there is so much more that the index waits, falls behind, and
-            reads back later from the segments what is no longer in memory.
-        has_room: Says whether so many bytes of chunks may wait for the index in memory.
-        next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
-        spare: Processors for what can wait: to pack a chunk, where there is no hurry, and to
-            make documents and columns of one.
-        on_written: Called, on another thread, when less waits for the disk. Whoever appends
-            never waits, and looks at `writer.waiting` instead.
-        renew: Gives another connection to the index when one has failed.
+        hurry: Returns whether writing is behind. Then only chunks that shrink to a fifth are
+            compressed.
+        behind: Returns whether writing is so far behind that indexing pauses; it later reads
+            chunks back from the segments.
+        has_room: Returns whether this many bytes of chunks may wait for the index in memory.
+        next_chunk_size: Returns the size in bytes of the next chunk.
+        spare: Semaphore of the processors for packing without hurry, and for making documents
+            and columns.
+        on_written: Called on another thread when less content waits for the disk. `append`
+            then never waits; its caller watches `writer.waiting`.
+        renew: Returns a new connection to the index after one has failed.
     """
 
     hurry: Callable[[], bool]
@@ -66,24 +65,24 @@ class Pace:
 
 
 class Capture:
-    """Takes the messages of one new recording.
+    """Records the messages of one new recording.
 
     Args:
         directory: The store.
         catalog: Its catalog.
         database: The index.
         name: Name of the recording.
-        tags: Kept with it.
-        source: What its messages come from, as the catalog shows it.
-        settings: How segments are cut and packed.
-        pace: Of whoever appends, if it cannot wait for compression, disk and index.
-        check: Called with the catalog before anything is made, while nobody else can
+        tags: Tags of the recording.
+        source: Origin of its messages, for the catalog.
+        settings: Division and compression of segments.
+        pace: Settings of a live recording; None if `append` may wait.
+        check: Called with the catalog before files are created, while no other process can
             start a recording; raises to refuse.
 
     Attributes:
         entry: The recording's catalog entry.
-        writer: Its segments.
-        index: Its way to the index.
+        writer: Writer of its segments.
+        index: Writer of its index.
     """
 
     def __init__(
@@ -106,7 +105,7 @@ class Capture:
         self._turn = 1
         self._held = ExitStack()
         with self._held, directory.alone():
-            # Who records the same at this moment is refused, or refuses us.
+            # Of two processes that record the same content now, one is refused.
             if check is not None:
                 check(self.catalog)
             self.entry = self._begin(name, tags, source, IndexState(database))
@@ -130,15 +129,15 @@ class Capture:
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
-        """Bring the recording to its end; `entry` is then complete.
+        """Complete the recording; `entry` is then complete, too.
 
         Args:
-            end: What its last segment says of it: `status` and `losses`.
+            end: The end of the recording: `status` and `losses`.
 
         Returns:
             Why the index is not complete, None when it is.
         """
-        # Only the last segment announces the end, and no other is sealed from here on.
+        # From here on only the last segment is sealed, which announces the end.
         self.writer.flush()
         self._end = end
         self.writer.close(json_metadata(END_METADATA, end))
@@ -147,7 +146,7 @@ class Capture:
     def give_up(
         self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
     ) -> DatabaseError | None:
-        """Bring the recording to its end where nothing more can be written.
+        """Complete the recording on a full disk.
 
         Args:
             end: As for `close`.
@@ -157,16 +156,16 @@ class Capture:
             Why the index is not complete, None when it is.
 
         Raises:
-            DiskFullError: There is not even room for that.
+            DiskFullError: No room for that either.
         """
-        self._end = end  # what was lost at last says the segment
+        self._end = end  # the segment holds the last losses
         self.writer.give_up(
             [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
         )
         return self._finish()
 
     def _announce(self, sealed: Sealed) -> None:
-        """List a segment in the journal before it gets its final name."""
+        """Write a segment into the journal before it gets its final name."""
         lines = [sealed_event(sealed)]
         if self._end is not None:
             lines.append(journal.event(journal.ENDED, end=dict(self._end)))
@@ -190,16 +189,16 @@ class Capture:
         return failure
 
     def leave(self) -> None:
-        """Stop at once; what was flushed stays, and the next opening of the store seals it."""
+        """Stop at once; flushed messages stay, and the next opening of the store seals them."""
         self.writer.abort()
         self.index.abandon()
         self._gatherer.discard()
         self._held.close()
 
     def forget(self) -> None:
-        """Take the whole recording back; what cannot be done now, the next opening does."""
+        """Remove the whole recording; the next opening finishes a removal that fails."""
         label, entry = self.entry.label, self.entry
-        with suppress(HybridlogError):  # the directory's new name says it, too
+        with suppress(HybridlogError):  # the directory's hidden name announces it, too
             announce_removal(self._directory, label)
         self.writer.abort()
         self.index.abandon()
@@ -208,7 +207,7 @@ class Capture:
             remove_files(self._directory, label)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
-        # If the database is away, the next connection finds an entry without files.
+        # If MongoDB is unavailable, the next connection finds an entry without files.
         with suppress(HybridlogError):
             state = IndexState(self.index.database)
             state.clear(entry.key, {collection_of(c.topic) for c in self.writer.channels.values()})
@@ -218,7 +217,7 @@ class Capture:
     def _begin(
         self, name: str, tags: Mapping[str, str], source: Mapping[str, Any], state: IndexState
     ) -> RecordingEntry:
-        """The recording's directory, locked, its journal, and its place in the index."""
+        """Create and lock the recording's directory, its journal and its index entry."""
         name = text(name)
         label = self._directory.new_recording(name)
         try:
@@ -256,7 +255,7 @@ class Capture:
 
 
 def origin() -> dict[str, Any]:
-    """Where a recording is made: host, boot, recorder, clock."""
+    """The origin of a recording: host, boot, recorder, clock."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""Opening a store: the one module that wires directory, database, segments and reader."""
+"""Opens a store: connects directory, database, segments and reader."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongod import EmbeddedMongod
 
 DEFAULT_STORE = "hybridlog-store"
-_MOST_OPEN = 256  # segments, and files of columns
-_MOST_WORDS = 128  # topics and predicates whose meaning is remembered
+_MOST_OPEN = 256  # open segments and files of columns
+_MOST_WORDS = 128  # topic names and predicates in the cache
 
 
 def store_path(path: str | Path | None = None) -> Path:
-    """Where the store is: the argument, else `HYBRIDLOG_STORE`, else `./hybridlog-store`."""
+    """Path of the store: the argument, else `HYBRIDLOG_STORE`, else `./hybridlog-store`."""
     return Path(path or os.environ.get("HYBRIDLOG_STORE") or DEFAULT_STORE)
 
 
@@ -73,21 +73,21 @@ def open_store(
     require_database: bool = False,
     progress: Progress | None = None,
 ) -> Store:
-    """Open a store; what a crash has left is mended first.
+    """Open a store; recover first after a crash.
 
     MongoDB is connected to when a question needs it.
 
     Args:
-        path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; without,
+        path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; by default
             `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
-        create: Make the store if there is none.
-        shared: Let the group write the store; when it is made.
+        create: Create the store if it does not exist.
+        shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
 
     Raises:
-        StoreError: there is no store there, or it is of another format.
+        StoreError: It is not a store, or has another format.
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
@@ -98,7 +98,7 @@ def open_store(
         directory = StoreDirectory.create(where, mongo=own, shared=shared)
         directory.check_writable()
         if is_new and own is not None:
-            with suppress(StoreError):  # without a home, each command names it again
+            with suppress(StoreError):  # without a home directory, each command must name it again
                 consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
@@ -113,22 +113,21 @@ def open_store(
 
 
 class Store:
-    """A directory of recordings and the database that makes them answerable.
+    """A directory of recordings and the database that indexes them.
 
-    Use `hybridlog.open`; a store is a context manager. One store may be used by several
-    threads for reading.
+    Opened by `hybridlog.open`. A context manager; several threads may read from one store.
 
     Args:
-        directory: Where it lies.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one that
-            the store names.
+        directory: Its directory.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in the
+            store's settings.
         progress: Called while an index is brought up to date.
 
     Attributes:
-        directory: Where it lies.
-        without_database: Why MongoDB is unavailable; None while it is not known to be.
-        repairs: What had to be mended when it was opened.
-        kept: Columns of what is asked for again and again.
+        directory: Its directory.
+        without_database: Why MongoDB is unavailable; None unless it is known to be.
+        repairs: Repairs made when it was opened.
+        kept: Cached columns of frequently used fields.
         recent_chunks: Chunks that single messages were read from.
     """
 
@@ -148,7 +147,7 @@ class Store:
         self._uri: str | None = None
         self._progress = progress
         self._connecting = threading.RLock()
-        self._is_indexed = False  # the recordings that are known are in the index
+        self._is_indexed = False  # the known recordings are indexed
         self._recordings: list[RecordingEntry] | None = None
         self._belief: Belief | None = None
         self._schemas: dict[str, Schema] = {}
@@ -168,7 +167,7 @@ class Store:
             raise
 
     def __enter__(self) -> Self:
-        """The store itself."""
+        """Return this store."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -182,12 +181,12 @@ class Store:
 
     @property
     def connected(self) -> Database | None:
-        """The index, if a question has needed it already."""
+        """The index, if it is connected."""
         return self._database
 
     @property
     def database(self) -> Database | None:
-        """The index; None if MongoDB is unavailable. It is connected to when first asked for."""
+        """The index, connected on first use; None if MongoDB is unavailable."""
         if self.without_database is None and not (self._database and self._is_indexed):
             with suppress(HybridlogError):
                 self.connect()
@@ -198,7 +197,7 @@ class Store:
 
         Raises:
             DatabaseError: MongoDB does not answer.
-            StoreError: it holds the index of another store, or this store is a copy.
+            StoreError: It holds the index of another store, or this store is a copy.
         """
         from hybridlog.maintenance import index
 
@@ -233,10 +232,10 @@ class Store:
             return self._database
 
     def _another_database(self) -> Database:
-        """A connection; the embedded MongoDB is started if it is not there (any more).
+        """Make a connection; start the embedded MongoDB if it is not running.
 
         Raises:
-            DatabaseError: it does not answer.
+            DatabaseError: It does not answer.
         """
         from hybridlog_storage.database import Database
 
@@ -252,7 +251,7 @@ class Store:
             try:
                 uri = self._mongod.start()
             except StoreError as error:
-                # A store that cannot be written has no embedded MongoDB; its segments do.
+                # A store that cannot be written has no embedded MongoDB, but readable segments.
                 raise DatabaseError(str(error)) from error
         else:
             uri = with_password(uri)
@@ -260,7 +259,7 @@ class Store:
 
     @property
     def index_place(self) -> str:
-        """Where the index is, without asking it."""
+        """Description of the index's place, without connecting."""
         if self._database is not None:
             return f"database {self._database.name} at {self._database.address}"
         uri = self._wanted or self.directory.settings.mongo or EMBEDDED
@@ -271,7 +270,7 @@ class Store:
         return without_secrets(uri)
 
     def disconnect(self) -> None:
-        """Leave the database; what remains is reading by time."""
+        """Disconnect from the database; fetching by topic and time still works."""
         if self._database is not None:
             self._database.close()
         self._database = None
@@ -281,7 +280,7 @@ class Store:
         self._mongod = None
 
     def close(self) -> None:
-        """Give everything back. May be called more than once."""
+        """Close files and connections. May be called more than once."""
         with self._lock:
             for reader in self._segments.values():
                 reader.close()
@@ -311,17 +310,17 @@ class Store:
         return GuardedIndex(self, self.database_for(purpose), recordings)
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
-        """What the index has said of some recordings, since the catalog was read.
+        """The index states of some recordings, cached since the catalog was read.
 
         Args:
             database: The index.
-            keys: Of the recordings.
-            anew: Ask it now.
+            keys: Keys of the recordings.
+            anew: Read them again.
         """
         found = self._belief = Belief.of(database, keys, None if anew else self._belief)
         return found
 
-    # What is in it.
+    # Content.
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first."""
@@ -329,7 +328,7 @@ class Store:
             try:
                 self._recordings = repair_on_open(self.directory, self.catalog, self.repairs)
             except DiskFullError as error:
-                # What is there can be read all the same, and removed.
+                # Existing recordings can still be read and removed.
                 self.repairs.disk_full = error
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
@@ -340,7 +339,7 @@ class Store:
         """The entry of a recording, by its id or its label.
 
         Raises:
-            TopicError: there is none.
+            TopicError: It does not exist.
         """
         for entry in self.recordings():
             if recording in {entry.id, entry.label}:
@@ -348,14 +347,14 @@ class Store:
         raise TopicError(f"Recording {recording!r} is not in the store any more.")
 
     def refresh(self) -> None:
-        """Forget what was read of the catalog."""
+        """Read the catalog again on next use."""
         self._recordings = None
         self._is_indexed = False
         self._belief = None
         self._schemas = {}
         self._lanes.clear()
         with self._lock:
-            self._columns.clear()  # closed by the last thread that reads from them
+            self._columns.clear()  # the last reading thread closes them
             self._segments.clear()
         self._chunk_lists.clear()
         self.kept.clear()
@@ -363,9 +362,9 @@ class Store:
         self._learn()
 
     def _learn(self) -> None:
-        """Remember from now on what words of questions mean: to find out takes half of a count.
+        """Reset the cache of topic names and predicates; resolving them takes half of a count.
 
-        Anew, not emptied: who looks something up at this moment looks into what was before.
+        It is replaced, not emptied: concurrent lookups use the previous one.
         """
         self._resolved = lru_cache(_MOST_WORDS)(self._resolve)
         self._compiled = lru_cache(_MOST_WORDS)(self._compile)
@@ -374,7 +373,7 @@ class Store:
         """Recordings by label, by name, by id, or by the beginning of one of these.
 
         Raises:
-            TopicError: there is no such recording, or there are several.
+            TopicError: No recording matches, or several do.
         """
         everything = self.recordings()
         chosen: list[RecordingEntry] = []
@@ -395,11 +394,11 @@ class Store:
         return chosen
 
     def topics(self) -> list[str]:
-        """Names of all topics, sorted; also of those of which all messages are lost."""
+        """Names of all topics, sorted, including those whose messages are all lost."""
         return sorted({topic for r in self.recordings() for topic in topics_of(r)})
 
     def lanes(self, recording: RecordingEntry) -> list[Lane]:
-        """The channels of a recording, with what reads them."""
+        """The channels of a recording, with their codecs."""
         lanes = self._lanes.get(recording.id)
         if lanes is None:
             channels = self._channels(recording)
@@ -411,13 +410,13 @@ class Store:
         """The channels of a recording, by id."""
         wanted = {c.schema for c in recording.channels if c.schema is not None}
         if not wanted <= self._schemas.keys():
-            # Recordings have most of them in common.
+            # Recordings share most of them.
             entries = (*self.recordings(), recording)
             used = {c.schema for r in entries for c in r.channels if c.schema is not None}
             with suppress(CatalogError):
                 self._schemas = self.catalog.schemas(used)
         if not wanted <= self._schemas.keys():
-            # The catalog has lost one.
+            # The catalog lacks one.
             return channels_of(take_inventory(self.directory, recording.label).summaries.values())
         return {
             c.id: Channel(
@@ -430,17 +429,17 @@ class Store:
             for c in recording.channels
         }
 
-    # Asking.
+    # Questions.
 
     def topic(self, *names: str) -> Query:
-        """A question about one topic or several.
+        """Make a query about one or several topics.
 
         Args:
-            names: Full names, short ones that are unambiguous (`scan`), globs, or
+            names: Full names, unambiguous short ones (`scan`), globs, or
                 `re:` and a regular expression.
 
         Raises:
-            TopicError: a name fits nothing, or several topics; lists the candidates.
+            TopicError: A name matches no topic, or several; the message lists candidates.
         """
         return self._resolved(names).again()
 
@@ -451,11 +450,11 @@ class Store:
         return self.query(resolve(names, known))
 
     def all_topics(self) -> Query:
-        """A question about everything."""
+        """Make a query about all topics."""
         return self.query(self.topics())
 
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
-        """A question about topics by their full names, in some recordings or all."""
+        """Make a query about topics by their full names, in some recordings or all."""
         wanted = set(topics)
         named = None if recordings is None else {r.id for r in self.select(recordings)}
         chosen = tuple(
@@ -470,10 +469,10 @@ class Store:
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
     ) -> Predicate:
-        """A predicate on some topics of some recordings.
+        """Parse a predicate on some topics of some recordings.
 
         Raises:
-            WhereError: it cannot be understood, or does not fit the fields.
+            WhereError: It is invalid, or does not fit the fields.
         """
         return self._compiled(text, topics, recordings)
 
@@ -504,7 +503,7 @@ class Store:
         """Chunks that may hold the last message of some channels by a time.
 
         Args:
-            recording: Of which.
+            recording: The recording.
             channels: Channel ids.
             span: Log time of the recording's first message, and the time, ns.
 
@@ -530,7 +529,7 @@ class Store:
             return self.catalog.chunks(recording, channels, bounds, clock)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
-        """The reader of a sealed segment of a recording, by id or label, kept open. Thread safe."""
+        """The cached reader of a sealed segment of a recording, by id or label. Thread safe."""
         key = (recording, number)
         with self._lock:
             reader = self._segments.get(key)
@@ -542,18 +541,18 @@ class Store:
             return reader
 
     def columns(self, recording: str) -> FieldColumns | None:
-        """The columns that lie beside the segments of a recording; None without good ones."""
+        """The columns beside the segments of a recording; None without valid ones."""
         with self._lock:
             if recording not in self._columns:
                 _make_room(self._columns)
                 self._columns[recording] = None
-                with suppress(FileNotFoundError, StoreError, TopicError):  # the index has the same
+                with suppress(FileNotFoundError, StoreError, TopicError):  # the index has it, too
                     path = self.directory.recording(self.entry(recording).label)
                     found = FieldColumns(path)
                     self._columns[recording] = found
             return self._columns[recording]
 
-    # Changing.
+    # Changes.
 
     def record(
         self,
@@ -565,14 +564,14 @@ class Store:
         """Record a ROS 1 bag, a ROS 2 bag or an MCAP file.
 
         Args:
-            log: Its path, or a source that was opened and not read yet.
-            options: What and how.
+            log: Its path, or an opened source that was not read yet.
+            options: Options of the recording.
             progress: Called with bytes read and messages stored.
             choices: Fields of `RecordOptions`, instead of `options`.
 
         Raises:
-            SourceError: nothing could be read.
-            AlreadyRecordedError: its content is in the store already.
+            SourceError: Nothing could be read.
+            AlreadyRecordedError: Its content is in the store already.
         """
         from hybridlog.recorder import RecordOptions, record
         from hybridlog.sources.detect import open_source
@@ -592,13 +591,13 @@ class Store:
         return report
 
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
-        """Start a recording that messages are written to as they come.
+        """Start a live recording, which takes messages one by one.
 
-        Until it is closed, the garbage collector passes over the objects that are there now.
+        Until it is closed, the garbage collector ignores existing objects.
 
         Args:
             name: Name of the recording.
-            options: How.
+            options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
         from hybridlog.live import LiveOptions, LiveRecording
@@ -614,11 +613,11 @@ class Store:
         )
 
     def _after(self, report: RecordReport) -> None:
-        """A recording has ended."""
+        """Update the store after the end of a recording."""
         self.refresh()
         if report.failure is None and (self._database is None or self._database.ping()):
             return
-        # MongoDB has ended meanwhile. If it can be had again, the rest is indexed.
+        # MongoDB has ended meanwhile. After a reconnect, the rest is indexed.
         self.disconnect()
         try:
             self.connect()
@@ -635,17 +634,17 @@ class Store:
         recordings: Sequence[str] | None = None,
         progress: Progress | None = None,
     ) -> list[RecordingEntry]:
-        """Make the index again from the segments, recording by recording.
+        """Rebuild the index from the segments, recording by recording.
 
         Args:
-            recordings: Which; None for all, and then what belongs to no recording is removed.
+            recordings: The recordings; None for all, which also removes unknown documents.
             progress: Called after each chunk.
 
         Returns:
-            Those that were indexed.
+            The indexed recordings.
 
         Raises:
-            StoreError: one that was named is being written.
+            StoreError: A named recording is being written.
         """
         from hybridlog.maintenance import index
 
@@ -671,19 +670,19 @@ class Store:
         return [entry for entry in self.recordings() if entry.id in done]
 
     def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
-        """Let MongoDB find messages by the values of fields without looking at all of them.
+        """Add a MongoDB index on fields of a topic.
 
         Args:
             topic: Full name, short name, glob, or `re:` and a regular expression.
-            fields: Of the messages, or `_meta.inserted_at` and its like; the first one
-                should be asked for a value or a range, the others narrow that down.
+            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
+                should give a value or a range of the first one; the others narrow it down.
 
         Returns:
             All indexes of the topics.
 
         Raises:
-            TopicError: there is no such topic or field.
-            DatabaseError: MongoDB cannot make it: two of the fields are arrays.
+            TopicError: A topic or field does not exist.
+            DatabaseError: MongoDB refuses, for example because two fields are arrays.
         """
         query = self.topic(topic)
         database = self.database_for("An index")
@@ -692,10 +691,10 @@ class Store:
         return field_indexes.of_topics(database, query.topics)
 
     def remove_index(self, topic: str, *fields: str) -> int:
-        """Drop the index on just these fields; returns from how many topics.
+        """Drop the index on exactly these fields; return the number of topics.
 
         Raises:
-            TopicError: there is no such topic.
+            TopicError: A topic does not exist.
         """
         query = self.topic(topic)
         database = self.database_for("An index")
@@ -710,7 +709,7 @@ class Store:
     def verify(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None
     ) -> Verification:
-        """Read everything, check checksums, compare catalog and index with the segments.
+        """Check all checksums, and compare catalog and index with the segments.
 
         Args:
             recordings: Which; None for all.
@@ -730,10 +729,10 @@ class Store:
         )
 
     def remove(self, recording: str) -> None:
-        """Delete a recording: its intent is on the disk first, then everything goes.
+        """Delete a recording.
 
         Args:
-            recording: Label, name, or id. The label of a copy removes that copy alone.
+            recording: Label, name, or id. The label of a copy removes only that copy.
 
         Raises:
             StoreError: it is being written.
@@ -752,11 +751,11 @@ class Store:
             self.refresh()
 
     def rename(self, recording: str, name: str) -> RecordingEntry:
-        """Give a recording another name; its directory gets a label made from it."""
+        """Rename a recording; its directory gets a label made from the name."""
         return self._edit(recording, journal.event(journal.RENAMED, name=text(name)))
 
     def tag(self, recording: str, **tags: str) -> RecordingEntry:
-        """Keep tags with a recording; those of the same keys are replaced."""
+        """Set tags of a recording; existing keys get the new values."""
         lines = [journal.event(journal.TAGGED, key=text(k), value=text(v)) for k, v in tags.items()]
         return self._edit(recording, *lines)
 
@@ -764,7 +763,7 @@ class Store:
         """Remove tags of a recording.
 
         Raises:
-            UsageError: it has no such tag.
+            UsageError: A tag does not exist.
         """
         (entry,) = self.select([recording])
         for key in keys:
@@ -791,17 +790,17 @@ class Store:
     def mark(
         self, recording: str, moment: TimeLike, note: str, tags: Mapping[str, str] | None = None
     ) -> RecordingEntry:
-        """Set a mark at a time of a recording that has ended; questions find it like others.
+        """Set a mark at a time of a recording that has ended.
 
         Args:
             recording: Label, name, or id.
             moment: Log time, as for `Query.between`.
-            note: What happened.
-            tags: Kept with it.
+            note: Text of the mark.
+            tags: Tags of the mark.
 
         Raises:
-            TimeError: `moment` is no time.
-            StoreError: the recording is being written: mark it while it runs.
+            TimeError: `moment` is invalid.
+            StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
         from hybridlog.maintenance import edit
 
@@ -819,7 +818,7 @@ class Store:
         recordings: Sequence[str] | None = None,
         progress: Progress | None = None,
     ) -> ImportReport:
-        """Copy recordings in from another store; what was copied before is not copied again.
+        """Import recordings from another store; earlier copies are not repeated.
 
         Args:
             other: The other store's directory.
@@ -827,7 +826,7 @@ class Store:
             progress: Called while files are copied and checked.
 
         Raises:
-            StoreError: there is no store, or a recording of it is damaged or being written.
+            StoreError: It is not a store, or a recording of it is damaged or being written.
         """
         from hybridlog.maintenance import imports
 
@@ -840,7 +839,7 @@ class Store:
     def repair(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None
     ) -> list[Repaired]:
-        """Apply the cures that lose nothing; returns what was done.
+        """Apply all repairs that lose no data; return them.
 
         Args:
             recordings: Which; None for all.
@@ -866,11 +865,11 @@ class Store:
         return done
 
     def take_over(self) -> None:
-        """Say that this store lies here now: it was moved, and its index comes along.
+        """Register the new place of a moved store in its MongoDB.
 
         Raises:
             DatabaseError: MongoDB does not answer.
-            StoreError: the database holds the index of another store.
+            StoreError: The database holds the index of another store.
         """
         from hybridlog.maintenance import lease
         from hybridlog_storage.index_state import IndexState
@@ -884,7 +883,7 @@ class Store:
         self.without_database = None
 
     def _claim(self, database: Database) -> None:
-        """Make sure that the database is this store's, and nobody else's."""
+        """Check that the database belongs to this store, and register its place."""
         from hybridlog.maintenance import lease
         from hybridlog_storage.index_state import IndexState
 
@@ -895,9 +894,9 @@ class Store:
 
 
 def _make_room(opened: dict[Any, Any]) -> None:
-    """Let go of the file that was opened first, if there are many.
+    """Drop the file that was opened first, if there are many.
 
-    It is closed when the last thread that reads from it lets go of it, too.
+    It is closed when the last reading thread drops it, too.
     """
     if len(opened) >= _MOST_OPEN:
         del opened[next(iter(opened))]
