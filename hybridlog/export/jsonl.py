@@ -1,4 +1,4 @@
-"""JSON lines: one object a message, in UTF-8.
+"""Writes JSON lines: one object for each message, in UTF-8.
 
 JSON has no NaN and no infinities: they become null. Integers keep all their digits, also
 those past 2**53, which some readers round. Binary values are their length: `{"n": 1024}`.
@@ -32,7 +32,7 @@ def message_row(log_time: int, topic: str, fields: Mapping[str, object]) -> dict
     Args:
         log_time: Nanoseconds since the epoch.
         topic: Name of the topic.
-        fields: Message fields; one that has the name of one of the two gets a trailing
+        fields: Message fields; one with the name of one of these two gets a trailing
             underscore.
     """
     row: dict[str, object] = {"log_time_ns": log_time, "topic": topic}
@@ -62,7 +62,7 @@ class JsonlWriter(FileWriter):
         block: list[bytes] = []
         size = 0
         for row in rows:
-            # A lone surrogate becomes the escape that JSON has for it.
+            # A lone surrogate becomes its JSON escape.
             line = _line(row).encode("utf-8", "backslashreplace")
             block.append(line)
             size += len(line)
@@ -99,7 +99,7 @@ class JsonlWriter(FileWriter):
 
 
 def rows_within(table: pa.Table, *, limit: int = 16 << 20) -> int:
-    """Rows of a table that are about `limit` bytes, from 1 to 4096."""
+    """Number of rows of a table with about `limit` bytes, from 1 to 4096."""
     per_row = max(1, table.nbytes // max(1, table.num_rows))
     return int(min(_ROWS, max(1, limit // per_row)))
 
@@ -107,14 +107,14 @@ def rows_within(table: pa.Table, *, limit: int = 16 << 20) -> int:
 def _line(row: Mapping[str, object]) -> str:
     try:
         return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_plain) + "\n"
-    except ValueError:  # NaN or an infinity; rare, so it is looked for only then
+    except ValueError:  # NaN or an infinity; rare, so searched only here
         return json.dumps(_clean(row, 0), ensure_ascii=False, default=_plain) + "\n"
     except RecursionError:
         raise UsageError("a message is nested too deep for JSON") from None
 
 
 def _plain(value: object) -> object:
-    """A value that `json` does not know."""
+    """Convert a value of a type unknown to `json`."""
     for kind, make in _KINDS:
         if isinstance(value, kind):
             return make(value)
@@ -144,7 +144,7 @@ _KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
 
 
 def _clean(value: object, depth: int) -> object:
-    """A copy with null for each number that JSON does not have."""
+    """A copy with null for each number without a JSON form."""
     if depth > _MAX_DEPTH:
         raise UsageError("a message is nested too deep for JSON")
     if isinstance(value, float):
