@@ -400,7 +400,9 @@ def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
     for fits, make in table:
         if fits:
             return make(name, kind, spools)
-    raise UsageError(f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields")
+    raise UsageError(
+        f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
+    )
 
 
 def _is_matrix(kind: pa.DataType) -> bool:

@@ -1,4 +1,4 @@
-"""Protobuf messages, when the protobuf package is there."""
+"""Protobuf messages, if the protobuf package is installed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MAX_PATHS = 10_000
 
 _TIMES = {"google.protobuf.Timestamp": "time", "google.protobuf.Duration": "duration"}
 
-# By FieldDescriptor.type, whose numbers are part of the protobuf format.
+# By FieldDescriptor.type; its numbers are part of the protobuf format.
 _TYPES = {
     1: "float64",
     2: "float32",
@@ -64,10 +64,10 @@ _GROUP, _MESSAGE = 10, 11
 class ProtobufCodec:
     """Messages of one protobuf type.
 
-    Fields that track their presence and are not set are not in the index document.
+    Unset fields with presence are not in the index document.
 
     Args:
-        schema: Name of the type, and a `FileDescriptorSet` with all it needs.
+        schema: Name of the type, and a `FileDescriptorSet` with its dependencies.
         array_limit: Arrays of more elements are summarised in the index.
 
     Raises:
@@ -83,7 +83,7 @@ class ProtobufCodec:
         self._class = _message_class(schema)
 
     def paths(self) -> list[FieldPath]:
-        """Every field; types that contain themselves are followed once."""
+        """All fields; recursive types are followed once."""
         found: list[FieldPath] = []
         _add_paths(found, self._class.DESCRIPTOR, "", [], within_array=False)
         return found
@@ -95,14 +95,14 @@ class ProtobufCodec:
         return body_groups(map(self._body, payloads_of(buffer, offset, length)))
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message."""
+        """The fields of this message in its index document."""
         body = self._body(memoryview(payload))
         if isinstance(body, PayloadError):
             return {}
         return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
 
     def decode(self, payload: Buffer) -> object:
-        """The protobuf message.
+        """Decode the protobuf message.
 
         Raises:
             PayloadError: The payload is not of this type.
@@ -174,7 +174,7 @@ def _message_class(schema: Schema) -> type[Message]:
 
 
 def _fill(pool: DescriptorPool, data: bytes) -> None:
-    """Adds all files of a set to a pool, each after the files that it imports."""
+    """Add all files of a set to a pool, each after its imports."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     waiting = {file.name: file for file in FileDescriptorSet.FromString(data).file}
@@ -194,7 +194,7 @@ def _fill(pool: DescriptorPool, data: bytes) -> None:
 
 
 def _fill_standard(pool: DescriptorPool, name: str) -> None:
-    """Adds one of protobuf's own files, which some writers leave out."""
+    """Add one of protobuf's own files, which some writers omit."""
     from google.protobuf import duration_pb2, timestamp_pb2
 
     for module in (duration_pb2, timestamp_pb2):
@@ -203,7 +203,7 @@ def _fill_standard(pool: DescriptorPool, name: str) -> None:
 
 
 def _plain(message: Message) -> dict[str, Plain]:
-    """A message as a plain object, its fields in the order of the definition."""
+    """A message as a plain object, with fields in the order of the definition."""
     found: dict[str, Plain] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
@@ -213,7 +213,7 @@ def _plain(message: Message) -> dict[str, Plain]:
             found[field.name] = _value(field, value)
         elif _is_map(field):
             inner = field.message_type.fields_by_name["value"]
-            # Maps have no order of their own; index documents must be reproducible.
+            # Maps have no order; index documents must be reproducible.
             found[field.name] = {_map_key(k): _value(inner, value[k]) for k in sorted(value)}
         else:
             found[field.name] = [_value(field, v) for v in value]
@@ -243,7 +243,7 @@ def _map_key(key: object) -> str:
 
 
 def _is_repeated(field: FieldDescriptor) -> bool:
-    # Up to protobuf 5 there is only the label, from 7 on only the property.
+    # Up to protobuf 5 only the label exists, from 7 on only the property.
     repeated = getattr(field, "is_repeated", None)
     return field.label == field.LABEL_REPEATED if repeated is None else bool(repeated)
 
