@@ -115,7 +115,7 @@ class Buffers:
             self._most_whole = max(self._most_whole, total, self._whole_bytes + missing)
         while missing >= size and not enough.is_set():
             with self._lock:
-                # Slabs in use come first.
+                # Partly allocated slabs come first.
                 whole = self._whole.get(kind)
                 slab = self._unkeep(whole[0]) if whole and whole[0].given < kind else None
             slab = slab or _Slab(kind)

@@ -248,7 +248,7 @@ class IndexState:
         """Remove the index documents of a recording, and the list of its chunks.
 
         Args:
-            key: Key of the recording, or the value that stands for no recording.
+            key: Key of the recording, or another value of `_meta.rec` in foreign documents.
             collections: Collections that may hold its documents.
             span: First and last log time of its documents, ns; None for any.
             but: Segments whose documents stay.
