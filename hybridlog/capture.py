@@ -1,8 +1,7 @@
-"""One recording while it is being made: its directory, its segments and its way to the index.
+"""A recording in progress: its directory, its segments and its index.
 
-Whatever the messages come from, a log file or a running robot, they go through a
-`Capture`: it starts the recording, gives them a writer, and either brings it to its end
-or takes back that it was ever there.
+Messages of log files and of running robots both go through a `Capture`. It starts the
+recording, provides its writer, and completes or removes the recording.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class Backpressure:
 
 
 class Capture:
-    """Takes the messages of one new recording.
+    """Records the messages of one new recording.
 
     Args:
         directory: The store.
@@ -83,8 +82,8 @@ class Capture:
 
     Attributes:
         entry: The recording's catalog entry.
-        writer: Its segments.
-        index: Its way to the index.
+        writer: Writer of its segments.
+        index: Writer of its index.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class Capture:
         self._turn = 1
         self._held = ExitStack()
         with self._held, directory.alone():
-            # Who records the same at this moment is refused, or refuses us.
+            # Of two processes that record the same content now, one is refused.
             if check is not None:
                 check(self.catalog)
             self.entry = self._begin(name, tags, source, IndexState(database))
@@ -133,15 +132,15 @@ class Capture:
         )
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
-        """Bring the recording to its end; `entry` is then complete.
+        """Complete the recording; `entry` is then complete, too.
 
         Args:
-            end: What its last segment says of it: `status` and `losses`.
+            end: The end of the recording: `status` and `losses`.
 
         Returns:
             Why the index is not complete, None when it is.
         """
-        # Only the last segment announces the end, and no other is sealed from here on.
+        # From here on only the last segment is sealed, which announces the end.
         self.writer.flush()
         self._end = end
         self.writer.close(json_metadata(END_METADATA, end))
@@ -150,7 +149,7 @@ class Capture:
     def give_up(
         self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
     ) -> DatabaseError | None:
-        """Bring the recording to its end where nothing more can be written.
+        """Complete the recording on a full disk.
 
         Args:
             end: As for `close`.
@@ -160,16 +159,16 @@ class Capture:
             Why the index is not complete, None when it is.
 
         Raises:
-            DiskFullError: There is not even room for that.
+            DiskFullError: No room for that either.
         """
-        self._end = end  # what was lost at last says the segment
+        self._end = end  # the segment holds the last losses
         self.writer.give_up(
             [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
         )
         return self._finish()
 
     def _announce(self, sealed: Sealed) -> None:
-        """List a segment in the journal before it gets its final name."""
+        """Write a segment into the journal before it gets its final name."""
         lines = [sealed_event(sealed)]
         if self._end is not None:
             lines.append(journal.event(journal.ENDED, end=dict(self._end)))
@@ -195,16 +194,16 @@ class Capture:
         return failure
 
     def leave(self) -> None:
-        """Stop at once; what was flushed stays, and the next opening of the store seals it."""
+        """Stop at once; flushed messages stay, and the next opening of the store seals them."""
         self.writer.abort()
         self.index.abandon()
         self._tables.discard()
         self._held.close()
 
     def forget(self) -> None:
-        """Take the whole recording back; what cannot be done now, the next opening does."""
+        """Remove the whole recording; the next opening finishes a removal that fails."""
         label, entry = self.entry.label, self.entry
-        with suppress(HybridlogError):  # the directory's new name says it, too
+        with suppress(HybridlogError):  # the directory's hidden name announces it, too
             announce_removal(self._directory, label)
         self.writer.abort()
         self.index.abandon()
@@ -215,7 +214,7 @@ class Capture:
             tables.remove(self._directory, entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
-        # If the database is away, the next connection finds an entry without files.
+        # If MongoDB is unavailable, the next connection finds an entry without files.
         with suppress(HybridlogError):
             state = IndexState(self.index.database)
             state.clear(entry.key, {collection_of(c.topic) for c in self.writer.channels.values()})
@@ -225,7 +224,7 @@ class Capture:
     def _begin(
         self, name: str, tags: Mapping[str, str], source: Mapping[str, Any], state: IndexState
     ) -> RecordingEntry:
-        """The recording's directory, locked, its journal, and its place in the index."""
+        """Create and lock the recording's directory, its journal and its index entry."""
         name = text(name)
         label = self._directory.new_recording(name)
         try:
@@ -263,7 +262,7 @@ class Capture:
 
 
 def origin() -> dict[str, Any]:
-    """Where a recording is made: host, boot, recorder, clock."""
+    """The origin of a recording: host, boot, recorder, clock."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):

@@ -1,8 +1,8 @@
-"""Catalog entries of recordings, made from their journals and segments alone.
+"""Makes catalog entries of recordings from their journals and segments.
 
-Recording, recovery, reindexing and opening all end here, which is why their entries are
-equal. What the journal lists and does not lie there as it was written is a row of the
-loss ledger; nothing that differs from the journal is believed.
+Recording, recovery, reindexing and opening use the same functions, so their entries are
+equal. Files that differ from the journal are not used. Content that the journal lists and
+that is missing or changed becomes rows of the loss ledger.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def new_id() -> str:
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
-    """What each segment keeps of its recording."""
+    """The metadata of a recording in each of its segments."""
     return {
         "id": entry.id,
         "name": entry.name,
@@ -58,14 +58,14 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """A file of a recording that is not what the journal says.
+    """A file of a recording that differs from the journal.
 
     Attributes:
         segment: Number in the file's name.
         file: Its name; empty for one that is missing.
-        reason: What is wrong, in words.
-        is_unlisted: Whether it is whole and of this recording, and only the journal lacks it.
-        belongs: Number under which the journal lists this very content; None if it does not.
+        reason: Description of the problem.
+        is_unlisted: Whether it is a whole segment of this recording that the journal lacks.
+        belongs: Number under which the journal lists this content; None if it does not.
     """
 
     segment: int
@@ -77,15 +77,15 @@ class Misfit:
 
 @dataclass(slots=True)
 class Inventory:
-    """What lies in a recording's directory, held against its journal.
+    """Content of a recording's directory, compared with its journal.
 
     Attributes:
         label: Name of the directory.
-        listing: What lies there.
-        state: What the journal says; None when there is none.
-        summaries: Of the segments that are believed, by number.
-        misfits: What is not as it should be.
-        lost: What the journal lists and is not there, or not as it was written.
+        listing: Names of its files.
+        state: State of the journal; None without one.
+        summaries: Summaries of valid segments, by number.
+        misfits: Files that differ from the journal.
+        lost: Listed segments that are missing or changed.
     """
 
     label: str
@@ -97,7 +97,7 @@ class Inventory:
 
     @property
     def id(self) -> str:
-        """The recording's id; empty when nothing says it."""
+        """The recording's id; empty if unknown."""
         if self.state is not None and self.state.id:
             return self.state.id
         ids = Counter(str(s.recording.get("id", "")) for s in self.summaries.values())
@@ -105,7 +105,7 @@ class Inventory:
 
     @property
     def end(self) -> Mapping[str, Any] | None:
-        """How the recording ended: by its journal, else by the last segment that says it."""
+        """The end of the recording: by its journal, else by the last segment that states it."""
         if self.state is not None and self.state.end is not None:
             return self.state.end
         ends = [summary.end for _, summary in sorted(self.summaries.items()) if summary.end]
@@ -113,7 +113,7 @@ class Inventory:
 
     @property
     def is_proven(self) -> bool:
-        """Whether the journal lists all that there was, and all of it is there."""
+        """True if the journal is complete, and all segments that it lists are valid."""
         return (
             self.state is not None
             and self.state.is_proof
@@ -123,7 +123,7 @@ class Inventory:
 
 
 def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
-    """Hold the sealed segments of a recording against its journal.
+    """Compare the sealed segments of a recording with its journal.
 
     Raises:
         StoreError: Directory or journal cannot be read.
@@ -151,7 +151,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
             reason = "the journal does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
     for number, sealed in listed.items():
-        # One that is listed and still has its old name is about to get the new one.
+        # A listed segment with its old name is about to be renamed.
         if number not in found.summaries and number not in listing.open:
             found.lost.append(sealed)
             if number not in listing.sealed:
@@ -163,7 +163,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
 def _difference(
     summary: SegmentSummary, number: int, sealed: SealedSegment | None, recording: str
 ) -> str | None:
-    """Why a whole segment is not the one that should lie there; None when it is."""
+    """The difference of a whole segment from the journal; None if it matches."""
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
     if its_id != recording:
         return f"it is a segment of another recording, {its_id}"
@@ -178,7 +178,7 @@ def read_summary(path: Path, number: int) -> SegmentSummary:
     """The summary of a sealed segment.
 
     Raises:
-        SegmentError: It has none that can be read, or cannot be opened.
+        SegmentError: It has no readable summary, or cannot be opened.
     """
     with SegmentReader(path, number) as reader:
         return reader.summary()
@@ -192,14 +192,14 @@ def describe(
     stamps: Stamps,
     damage: Mapping[tuple[int, int], str],
 ) -> Described:
-    """The whole entry of a recording.
+    """Make the complete entry of a recording.
 
     Args:
-        inventory: What there is of it.
-        is_open: Whether somebody writes it at this moment.
-        reason: Says why a channel's fields are not in the index, None when they are.
-        stamps: Gives what decoded messages tell of a segment, None while that is not known.
-        damage: Chunks that are known to be unreadable, by segment and number.
+        inventory: Content of its directory.
+        is_open: Whether a process is writing it.
+        reason: Returns why a channel's fields are not indexed, None if they are.
+        stamps: Returns the decoding results of a segment, None if unknown.
+        damage: Known unreadable chunks, by segment and number.
 
     Raises:
         SegmentError: Neither journal nor segments say what recording it is.
@@ -244,7 +244,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
     elif inventory.summaries:
         first = inventory.summaries[min(inventory.summaries)]
         said = first.recording
-        if state is not None:  # the first line is lost, not those behind it
+        if state is not None:  # only the first line is lost
             said = {**said, "tags": {**cast("dict[str, str]", said.get("tags", {})), **state.tags}}
             said["name"] = state.name or said.get("name")
     if said is None:
@@ -276,7 +276,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
 def _status(
     inventory: Inventory, end: Mapping[str, Any] | None, *, is_open: bool, has_losses: bool
 ) -> str:
-    # Whoever holds one that has ended does something else with it than record.
+    # The holder of an ended recording does not record it.
     if is_open and (end is None or inventory.listing.open):
         return "open"
     if inventory.listing.open:
@@ -289,7 +289,7 @@ def _status(
 
 
 def _losses_of_segment(inventory: Inventory, sealed: SealedSegment) -> list[dict[str, Any]]:
-    """Rows of the loss ledger for a segment that the journal lists and nobody can read."""
+    """Rows of the loss ledger for a listed segment that is not readable."""
     reasons = [m.reason for m in inventory.misfits if m.segment == sealed.segment]
     reason = "; ".join(reasons) or "it cannot be read"
     lost = [channel for channel in sealed.channels if channel["messages"]]
@@ -298,7 +298,7 @@ def _losses_of_segment(inventory: Inventory, sealed: SealedSegment) -> list[dict
 
 
 def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
-    """Rows for what was listed before a crash and did not come out of it."""
+    """Rows for listed content that was lost in a crash."""
     rows = []
     for before, after in inventory.state.replaced if inventory.state is not None else ():
         left = {channel["id"]: channel["messages"] for channel in after.channels}
@@ -313,7 +313,7 @@ def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
 def _losses_of_chunks(
     inventory: Inventory, damage: Mapping[tuple[int, int], str]
 ) -> list[dict[str, Any]]:
-    """Rows for chunks that cannot be read."""
+    """Rows for unreadable chunks."""
     rows = []
     for (segment, number), reason in sorted(damage.items()):
         summary = inventory.summaries.get(segment)
@@ -376,9 +376,9 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
 
 
 def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> list[journal.Event]:
-    """The lines of a journal that is written again from what lies there.
+    """The lines of a journal rebuilt from the files.
 
-    Whole lines of the old one are kept; segments that it did not list are added.
+    It has the whole lines of the old one, and lists missing segments.
 
     Raises:
         SegmentError: Neither journal nor segments say what recording it is.
@@ -420,7 +420,7 @@ def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
 
 
 def sealed_line(inventory: Inventory, number: int) -> journal.Event:
-    """The journal line that lists a segment which lies there."""
+    """The journal line for an existing segment."""
     summary = inventory.summaries[number]
     channels = sealed_channels(summary.table, summary.channels)
     file = inventory.listing.sealed[number]
@@ -428,7 +428,7 @@ def sealed_line(inventory: Inventory, number: int) -> journal.Event:
 
 
 def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
-    """The journal line that lists a segment."""
+    """The journal line for a segment."""
     return journal.event(
         journal.SEALED,
         segment=sealed.segment,
@@ -440,5 +440,5 @@ def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
 
 
 def text(name: str) -> str:
-    """A name as text that MongoDB and JSON take: what is no UTF-8 in it as escapes."""
+    """A name as valid text for MongoDB and JSON, with escapes for invalid UTF-8."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")

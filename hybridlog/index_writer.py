@@ -1,7 +1,7 @@
-"""The way of chunks into the index: what becomes of them in the background.
+"""Indexes chunks in the background.
 
-`IndexWriter` makes documents of them and sends these to the database; with a `Lag` it may
-fall behind the recording that it belongs to, and reads back what it has let go.
+`IndexWriter` makes documents of chunks and sends them to the database. With a `Lag` it may
+fall behind its recording, drop chunks from memory, and read them back from the segments.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ if TYPE_CHECKING:
 
 _SENDERS = 2
 _LAG_PAUSE_S = 0.002
-_RETRY_S = 2.0  # after the database has failed
+_RETRY_S = 2.0  # seconds between attempts after the database has failed
 _PARCEL_BYTES = 4 << 20
 _PARCEL_CHUNKS = 32
-_BACKLOG = 8  # chunks in memory, waiting or under way
-# The same with a lag, where there is room for them. Topics of one rate and size close theirs
-# at one time, and what finds no room then must be read again.
+_BACKLOG = 8  # chunks in memory, waiting or in work
+# The same with a lag, if memory allows. Topics of equal rate and size close their chunks at
+# the same time, and chunks without room must be read again.
 _MOST_BACKLOG = 96
-_FEW = 32  # messages, and
-_FEW_BYTES = 1 << 20  # bytes of a chunk up to which it is not worth documents of its own
-_FEW_CHUNKS = 512  # that wait for others, at most
-_FEW_WAITING = 16 << 20  # and bytes of them
-_MOST_LATEST = 4096  # chunks: far more than a server that is killed has not in its journal
+_FEW = 32  # most messages, and
+_FEW_BYTES = 1 << 20  # most bytes of a chunk that waits for others
+_FEW_CHUNKS = 512  # most waiting chunks,
+_FEW_WAITING = 16 << 20  # and their bytes
+_MOST_LATEST = 4096  # chunks: far more than a killed server has not in its journal
 
 
 @dataclass(slots=True)
 class _Parcel:
-    """What goes to the database in one go: documents of some chunks, and those chunks."""
+    """Documents of some chunks that are sent to the database together, and those chunks."""
 
     documents: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
     entries: list[ChunkEntry] = field(default_factory=list)
@@ -70,11 +70,11 @@ class _Parcel:
 
 
 class _Few:
-    """Chunks of few messages, which wait until there are more of them. Thread safe.
+    """Chunks of few messages, which wait to be indexed together. Thread safe.
 
-    A topic that says four things a second has a chunk of four messages each second, so that
-    no more can be lost. To make documents of such a chunk, and to insert them, costs as much
-    as of one of a hundred; and so does to wake the thread that makes documents.
+    A topic of 4 Hz has a chunk of four messages each second, so that no more can be lost.
+    Making and inserting the documents of such a chunk costs as much as those of a hundred
+    messages, and so does waking the thread.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class _Few:
     def add(
         self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_in_tables: bool
     ) -> bool:
-        """Have a chunk wait, if it is one of these, and there is room.
+        """Let a chunk wait, if it has few messages and there is room.
 
         Args:
             chunk: The chunk.
@@ -97,7 +97,7 @@ class _Few:
             is_in_tables: Whether it is in the tables.
 
         Returns:
-            Whether it does.
+            Whether it waits.
         """
         size = len(chunk.batch.buffer)
         if len(chunk.batch) > _FEW or size > _FEW_BYTES:
@@ -107,7 +107,7 @@ class _Few:
                 return False
             if not self._chunks:
                 self._since = time.monotonic()
-            # A copy: its buffer may have room for a hundred times as much.
+            # A copy, since its buffer may be a hundred times as large.
             batch = replace(chunk.batch, buffer=bytes(chunk.batch.buffer))
             waits = replace(chunk, batch=batch)
             self._channels.update(channels)
@@ -119,12 +119,12 @@ class _Few:
 
     @property
     def is_full(self) -> bool:
-        """Whether no more should wait."""
+        """True if the limit is reached."""
         return self._size >= _FEW_WAITING or len(self._chunks) >= _FEW_CHUNKS
 
     @property
     def waited(self) -> float:
-        """Seconds for which the first one has waited; 0 without any."""
+        """Seconds for which the first chunk has waited; 0 without chunks."""
         return time.monotonic() - self._since if self._chunks else 0.0
 
     def untabled(
@@ -133,7 +133,7 @@ class _Few:
         """Those that are to go into the tables now, in the order of the file.
 
         Args:
-            before: Only those that lie before this chunk; None for all.
+            before: Only chunks before this one; None for all.
         """
         found = []
         with self._lock:
@@ -145,7 +145,7 @@ class _Few:
         return found, self._channels
 
     def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
-        """All that wait, which do so no longer, and their channels."""
+        """Remove and return all waiting chunks and their channels."""
         with self._lock:
             chunks, self._chunks, self._size = self._chunks, [], 0
         return chunks, self._channels
@@ -156,7 +156,7 @@ def _place(chunk: StoredChunk) -> tuple[int, int]:
 
 
 class Lag:
-    """Lets the index fall behind the recording that it belongs to.
+    """Lets the index fall behind its recording.
 
     Args:
         recording: The recording's directory.
@@ -186,7 +186,7 @@ class Lag:
         self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
 
     def wait(self) -> None:
-        """Return once the recorder can spare the processor and the disk."""
+        """Wait until the recorder does not need the processor and the disk."""
         while self._behind():
             time.sleep(_LAG_PAUSE_S)
 
@@ -198,7 +198,7 @@ class Lag:
         return ahead[1].result()
 
     def read_ahead(self, chunk: _Forgotten) -> None:
-        """Start to read the chunk that is asked for next."""
+        """Start reading the next chunk."""
         self._ahead = chunk, self._thread.submit(self._read, chunk)
 
     def _read(self, chunk: _Forgotten) -> StoredChunk:
@@ -209,7 +209,7 @@ class Lag:
         return self._reader.read_chunk(chunk.place)
 
     def close(self) -> None:
-        """Give everything back."""
+        """Close the open segment."""
         self._thread.shutdown(wait=True, cancel_futures=True)
         self._release()
 
@@ -221,7 +221,7 @@ class Lag:
     def _open(self, segment: int) -> SegmentReader:
         path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
         if path.exists():
-            # It may be sealed, and renamed, at this moment.
+            # It may be sealed and renamed at this moment.
             with suppress(SegmentError):
                 return SegmentReader(path, segment, direct=True)
         sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
@@ -229,11 +229,11 @@ class Lag:
 
 
 class _Forgotten(NamedTuple):
-    """A chunk that is in its segment, and no longer in memory.
+    """A chunk that was dropped from memory and is in its segment.
 
     Attributes:
         segment: Number of the segment.
-        place: Where it lies there.
+        place: Its position there.
         messages: Number of its messages.
         is_in_tables: Whether it is in the tables.
     """
@@ -245,13 +245,13 @@ class _Forgotten(NamedTuple):
 
 
 class IndexWriter:
-    """Sends chunks to the index in the background, so that recording need not wait.
+    """Indexes chunks in the background, so that recording need not wait.
 
-    One thread makes documents, others send them; what is made while they are busy goes
-    in one parcel, so that a chunk of one image costs no round trip of its own. A database
-    that fails stops the index, never the recording: what was not indexed is made up for
-    from the segments, with a lag as soon as the database answers again, else when the
-    store is opened next.
+    One thread makes documents, others send them. Documents made while all senders are busy
+    are sent together, so a chunk of one image costs no round trip of its own. A failing
+    database stops the index, never the recording. Missing documents are made later from the
+    segments: with a lag as soon as the database answers again, else when a question needs
+    the index.
 
     Args:
         indexer: Makes the documents.
@@ -270,9 +270,9 @@ class IndexWriter:
     ) -> None:
         self.failure: DatabaseError | None = None
         self.indexed = 0
-        """Messages whose index documents are in the database."""
+        """Number of indexed messages."""
         self.missed = 0
-        """Messages that were skipped because the database had failed."""
+        """Number of messages skipped after a failure of the database."""
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
         self._indexer = indexer
         self._lag = lag
@@ -284,10 +284,10 @@ class IndexWriter:
         self._collections: set[str] = set()
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
-        self._in_memory = 0  # chunks that wait or are under way
+        self._in_memory = 0  # chunks waiting or in work
         self._bytes_in_memory = 0
-        self._is_asked = False  # for the next forgotten chunk
-        self._has_ended = False  # nothing is taken any more
+        self._is_asked = False  # for the next dropped chunk
+        self._has_ended = False  # no more chunks are accepted
         self._maker = Threads(1, "hybridlog-index")
         self._senders = Threads(_SENDERS, "hybridlog-send")
         self._idle = threading.BoundedSemaphore(_SENDERS)
@@ -301,11 +301,11 @@ class IndexWriter:
 
     @property
     def database(self) -> Database:
-        """Where documents go now."""
+        """The present connection to the index."""
         return self._database
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Index a chunk that is in its segment; waits while the backlog is full."""
+        """Index a chunk that is in its segment; wait while the backlog is full."""
         if self._crash is not None:
             raise self._crash
         self._channels = channels
@@ -325,7 +325,7 @@ class IndexWriter:
         future.add_done_callback(partial(self._made, size))
 
     def _find_room(self, size: int) -> bool:
-        """Have a chunk wait in memory; without a lag once there is room, else only if there is."""
+        """Reserve memory for a waiting chunk; wait for room without a lag, else return False."""
         if self._lag is None:
             return self._room.acquire()
         with self._lock:
@@ -334,7 +334,7 @@ class IndexWriter:
         return (is_usual or self._lag.has_room(size)) and self._room.acquire(blocking=False)
 
     def prepare(self, channel: Channel) -> None:
-        """Do now what a channel's first message would have to wait for."""
+        """Prepare a channel before its first message."""
         self._indexer.prepare(channel)
         self._maker.submit(self._prepare, channel).add_done_callback(self._done)
 
@@ -344,22 +344,22 @@ class IndexWriter:
         try:
             self._ensure(collection_of(channel.topic))
         except DatabaseError:
-            # It fails again with the first documents, and is told then. To find out that
-            # nobody answers takes seconds, and others stand behind this.
+            # It fails again with the first documents, and is reported then. A timeout takes
+            # seconds, and other channels wait.
             self._is_away = True
 
     def nudge(self, patience_s: float) -> None:
-        """Send what has been made so far, however little, once a sender is free.
+        """Send the documents made so far once a sender is free.
 
         Args:
             patience_s: Seconds for which chunks of few messages may wait for others.
         """
-        # To wake the thread that makes documents for nothing costs what ten of them do.
+        # Waking the thread that makes documents costs as much as ten documents.
         if self._parcel.entries or self._forgotten or self.failure or self._is_late(patience_s):
             self._maker.submit(self._tend, patience_s).add_done_callback(self._done)
 
     def close(self) -> None:
-        """Wait for all chunks; an error of our own (no database's) is raised here."""
+        """Wait for all chunks; raise errors other than those of the database."""
         if self._crash is None:
             self._maker.submit(self._last_try).add_done_callback(self._done)
             self._maker.submit(self._remember_all).add_done_callback(self._done)
@@ -371,11 +371,11 @@ class IndexWriter:
             raise self._crash
 
     def abandon(self) -> None:
-        """Stop without indexing what still waits."""
+        """Stop without indexing waiting chunks."""
         self._end(cancel=True)
 
     def release(self) -> None:
-        """Close the connections that it has made itself; `database` may be one of them."""
+        """Close the connections made by this object; `database` may be one of them."""
         for database in self._renewed:
             database.close()
         self._renewed.clear()
@@ -404,11 +404,10 @@ class IndexWriter:
         self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), is_in_tables))
 
     def _catch_up(self) -> None:
-        """Ask for a forgotten chunk once none waits in memory.
+        """Request a dropped chunk once none waits in memory.
 
-        To read one back costs more than to make its documents. Taken in the order in which
-        they came, those that were let go would keep others waiting until these, too, have
-        no room.
+        Reading a chunk back costs more than making its documents. In arrival order, dropped
+        chunks would delay others until these have no room either.
         """
         with self._lock:
             is_idle = not (self._is_asked or self._in_memory or self._has_ended)
@@ -427,7 +426,7 @@ class IndexWriter:
         self._dispatch(wait=False)
 
     def _is_late(self, patience_s: float) -> bool:
-        """Whether chunks have waited for others for so long."""
+        """True if chunks have waited to be indexed for too long."""
         return self._few.waited > patience_s
 
     def _last_try(self) -> None:
@@ -435,7 +434,7 @@ class IndexWriter:
             self._retry()
 
     def _retry(self) -> None:
-        """Go on after the database has failed, if it can be had again."""
+        """Continue after a failure of the database, if it can be reconnected."""
         if self._lag is None:
             return
         try:
@@ -450,7 +449,7 @@ class IndexWriter:
         with self._lock:
             self._database, self._state = database, state
             self._collections.clear()
-            # A server that was killed has lost what it had not yet in its journal.
+            # A killed server has lost documents that were not in its journal yet.
             latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
             for entry in latest:
                 if there.get((entry.segment, entry.number)) == entry.offset:
@@ -470,7 +469,7 @@ class IndexWriter:
             self._remember()
 
     def _remember(self) -> None:
-        """Make documents of the first forgotten chunk, while the next one is read."""
+        """Index the first dropped chunk, while the next one is read."""
         assert self._lag is not None
         if self.failure is not None or not self._forgotten:
             return
@@ -503,7 +502,7 @@ class IndexWriter:
             self._make_few()
 
     def _make_few(self) -> None:
-        """Make documents of the chunks that wait for others."""
+        """Index the waiting chunks of few messages."""
         if self._lag is not None:
             self._lag.wait()
         chunks, channels = self._few.take()
@@ -528,7 +527,7 @@ class IndexWriter:
             self._dispatch(wait=parcel.size >= _PARCEL_BYTES)
 
     def _dispatch(self, *, wait: bool) -> None:
-        """Hand over what has been made, if a sender is free or has to be waited for."""
+        """Hand the documents over, if a sender is free or must be waited for."""
         if self._parcel.entries and self._idle.acquire(blocking=wait):
             parcel, self._parcel = self._parcel, _Parcel()
             future = self._senders.submit(self._send, parcel)
@@ -558,12 +557,12 @@ class IndexWriter:
             if self._lag is None:
                 self.missed += parcel.messages
                 return
-            # To insert a document twice is to insert it once, so all of it comes again.
+            # Inserting a document twice has no effect, so all are sent again.
             for entry in parcel.entries:
                 self._put_back(entry)
 
     def _put_back(self, entry: ChunkEntry) -> int:
-        """A chunk is to be indexed again; returns its messages."""
+        """Queue a chunk again; return the number of its messages."""
         self._forgotten.append(_Forgotten(entry.segment, entry.place, entry.messages, True))
         return entry.messages
 

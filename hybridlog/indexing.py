@@ -1,7 +1,7 @@
-"""From chunks to index documents: a pure function.
+"""Makes index documents from chunks, as a pure function.
 
-`documents_of` is what makes the index disposable: it needs nothing but chunks and their
-channels, and `record`, recovery, `reindex` and `verify` all call it.
+`documents_of` makes the index disposable: it needs only chunks and their channels.
+`record`, recovery, `reindex` and `verify` all call it.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Documents(NamedTuple):
     """Index documents of one topic.
 
     Attributes:
-        collection: Where they belong.
-        tables: uint8[k, width] each: a whole BSON document a row.
+        collection: Their collection.
+        tables: uint8[k, width] each, with a whole BSON document in each row.
     """
 
     collection: str
@@ -49,8 +49,8 @@ class ChunkIndexer:
     """Makes the index documents of one recording's chunks. Thread safe.
 
     Args:
-        recording: Id of the recording, or the key that is its beginning.
-        array_limit: Longest array that is kept in the index whole.
+        recording: Id or key of the recording.
+        array_limit: Longest array that is indexed whole.
     """
 
     def __init__(self, recording: str, *, array_limit: int = ARRAY_LIMIT) -> None:
@@ -63,10 +63,10 @@ class ChunkIndexer:
     def documents_of(
         self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
     ) -> tuple[list[Documents], list[ChunkEntry]]:
-        """All index documents of some chunks, and the chunks' catalog entries.
+        """Make all index documents of some chunks, and the chunks' catalog entries.
 
-        They are what they would be of each chunk by itself, and where chunks are of few
-        messages take little longer than those of one.
+        They equal those of each chunk alone. Several chunks of few messages take little longer
+        than one.
         """
         placed = Placed.of(chunks)
         documents: list[Documents] = []
@@ -107,11 +107,11 @@ class ChunkIndexer:
         return documents, entries
 
     def prepare(self, channel: Channel) -> None:
-        """Understand a channel's definition before its first message comes."""
+        """Compile a channel's definition before its first message."""
         codec_for(channel, array_limit=self._array_limit).paths()
 
     def reason(self, channel_id: int, channel: Channel) -> str | None:
-        """Why a channel's fields are not in the index, None when they are."""
+        """Reason why a channel's fields are not indexed, None if they are."""
         return self._part(channel_id, channel)[0].reason
 
     def _part(self, channel_id: int, channel: Channel) -> tuple[Codec, DocumentAssembler, bool]:
@@ -138,12 +138,12 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
 
 
 class _Told:
-    """What the catalog says of a channel's messages, of each chunk by itself.
+    """Statistics of a channel's messages, for each chunk.
 
     Args:
         batch: n messages of one channel.
-        number: intp[n], which chunk each is from; ascending.
-        has_publish_time: Whether publish times are told of.
+        number: intp[n], index of each message's chunk; ascending.
+        has_publish_time: Whether to include publish times.
     """
 
     def __init__(self, batch: Batch, number: NDArray[np.intp], *, has_publish_time: bool) -> None:
@@ -155,13 +155,13 @@ class _Told:
         self._stamps: list[NDArray[np.int64]] = []
 
     def stamped(self, rows: NDArray[np.intp], stamps: NDArray[np.int64]) -> None:
-        """Some messages have header stamps."""
+        """Add messages with header stamps."""
         if len(rows):
             self._stamped.append(rows)
             self._stamps.append(stamps)
 
     def without_stamps(self) -> NDArray[np.intp]:
-        """The messages of chunks of which no header stamp is known."""
+        """The messages of chunks without known header stamps."""
         if not self._stamped:
             return np.arange(len(self._number))
         if self._number[0] == self._number[-1]:
@@ -172,11 +172,11 @@ class _Told:
         return np.flatnonzero(~known[self._number])
 
     def unreadable(self, rows: NDArray[np.intp]) -> None:
-        """Some messages could not be read."""
+        """Add unreadable messages."""
         self._unreadable.append(rows)
 
     def by_chunk(self) -> Iterator[tuple[int, ChannelStats]]:
-        """The chunks that have messages, in order, and what is told of these."""
+        """The chunks with messages, in order, and their statistics."""
         batch, begins = self._batch, run_starts(self._number)
         numbers = self._number[begins].tolist()
         messages = run_lengths(begins, len(batch)).tolist()
@@ -210,7 +210,7 @@ class _Told:
         begins = run_starts(self._number[rows])
         numbers = self._number[rows[begins]].tolist()
         counts = run_lengths(begins, len(rows)).tolist()
-        # As integers they could run over.
+        # Integers could overflow.
         sums = np.add.reduceat(skew, begins, dtype=np.float64).tolist()
         for number, count, total, (first, last), (least, most) in zip(
             numbers, counts, sums, _spans(stamps, begins), _spans(skew, begins), strict=True
@@ -222,7 +222,7 @@ class _Told:
 
 
 def _read_stamps(codec: Codec, batch: Batch, told: _Told) -> None:
-    """Read header stamps that the index documents did not need as numbers."""
+    """Read header stamps that the index bodies do not provide."""
     rows = told.without_stamps()
     if len(rows):
         left = batch.take(rows)
@@ -233,6 +233,6 @@ def _read_stamps(codec: Codec, batch: Batch, told: _Told) -> None:
 
 
 def _spans(values: NDArray[np.int64], begins: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
-    """The least and the greatest value of each run."""
+    """Minimum and maximum of each run."""
     least, greatest = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
     return zip(least.tolist(), greatest.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Opening a store: the one module that wires directory, database, segments and reader."""
+"""Opens a store: connects directory, database, segments and reader."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DEFAULT_STORE = "hybridlog-store"
 
 
 def store_path(path: str | Path | None = None) -> Path:
-    """Where the store is: the argument, else `HYBRIDLOG_STORE`, else `./hybridlog-store`."""
+    """Path of the store: the argument, else `HYBRIDLOG_STORE`, else `./hybridlog-store`."""
     return Path(path or os.environ.get("HYBRIDLOG_STORE") or DEFAULT_STORE)
 
 
@@ -50,21 +50,21 @@ def open_store(
     require_database: bool = False,
     progress: Progress | None = None,
 ) -> Store:
-    """Open a store; what a crash has left is mended first.
+    """Open a store; recover first after a crash.
 
     MongoDB is connected to when a question needs it.
 
     Args:
-        path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; without,
+        path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; by default
             `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
-        create: Make the store if there is none.
-        shared: Let the group write the store; when it is made.
+        create: Create the store if it does not exist.
+        shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
 
     Raises:
-        StoreError: there is no store there, or it is of another format.
+        StoreError: It is not a store, or has another format.
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
@@ -75,7 +75,7 @@ def open_store(
         directory = StoreDirectory.create(where, mongo=own, shared=shared)
         directory.check_writable()
         if is_new and own is not None:
-            with suppress(StoreError):  # without a home, each command names it again
+            with suppress(StoreError):  # without a home directory, each command must name it again
                 consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
@@ -90,15 +90,14 @@ def open_store(
 
 
 class Store:
-    """A directory of recordings and the database that makes them answerable.
+    """A directory of recordings and the database that indexes them.
 
-    Use `hybridlog.open`; a store is a context manager. One store may be used by several
-    threads for reading.
+    Opened by `hybridlog.open`. A context manager; several threads may read from one store.
 
     Args:
-        directory: Where it lies.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one that
-            the store names.
+        directory: Its directory.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in the
+            store's settings.
         progress: Called while an index is brought up to date.
 
     Attributes:
@@ -118,7 +117,7 @@ class Store:
         self.session = Session(directory, mongo, progress)
 
     def __enter__(self) -> Self:
-        """The store itself."""
+        """Return this store."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -160,7 +159,7 @@ class Store:
 
         Raises:
             DatabaseError: MongoDB does not answer.
-            StoreError: it holds the index of another store, or this store is a copy.
+            StoreError: It holds the index of another store, or this store is a copy.
         """
         return self.session.connect()
 
@@ -190,7 +189,7 @@ class Store:
         """The entry of a recording, by its id or its label.
 
         Raises:
-            TopicError: there is none.
+            TopicError: It does not exist.
         """
         return self.session.entry(recording)
 
@@ -198,7 +197,7 @@ class Store:
         """Recordings by label, by name, by id, or by the beginning of one of these.
 
         Raises:
-            TopicError: there is no such recording, or there are several.
+            TopicError: No recording matches, or several do.
         """
         return self.session.select(names)
 
@@ -206,29 +205,29 @@ class Store:
         """Names of all topics, sorted; also of those whose messages are all lost."""
         return self.session.topics()
 
-    # Asking.
+    # Questions.
 
     def topic(self, *names: str) -> Query:
-        """A question about one topic or several.
+        """Make a query about one or several topics.
 
         Args:
-            names: Full names, short ones that are unambiguous (`scan`), globs, or
+            names: Full names, unambiguous short ones (`scan`), globs, or
                 `re:` and a regular expression.
 
         Raises:
-            TopicError: a name fits nothing, or several topics; lists the candidates.
+            TopicError: A name matches no topic, or several; the message lists candidates.
         """
         return Query(self.session, Question(*self.session.resolve(names)))
 
     def all_topics(self) -> Query:
-        """A question about everything."""
+        """Make a query about all topics."""
         return self.query(self.topics())
 
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all."""
         return Query(self.session, Question(*self.session.having(topics, recordings)))
 
-    # Changing.
+    # Changes.
 
     def record(
         self,
@@ -240,14 +239,14 @@ class Store:
         """Record a ROS 1 bag, a ROS 2 bag or an MCAP file.
 
         Args:
-            log: Its path, or a source that was opened and not read yet.
-            options: What and how.
+            log: Its path, or an opened source that was not read yet.
+            options: Options of the recording.
             progress: Called with bytes read and messages stored.
             choices: Fields of `RecordOptions`, instead of `options`.
 
         Raises:
-            SourceError: nothing could be read.
-            AlreadyRecordedError: its content is in the store already.
+            SourceError: Nothing could be read.
+            AlreadyRecordedError: Its content is in the store already.
         """
         from hybridlog.recorder import RecordOptions, record
         from hybridlog.sources.detect import open_source
@@ -267,13 +266,13 @@ class Store:
         return report
 
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
-        """Start a recording that messages are written to as they come.
+        """Start a live recording, which takes messages one by one.
 
-        Until it is closed, the garbage collector passes over the objects that are there now.
+        Until it is closed, the garbage collector ignores existing objects.
 
         Args:
             name: Name of the recording.
-            options: How.
+            options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
         from hybridlog.live import LiveOptions, LiveRecording
@@ -289,7 +288,7 @@ class Store:
         )
 
     def _after(self, report: RecordReport) -> None:
-        """A recording has ended."""
+        """Update the store after the end of a recording."""
         self.refresh()
         connected = self.session.connected
         if report.failure is None and (connected is None or connected.ping()):
@@ -311,17 +310,17 @@ class Store:
         recordings: Sequence[str] | None = None,
         progress: Progress | None = None,
     ) -> list[RecordingEntry]:
-        """Make the index again from the segments, recording by recording.
+        """Rebuild the index from the segments, recording by recording.
 
         Args:
-            recordings: Which; None for all, and then what belongs to no recording is removed.
+            recordings: The recordings; None for all, which also removes unknown documents.
             progress: Called after each chunk.
 
         Returns:
-            Those that were indexed.
+            The indexed recordings.
 
         Raises:
-            StoreError: one that was named is being written.
+            StoreError: A named recording is being written.
         """
         from hybridlog.maintenance import index
 
@@ -347,19 +346,19 @@ class Store:
         return [entry for entry in self.recordings() if entry.id in done]
 
     def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
-        """Let MongoDB find messages by the values of fields without looking at all of them.
+        """Add a MongoDB index on fields of a topic.
 
         Args:
             topic: Full name, short name, glob, or `re:` and a regular expression.
-            fields: Of the messages, or `_meta.inserted_at` and its like; the first one
-                should be asked for a value or a range, the others narrow that down.
+            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
+                should give a value or a range of the first one; the others narrow it down.
 
         Returns:
             All indexes of the topics.
 
         Raises:
-            TopicError: there is no such topic or field.
-            DatabaseError: MongoDB cannot make it: two of the fields are arrays.
+            TopicError: A topic or field does not exist.
+            DatabaseError: MongoDB refuses, for example because two fields are arrays.
         """
         query = self.topic(topic)
         database = self.database_for("An index")
@@ -368,10 +367,10 @@ class Store:
         return field_indexes.of_topics(database, query.topics)
 
     def remove_index(self, topic: str, *fields: str) -> int:
-        """Drop the index on just these fields; returns from how many topics.
+        """Drop the index on exactly these fields; return the number of topics.
 
         Raises:
-            TopicError: there is no such topic.
+            TopicError: A topic does not exist.
         """
         query = self.topic(topic)
         database = self.database_for("An index")
@@ -386,7 +385,7 @@ class Store:
     def verify(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None
     ) -> Verification:
-        """Read everything, check checksums, compare catalog and index with the segments.
+        """Check all checksums, and compare catalog and index with the segments.
 
         Args:
             recordings: Which; None for all.
@@ -406,10 +405,10 @@ class Store:
         )
 
     def remove(self, recording: str) -> None:
-        """Delete a recording: its intent is on the disk first, then everything goes.
+        """Delete a recording.
 
         Args:
-            recording: Label, name, or id. The label of a copy removes that copy alone.
+            recording: Label, name, or id. The label of a copy removes only that copy.
 
         Raises:
             StoreError: it is being written.
@@ -428,11 +427,11 @@ class Store:
             self.refresh()
 
     def rename(self, recording: str, name: str) -> RecordingEntry:
-        """Give a recording another name; its directory gets a label made from it."""
+        """Rename a recording; its directory gets a label made from the name."""
         return self._edit(recording, journal.event(journal.RENAMED, name=text(name)))
 
     def tag(self, recording: str, **tags: str) -> RecordingEntry:
-        """Keep tags with a recording; those of the same keys are replaced."""
+        """Set tags of a recording; existing keys get the new values."""
         lines = [journal.event(journal.TAGGED, key=text(k), value=text(v)) for k, v in tags.items()]
         return self._edit(recording, *lines)
 
@@ -440,7 +439,7 @@ class Store:
         """Remove tags of a recording.
 
         Raises:
-            UsageError: it has no such tag.
+            UsageError: A tag does not exist.
         """
         (entry,) = self.select([recording])
         for key in keys:
@@ -468,17 +467,17 @@ class Store:
     def mark(
         self, recording: str, moment: TimeLike, note: str, tags: Mapping[str, str] | None = None
     ) -> RecordingEntry:
-        """Set a mark at a time of a recording that has ended; questions find it like others.
+        """Set a mark at a time of a recording that has ended.
 
         Args:
             recording: Label, name, or id.
             moment: Log time, as for `Query.between`.
-            note: What happened.
-            tags: Kept with it.
+            note: Text of the mark.
+            tags: Tags of the mark.
 
         Raises:
-            TimeError: `moment` is no time.
-            StoreError: the recording is being written: mark it while it runs.
+            TimeError: `moment` is invalid.
+            StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
         from hybridlog.maintenance import edit
 
@@ -496,7 +495,7 @@ class Store:
         recordings: Sequence[str] | None = None,
         progress: Progress | None = None,
     ) -> ImportReport:
-        """Copy recordings in from another store; what was copied before is not copied again.
+        """Import recordings from another store; earlier copies are not repeated.
 
         Args:
             other: The other store's directory.
@@ -504,7 +503,7 @@ class Store:
             progress: Called while files are copied and checked.
 
         Raises:
-            StoreError: there is no store, or a recording of it is damaged or being written.
+            StoreError: It is not a store, or a recording of it is damaged or being written.
         """
         from hybridlog.maintenance import imports
 
@@ -517,7 +516,7 @@ class Store:
     def repair(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None
     ) -> list[Repaired]:
-        """Apply the cures that lose nothing; returns what was done.
+        """Apply all repairs that lose no data; return them.
 
         Args:
             recordings: Which; None for all.
@@ -547,6 +546,6 @@ class Store:
 
         Raises:
             DatabaseError: MongoDB does not answer.
-            StoreError: the database holds the index of another store.
+            StoreError: The database holds the index of another store.
         """
         self.session.take_over()

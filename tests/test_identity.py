@@ -192,11 +192,11 @@ def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
     data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
     path.write_bytes(data)
     with hl.open(tmp_path / "mine", create=True) as mine:
-        with pytest.raises(StoreError, match="does not fit its checksums"):
+        with pytest.raises(StoreError, match="does not match its checksums"):
             mine.import_from(place)
         assert not mine.recordings()
         path.unlink()
-        with pytest.raises(StoreError, match="not whole"):
+        with pytest.raises(StoreError, match="is incomplete"):
             mine.import_from(place)
         assert not mine.recordings()
 

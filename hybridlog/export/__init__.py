@@ -1,7 +1,7 @@
-"""Ways out of the store: files that other tools open.
+"""Writers of files for other tools.
 
-`FORMATS` says what there is; `open_batch_writer`, `open_table_writer` and
-`open_row_writer` make a writer by name. The modules behind them are loaded then.
+`FORMATS` lists the formats; `open_batch_writer`, `open_table_writer` and `open_row_writer`
+open a writer by name, and import its module then.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ Kind = Literal["exact", "table", "rows"]
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A way out.
+    """An output format.
 
     Attributes:
-        kind: `exact` formats carry payloads as they came and are fed with batches;
-            `table` formats carry columns and are fed with Arrow tables; `rows` formats
-            carry one object a message.
-        suffix: Usual end of the file's name; empty for a directory.
+        kind: `exact` formats hold unchanged payloads and take batches; `table` formats hold
+            columns and take Arrow tables; `rows` formats hold one object for each message.
+        suffix: Usual suffix of the file; empty for a directory.
         help: One line for help texts.
     """
 
@@ -46,11 +45,11 @@ FORMATS: dict[str, Format] = {
     "bag": Format("exact", ".bag", "a ROS 1 bag: every ROS 1 message as it came"),
     "raw": Format("exact", "", "a directory with one file a payload"),
 }
-"""Every format by the name that `--format` takes."""
+"""Every format by its name for `--format`."""
 
 
 def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchWriter:
-    """A writer of an `exact` format.
+    """Open a writer of an `exact` format.
 
     Args:
         name: `mcap`, `bag` or `raw`.
@@ -102,7 +101,7 @@ def open_table_writer(name: str, target: Target, *, schema: pa.Schema | None = N
 
 
 def open_row_writer(name: str, target: Target) -> RowWriter:
-    """A writer of a `rows` format: `jsonl`.
+    """Open a writer of a `rows` format: `jsonl`.
 
     Raises:
         UsageError: No such format, or the target cannot be written.
@@ -116,4 +115,4 @@ def open_row_writer(name: str, target: Target) -> RowWriter:
 
 def _no_such_format(name: str, kind: Kind) -> UsageError:
     names = ", ".join(key for key, value in FORMATS.items() if value.kind == kind)
-    return UsageError(f"{name!r} is no format for this: there are {names}")
+    return UsageError(f"{name!r} is not a format for this command; use {names}")

@@ -1,4 +1,4 @@
-"""ROS 1 bags: every message as it came, with the connection headers of the source."""
+"""Writes ROS 1 bags with unchanged messages and the connection headers of the source."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class BagWriter(FileWriter):
     Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag.
 
     Args:
-        target: Path or binary stream; a bag's header is written last, so for a stream
-            the bag is made in a temporary file first.
-        compression: Of chunks.
+        target: Path or binary stream. A bag's header is written last, so for a stream the bag
+            is written to a temporary file first.
+        compression: Compression of chunks.
     """
 
     def __init__(
@@ -75,8 +75,8 @@ class BagWriter(FileWriter):
         """Append messages in the order of the rows.
 
         Raises:
-            UsageError: A channel whose messages are not in ROS 1 encoding, or a time past
-                what a bag can hold (the year 2106).
+            UsageError: A channel has another encoding than ROS 1, or a time is outside the range
+                of a bag (1970 to 2106).
             DiskFullError: No space left.
         """
         if len(batch) == 0:
@@ -148,14 +148,14 @@ class BagWriter(FileWriter):
 
 
 class _ExactWriter(RosbagsWriter):
-    """The rosbags writer with connection headers as they came, and a bounded memory."""
+    """The rosbags writer with unchanged connection headers and bounded memory."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._headers: list[tuple[str, Header]] = []
 
     def add(self, topic: str, schema: Schema, md5sum: str, metadata: dict[str, str]) -> Connection:
-        """Add a connection with the definition's own bytes."""
+        """Add a connection with the unchanged bytes of its definition."""
         header = Header()
         header.set_string("topic", topic)
         header.set_string("type", schema.name)
@@ -173,13 +173,13 @@ class _ExactWriter(RosbagsWriter):
             msgdef=schema.data.decode(errors="replace"),
             md5sum=md5sum,
             callerid=metadata.get("callerid"),
-            # Only tells connections apart; the header has the text as it came.
+            # Only distinguishes connections; the header has the unchanged text.
             latching=int.from_bytes(latching.encode()) if latching else None,
         )
 
-    # rosbags has it as a static method that makes the header of the connection's fields.
+    # In rosbags this static method builds the header from the connection's fields.
     def write_connection(self, connection: Connection, bio: BinaryIO) -> None:  # type: ignore[override]
-        """Write a connection record with the header as it came."""
+        """Write a connection record with the unchanged header."""
         topic, fields = self._headers[connection.id]
         header = Header()
         header.set_uint32("conn", connection.id)
@@ -188,7 +188,7 @@ class _ExactWriter(RosbagsWriter):
         fields.write(bio)
 
     def write_chunk(self, chunk: WriteChunk) -> None:
-        """Write a chunk and keep of its index only what the bag's end needs: the counts."""
+        """Write a chunk; store only the counts of its index, for the end of the bag."""
         super().write_chunk(chunk)
         for number, entries in chunk.connections.items():
             counted = cast("list[tuple[int, int]]", range(len(entries)))
@@ -196,7 +196,7 @@ class _ExactWriter(RosbagsWriter):
 
 
 def _md5sum(schema: Schema) -> str:
-    """The ROS 1 hash of a definition; `*`, which matches any, when it cannot be made."""
+    """The ROS 1 hash of a definition; `*`, which matches any, if it cannot be computed."""
     if len(schema.data) > _LARGEST_DEFINITION or "/" not in schema.name:
         return "*"
     package, _, name = schema.name.replace("/msg/", "/").partition("/")
@@ -205,5 +205,5 @@ def _md5sum(schema: Schema) -> str:
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(schema.data.decode(), kind))
         return store.generate_msgdef(kind)[1]
-    except Exception:  # whatever the parser makes of a hostile definition
+    except Exception:  # any error of the parser for a hostile definition
         return "*"

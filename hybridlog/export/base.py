@@ -1,8 +1,8 @@
-"""What all writers share: where bytes go, and that nothing half-made stays behind.
+"""Base of all writers: atomic output files.
 
 A file appears under its name only when it is complete: it is written beside the target,
 synced, and renamed on `close`. `abort` removes it, and so does an interruption at any
-instant: see `unfinished`. Devices, pipes and streams are written as they are.
+moment: see `unfinished`. Devices, pipes and streams are written directly.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Buffer, Channel
 
 Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
-"""Where a writer writes: a path, or a binary stream, which is left open."""
+"""Target of a writer: a path, or a binary stream, which stays open."""
 
 _WRONG_PLACE = {
     errno.ENOENT,
@@ -44,10 +44,9 @@ _BUFFER = 1 << 20
 
 
 class Writer(Protocol):
-    """Something that ends well or not at all.
+    """A writer whose output is complete or absent.
 
-    As a context manager it closes at the end of the block, and aborts when the block
-    raises.
+    As a context manager it closes at the end of the block, and aborts if the block raises.
     """
 
     def close(self) -> None:
@@ -67,36 +66,36 @@ class Writer(Protocol):
 
 
 class BatchWriter(Writer, Protocol):
-    """A format that carries payloads as they came."""
+    """A writer of unchanged payloads."""
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Append messages.
 
         Args:
-            batch: Rows in the order wanted.
+            batch: Rows in the order of the output.
             channels: `batch.channel` indexes these. Channels of equal content, in one
                 call or several, become one.
         """
 
 
 class TableWriter(Writer, Protocol):
-    """A format of columns."""
+    """A writer of columns."""
 
     def write(self, table: pa.Table) -> None:
         """Append rows."""
 
 
 class RowWriter(Writer, Protocol):
-    """A format of one object a message."""
+    """A writer of one object for each message."""
 
     def write(self, rows: Iterable[Mapping[str, object]]) -> None:
         """Append objects."""
 
 
 class FileWriter:
-    """The life of a writer: subclasses say how to finish and how to let go.
+    """A writer with `close` and `abort`; subclasses implement both ends.
 
-    `close` and `abort` may be called again; whichever came first counts.
+    `close` and `abort` may be called again; the first call counts.
     """
 
     def __init__(self) -> None:
@@ -106,8 +105,8 @@ class FileWriter:
         """Complete the output; it then stands under its name.
 
         Raises:
-            DiskFullError: No space; nothing is left behind.
-            UsageError: The place cannot be written.
+            DiskFullError: No space; no file remains.
+            UsageError: The target cannot be written.
         """
         if self._over:
             return
@@ -125,7 +124,7 @@ class FileWriter:
             self._discard()
 
     def __enter__(self) -> Self:
-        """The writer itself."""
+        """Return this writer."""
         return self
 
     def __exit__(
@@ -150,13 +149,13 @@ class FileWriter:
 class Sink:
     """A binary output that appears on `commit`.
 
-    It has what pyarrow, zipfile and the mcap writer ask of a file that cannot seek.
+    It has the methods that pyarrow, zipfile and the mcap writer need of a file without seek.
 
     Args:
         target: Path or stream.
 
     Raises:
-        UsageError: A directory, or a place that does not exist or cannot be written.
+        UsageError: The target is a directory, does not exist or cannot be written.
     """
 
     def __init__(self, target: Target) -> None:
@@ -174,19 +173,19 @@ class Sink:
             self._final, atomic = destination(target)
             if atomic:
                 self._unfinished = beside(self._final)
-            # A text that is a path is never opened for reading here, nor followed again.
+            # A path is never opened for reading here, and its links are resolved once.
             path = self._unfinished.path if self._unfinished is not None else self._final
             self._file = path.open("xb" if atomic else "wb", buffering=_BUFFER)
 
     @property
     def closed(self) -> bool:
-        """Whether it is committed or aborted."""
+        """True if it is committed or aborted."""
         return self._over
 
     def write(self, data: Buffer) -> int:
         """Append bytes; returns how many.
 
-        After `abort` they are dropped: libraries write their ends when they are let go.
+        After `abort` they are dropped: libraries write their trailers when they are closed.
 
         Raises:
             DiskFullError: No space left.
@@ -204,14 +203,14 @@ class Sink:
         return self._position
 
     def flush(self) -> None:
-        """Hand what is buffered to the system."""
+        """Pass buffered bytes to the system."""
         if self._over:
             return
         with failures(self.name):
             self._file.flush()
 
     def close(self) -> None:
-        """Nothing: libraries close what they are given, `commit` is for its owner."""
+        """Do nothing: libraries close their files, but only the owner may commit."""
 
     def readable(self) -> bool:
         """False."""
@@ -238,12 +237,12 @@ class Sink:
         self._over = True
 
     def abort(self) -> None:
-        """Remove what was written; a stream keeps what it has taken."""
+        """Remove the file; bytes already written to a stream stay."""
         if self._over:
             return
         self._over = True
         if self._own:
-            # Closing flushes, and on a full disk that fails again.
+            # Closing flushes, which fails again on a full disk.
             with contextlib.suppress(OSError):
                 self._file.close()
         if self._unfinished is not None:
@@ -251,12 +250,12 @@ class Sink:
 
 
 def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
-    """The path to write, links followed, and whether it can be replaced by a rename.
+    """The path to write, with links resolved, and whether a rename can replace it.
 
-    Devices and pipes cannot.
+    Devices and pipes cannot be replaced.
 
     Raises:
-        UsageError: A directory, or in a directory that does not exist.
+        UsageError: It is a directory, or its directory does not exist.
     """
     if "\0" in os.fspath(target):
         raise UsageError("the output's name has a NUL character")
@@ -270,7 +269,7 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
 
 @contextlib.contextmanager
 def failures(name: str) -> Iterator[None]:
-    """Map the system's errors in writing `name` to ours; a broken pipe stays what it is."""
+    """Map system errors while writing `name` to hybridlog errors, except a broken pipe."""
     try:
         yield
     except BrokenPipeError:
@@ -280,7 +279,7 @@ def failures(name: str) -> Iterator[None]:
 
 
 def explain(error: OSError, name: str) -> HybridlogError:
-    """The error of our tree for a failure in writing an output."""
+    """Map a failure in writing an output to a hybridlog error."""
     reason = error.strerror or str(error)
     if error.errno in NO_SPACE:
         return DiskFullError(

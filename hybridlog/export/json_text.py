@@ -1,4 +1,4 @@
-"""Arrow columns as JSON text, whole columns at a time.
+"""Converts Arrow columns to JSON text, whole columns at a time.
 
 JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
 `"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits. Times and
@@ -19,13 +19,13 @@ def json_column(array: pa.Array) -> pa.Array:
     """The values of an array as JSON, one string a row.
 
     Args:
-        array: Of any type; at most 2**31 bytes of text may come out of it.
+        array: An array of any type whose text has at most 2**31 bytes.
 
     Returns:
         `pa.string()`, without nulls (a null is the text `null`).
 
     Raises:
-        pa.ArrowNotImplementedError: A type that has no JSON form here (a map, a union).
+        pa.ArrowNotImplementedError: The type has no JSON form here (a map, a union).
     """
     text = _values(array)
     return pc.fill_null(text, "null") if text.null_count else text
@@ -47,7 +47,7 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
         return array.cast(unit).cast(pa.int64()).cast(pa.string())
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-        # Few different strings are the rule: each is quoted once.
+        # Usually few strings are distinct: each is quoted once.
         words = array.dictionary_encode()
         quoted = [json.dumps(word) for word in words.dictionary.to_pylist()]
         return pa.array(quoted, pa.string()).take(words.indices)
@@ -77,7 +77,7 @@ def base64_column(array: pa.Array) -> pa.Array:
 
 
 def _lists(array: pa.Array) -> pa.Array:
-    # `flatten` leaves out what null lists and slices hide, so offsets are made anew.
+    # `flatten` omits values hidden by null lists and slices, so offsets are recomputed.
     items = json_column(array.flatten())
     lengths = np.asarray(pc.fill_null(pc.list_value_length(array), 0), dtype=np.int64)
     offsets = np.zeros(len(array) + 1, dtype=np.int64)

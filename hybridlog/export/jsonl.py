@@ -1,4 +1,4 @@
-"""JSON lines: one object a message, in UTF-8.
+"""Writes JSON lines: one object for each message, in UTF-8.
 
 JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
 `"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits, also those
@@ -35,7 +35,7 @@ def message_row(log_time: int, topic: str, fields: Mapping[str, object]) -> dict
     Args:
         log_time: Nanoseconds since the epoch.
         topic: Name of the topic.
-        fields: Message fields; one that has the name of one of the two gets a trailing
+        fields: Message fields; one with the name of one of these two gets a trailing
             underscore.
     """
     row: dict[str, object] = {"log_time_ns": log_time, "topic": topic}
@@ -110,7 +110,7 @@ def json_line(row: Mapping[str, object]) -> str:
 
 
 def _plain(value: object) -> object:
-    """A value that `json` does not know."""
+    """Convert a value of a type unknown to `json`."""
     for kind, make in _KINDS:
         if isinstance(value, kind):
             return make(value)

@@ -1,4 +1,4 @@
-"""MCAP files: every message, schema and channel as it came."""
+"""Writes MCAP files with unchanged messages, schemas and channels."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel, Schema
 
 OWN_METADATA = "hybridlog."
-"""Channel metadata keys of the store, which do not leave it."""
+"""Prefix of the store's channel metadata keys, which are not exported."""
 
 _ChannelKey = tuple[str, str, int, tuple[tuple[str, str], ...]]
 
 
 def source_metadata(channel: Channel) -> dict[str, str]:
-    """A channel's metadata without what the store has added."""
+    """A channel's metadata without the keys added by the store."""
     return {
         key: value for key, value in channel.metadata.items() if not key.startswith(OWN_METADATA)
     }
@@ -31,7 +31,7 @@ class McapWriter(FileWriter):
     Args:
         target: Path or binary stream.
         profile: MCAP profile: `ros1`, `ros2` or empty.
-        compression: Of chunks.
+        compression: Compression of chunks.
         chunk_size: Uncompressed bytes at which a chunk ends.
     """
 

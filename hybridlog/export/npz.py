@@ -1,4 +1,4 @@
-"""numpy's .npz: one array a column, readable without pickle.
+"""Writes numpy's .npz: one array for each column, readable without pickle.
 
 | column | arrays |
 |---|---|
@@ -6,12 +6,12 @@
 | times, durations | `name`, datetime64[ns] (UTC) or timedelta64[ns] |
 | strings up to 256 characters | `name`, fixed-width Unicode |
 | longer strings, or with NUL, and binary values | `name.values` (uint8), `name.offsets` |
-| lists of fixed size | `name`, one row a message |
+| lists of fixed size | `name`, one row for each message |
 | lists | `name.values`, `name.offsets`: row i is `values[offsets[i]:offsets[i + 1]]` |
 | structures | `name.field` |
 
-Where a column has nulls, `name.valid` tells which rows have a value; the others are NaN,
-NaT, zero or empty. Columns are spooled to temporary files, so memory stays bounded.
+If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
+zero or empty. Columns are spooled to temporary files, so memory stays bounded.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class NpzWriter(FileWriter):
         """Append rows; columns are matched by name. A missing column is null.
 
         Raises:
-            UsageError: A column that changes its type, or has a type that numpy has not.
+            UsageError: A column changes its type, or has a type without a numpy form.
             DiskFullError: No space left.
         """
         with failures(self._sink.name):
@@ -83,7 +83,7 @@ class NpzWriter(FileWriter):
             column = self._columns.get(name)
             if column is None:
                 if pa.types.is_null(array.type):
-                    continue  # its type is not known yet; nulls are filled in then
+                    continue  # its type is unknown; nulls are filled in later
                 column = self._columns[name] = _column(_array_name(name), array.type, self._spools)
                 column.append_nulls(self._rows)
             column.append(array)
@@ -106,7 +106,7 @@ class NpzWriter(FileWriter):
             try:
                 self._write_arrays(archive)
             except BaseException:
-                # Else the archive would be ended, and a stream would look complete.
+                # Otherwise the archive would be finished, and a stream would look complete.
                 self._sink.abort()
                 raise
         self._sink.commit()
@@ -120,7 +120,7 @@ class NpzWriter(FileWriter):
                 while unique in written:
                     unique += "_"
                 written.add(unique)
-                # A fixed date makes equal content an equal file.
+                # With a fixed date, equal content makes equal files.
                 entry = zipfile.ZipInfo(f"{unique}.npy", (1980, 1, 1, 0, 0, 0))
                 with archive.open(entry, "w", force_zip64=True) as file:
                     file.write(_npy_header(dtype, shape))
@@ -133,7 +133,7 @@ class NpzWriter(FileWriter):
 
 
 class _Spools:
-    """Temporary files of one writer; all are gone when it is."""
+    """Temporary files of one writer, removed with it."""
 
     def __init__(self) -> None:
         self._stack = contextlib.ExitStack()
@@ -141,7 +141,7 @@ class _Spools:
         self._count = 0
 
     def new(self) -> IO[bytes]:
-        """A file that holds an array's bytes."""
+        """A temporary file for an array's bytes."""
         self._count += 1
         if self._count > _OPEN_FILES:
             raise UsageError("more columns than files can be open; choose some with --fields")
@@ -182,7 +182,7 @@ class _Spool:
 
 
 class _Column:
-    """A column that takes pieces and, in the end, gives arrays."""
+    """A column: collects pieces and finally returns arrays."""
 
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         self.name = name
@@ -194,7 +194,7 @@ class _Column:
         """Append values.
 
         Raises:
-            UsageError: Of another type than before.
+            UsageError: Their type differs from that before.
         """
         if array.type != self.kind:
             try:
@@ -325,7 +325,7 @@ class _Lists(_Column):
 
 
 class _FixedLists(_Column):
-    """Lists of one size of numbers: a matrix."""
+    """Lists of numbers of one size: a matrix."""
 
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         super().__init__(name, kind, spools)
@@ -335,7 +335,7 @@ class _FixedLists(_Column):
 
     def _append(self, array: pa.Array) -> None:
         self._rows += len(array)
-        # `values` has the elements of null rows too, which `flatten` leaves out.
+        # `values` also has the elements of null rows, which `flatten` omits.
         items = array.values.slice(array.offset * self._size, len(array) * self._size)
         if array.null_count:
             hidden = np.repeat(array.is_null().to_numpy(zero_copy_only=False), self._size)
@@ -357,7 +357,7 @@ class _Structs(_Column):
         ]
 
     def _append(self, array: pa.Array) -> None:
-        # `flatten` puts the structure's nulls into its members.
+        # `flatten` applies the structure's nulls to its members.
         for member, values in zip(self._members, array.flatten(), strict=True):
             member.append(values)
 
@@ -367,7 +367,7 @@ class _Structs(_Column):
 
 
 class _Decoded(_Column):
-    """A dictionary column, as the values it stands for."""
+    """A dictionary column, converted to its values."""
 
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         super().__init__(name, kind, spools)
@@ -382,7 +382,7 @@ class _Decoded(_Column):
 
 
 class _Nulls(_Column):
-    """A list's elements of which none was ever there."""
+    """Elements of lists that are all empty."""
 
     def _append(self, array: pa.Array) -> None:
         pass
@@ -410,7 +410,9 @@ def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
     for fits, make in table:
         if fits:
             return make(name, kind, spools)
-    raise UsageError(f"column {name!r} is {kind}, which numpy has not; leave it out with --fields")
+    raise UsageError(
+        f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
+    )
 
 
 def _is_matrix(kind: pa.DataType) -> bool:
@@ -442,6 +444,6 @@ def _npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 
 def _array_name(name: str) -> str:
-    """A name in the archive that unpacks to no other place."""
+    """A safe name in the archive, which cannot unpack to another directory."""
     safe = "".join("_" if char in '/\\:\0"' or not char.isprintable() else char for char in name)
     return safe.encode("utf-8", "replace").decode()[:200] or "_"

@@ -1,10 +1,10 @@
-"""Payloads as they came, one file each.
+"""Writes unchanged payloads, one file each.
 
-The directory holds `index.jsonl`, a line a message (file, topic, type, times, sequence,
-length), and one directory a topic with files `<log time in ns>.bin`; a second message of
-the same nanosecond is `<log time>-1.bin`. Topic directories are named by the rule of the
-index's collections, so that no topic can name a place outside and no two topics meet.
-On a stream the payloads follow each other without anything between them.
+The directory holds `index.jsonl`, with a line for each message (file, topic, type, times,
+sequence, length), and one directory for each topic with files `<log time in ns>.bin`. A
+second message of the same nanosecond is `<log time>-1.bin`. Topic directories are named
+like the index's collections, so no topic leads outside and no two share a directory. On a
+stream the payloads follow each other without separators.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
 
 INDEX = "index.jsonl"
-"""The file that says which message each payload is. No topic's directory has a dot."""
+"""The file that describes each payload. No topic's directory has a dot."""
 
 
 _LONGEST_LINE = 1 << 20
@@ -34,10 +34,10 @@ _PAYLOAD = re.compile(r"[0-9]+(-[0-9]+)?\.bin")
 
 
 def holds_payloads(directory: Path) -> bool:
-    """Whether a directory was written here, and nothing has been added to it since.
+    """True if this module wrote a directory, and no file was added since.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: It cannot be read.
     """
     index = directory / INDEX
     if not index.is_file() or not _is_index(index):
@@ -63,7 +63,7 @@ def _is_index(path: Path) -> bool:
 
 
 def open_raw_writer(target: Target) -> BatchWriter:
-    """A directory for a path, payloads one after the other for a stream."""
+    """Open a writer: of a directory for a path, of consecutive payloads for a stream."""
     if isinstance(target, str | os.PathLike):
         return RawWriter(target)
     return RawStreamWriter(target)
@@ -73,10 +73,10 @@ class RawWriter(FileWriter):
     """Writes a directory of payload files.
 
     Args:
-        target: The directory; it must not exist, or be empty.
+        target: The directory; it must be missing or empty.
 
     Raises:
-        UsageError: Something is there already, or the place cannot be written.
+        UsageError: It is not empty, or cannot be written.
     """
 
     def __init__(self, target: str | os.PathLike[str]) -> None:
@@ -127,7 +127,7 @@ class RawWriter(FileWriter):
             name = f"{folder}/{log_time}{f'-{number}' if number else ''}.bin"
             try:
                 file = (self._temporary / name).open("xb")
-            except FileExistsError:  # the same time again, after others
+            except FileExistsError:  # the same time again, after other times
                 number += 1
                 continue
             with file:
@@ -138,7 +138,7 @@ class RawWriter(FileWriter):
     def _finish(self) -> None:
         with failures(self._name):
             self._index.close()
-            # One sync for all: thousands of small ones take minutes on a slow disk.
+            # One sync for all: thousands of separate ones take minutes on a slow disk.
             os.sync()
             self._unfinished.publish(self._final)
 

@@ -1,8 +1,8 @@
-"""Tables as files: Parquet, Arrow IPC, CSV.
+"""Writes tables: Parquet, Arrow IPC, CSV.
 
-Tables arrive in pieces. The first pieces, up to a bound, are held back until the columns
-are known, so that a column may appear late or be empty at first; after that a missing
-column is null, and a new one is an error, because these formats fix their columns.
+Tables arrive in pieces. The first pieces, up to a limit, are held back to learn the
+columns, so a column may appear late or be empty at first. After that a missing column is
+null, and a new one is an error, because these formats fix their columns.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hybridlog.schema.arrow_types import common_schema, converted, is_list
 from hybridlog_storage.errors import UsageError
 
 HELD_BYTES = 32 << 20
-"""Bytes of the pieces that are held back to learn the columns."""
+"""Default limit of the pieces held back to learn the columns, bytes."""
 GROUP_BYTES = 32 << 20
 GROUP_ROWS = 1 << 17
 
@@ -35,12 +35,12 @@ class _ArrowFile(Protocol):
 
 
 class TableFileWriter(FileWriter):
-    """What the table formats share: the columns, and rows gathered into groups.
+    """Base of the table formats: learns the columns and collects rows into groups.
 
     Args:
         target: Path or binary stream.
-        schema: The columns, when they are known before; else they are learnt.
-        held_bytes: Bound of what is held back to learn them.
+        schema: The columns, if known beforehand; else they are learnt.
+        held_bytes: Limit of the pieces held back to learn them.
     """
 
     format_name = "table"
@@ -83,7 +83,7 @@ class TableFileWriter(FileWriter):
         raise NotImplementedError
 
     def _prepared(self, table: pa.Table) -> pa.Table:
-        """The table with columns that the format can hold."""
+        """Convert a table to columns that the format supports."""
         return table
 
     def _write_group(self) -> None:
@@ -134,7 +134,7 @@ class TableFileWriter(FileWriter):
 
     @contextlib.contextmanager
     def _failures(self) -> Iterator[None]:
-        """Map what Arrow says about a table to an error of ours."""
+        """Map Arrow errors to hybridlog errors."""
         try:
             yield
         except pa.ArrowException as error:
@@ -154,7 +154,7 @@ class TableFileWriter(FileWriter):
         self._pieces = []
         file, self._file = self._file, None
         if file is not None:
-            # Goes nowhere now; without it Arrow's writers would close when collected.
+            # Its output is dropped; otherwise Arrow's writers would close when collected.
             with contextlib.suppress(Exception):
                 file.close()
 
@@ -176,7 +176,7 @@ class ParquetWriter(TableFileWriter):
         return writer
 
     def _prepared(self, table: pa.Table) -> pa.Table:
-        # Parquet has no group without members; a message without fields says nothing.
+        # Parquet has no empty group, so messages without fields are omitted.
         for index, field in enumerate(table.schema):
             if pa.types.is_struct(field.type) and field.type.num_fields == 0:
                 table = table.set_column(index, field.name, pa.nulls(table.num_rows))

@@ -1,9 +1,9 @@
-"""What is being made, under names of its own, until it is complete.
+"""Temporary names for files and directories until they are complete.
 
-An interruption (Ctrl-C) may come at any instant: after a file is created and before
-anything holds it, or on the way into the function that would remove it. So a name is
-noted before anything exists under it, and forgotten only when nothing does any more.
-What is noted is removed when its owner is, by `remove_unfinished`, or when the process
+An interruption (Ctrl-C) may come at any moment: after a file is created and before an
+object owns it, or on the way into the function that would remove it. So a name is
+registered before its file exists, and unregistered only after its file is gone.
+Registered files are removed with their owner, by `remove_unfinished`, or when the process
 ends.
 """
 
@@ -20,14 +20,14 @@ from pathlib import Path
 from hybridlog_storage.durability import publish
 
 _noted: dict[Path, int] = {}
-"""What is unfinished, and the process that makes it: a child removes nothing of it."""
+"""Unfinished paths and the process that makes them: a child process removes none."""
 
 
 class Unfinished:
-    """A name under which something is made.
+    """A temporary name of a file or directory.
 
     Args:
-        path: Nothing is there yet; the owner makes a file or a directory there.
+        path: An unused path; the owner creates a file or a directory there.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,34 +36,34 @@ class Unfinished:
         self._at_the_end = weakref.finalize(self, _remove, path)
 
     def publish(self, final: Path) -> None:
-        """Give it its name, in one step, and sync the directory.
+        """Rename it atomically to its final name, and sync the directory.
 
         Args:
-            final: In the same directory. A file there is replaced, and an empty directory
-                by a directory.
+            final: A path in the same directory. It replaces a file, or as a directory an empty
+                directory.
 
         Raises:
-            OSError: It cannot be done.
+            OSError: The rename fails.
         """
         publish(self.path, final, depth=1)
         self.remove()
 
     def remove(self) -> None:
-        """Leave nothing; does nothing after `publish`."""
+        """Remove the file or directory; does nothing after `publish`."""
         _remove(self.path)
         self._at_the_end.detach()
 
 
 def beside(final: Path) -> Unfinished:
-    """A name in the same directory that is not in use."""
+    """An unused name in the same directory."""
     return Unfinished(final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial"))
 
 
 def scratch_directory() -> Unfinished:
-    """A new directory for temporary files, which only this user may enter.
+    """Create a directory for temporary files that only this user may enter.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: It cannot be created.
     """
     place = Unfinished(Path(tempfile.gettempdir()) / f"hybridlog-{secrets.token_hex(8)}")
     place.path.mkdir(mode=0o700)
@@ -71,9 +71,9 @@ def scratch_directory() -> Unfinished:
 
 
 def remove_unfinished() -> None:
-    """Remove all that this process has begun and not completed.
+    """Remove all unfinished files of this process.
 
-    For a process that was told to stop: it may be that nobody holds the writer any more.
+    For a process that is stopping and may have lost its reference to the writer.
     """
     for path in list(_noted):
         _remove(path)

@@ -1,7 +1,6 @@
-"""Keeping a store whole: recovery, index, verification, repair, removal, import.
+"""Store maintenance: recovery, index, verification, repair, removal, import.
 
-Segments and journals are the truth. Everything here holds what was made from them, the
-catalog and the index, against them, and mends that, never the other way round. Before the
-first step that destroys something, the intent is on the disk; whatever is interrupted, the
-next opening of the store finishes.
+Segments and journals are the truth. The functions here compare catalog and index with them
+and repair catalog and index, never the reverse. The intent is on the disk before the first
+destructive step, and the next opening of the store finishes interrupted work.
 """

@@ -30,16 +30,16 @@ def decode_again(
     entry: RecordingEntry,
     progress: Progress | None = None,
 ) -> RecordingEntry:
-    """Decode all segments of which the catalog does not know what is in the messages.
+    """Decode all segments without decoding results in the catalog.
 
     Args:
         directory: The store.
         catalog: Its catalog.
-        entry: The recording, which this process holds for writing.
+        entry: The recording, locked by this process for writing.
         progress: Called after each chunk.
 
     Returns:
-        The recording's whole entry.
+        The recording's complete entry.
 
     Raises:
         SegmentError: A segment cannot be opened.
@@ -66,7 +66,7 @@ def _decoded(
             path = directory.recording(entry.label) / inventory.listing.sealed[number]
             with SegmentReader(path, number) as reader:
                 for place in summary.chunks:
-                    # Of one that cannot be read nobody knows more; who asks for it is told.
+                    # An unreadable chunk has no results; reading it raises an error.
                     with suppress(SegmentError):
                         chunk = reader.read_chunk(place)
                         _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)

@@ -40,10 +40,10 @@ def append(
     entry: RecordingEntry,
     lines: Sequence[journal.Event],
 ) -> None:
-    """Add lines to the journal of a recording; a new name gives its directory a new label.
+    """Append lines to the journal of a recording; a new name changes its directory's label.
 
     Raises:
-        StoreError: It is being written, or has no journal that can be written.
+        StoreError: It is being written, or its journal cannot be written.
     """
     with directory.writing(entry.label) as mine:
         if not mine:
@@ -54,7 +54,7 @@ def append(
 
 
 def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> journal.Event:
-    """A line; one that renames says which label the directory has, and which it is to get."""
+    """A line of the journal; a renaming line also has the old and the new label."""
     if line["event"] != journal.RENAMED:
         return line
     new = directory.free_label(str(line["name"]), but=label)
@@ -77,8 +77,8 @@ def mark(
         catalog: Its catalog.
         entry: The recording.
         moment: Log time of the mark, ns.
-        text: What happened.
-        tags: Kept with it.
+        text: Text of the mark.
+        tags: Tags of the mark.
 
     Raises:
         StoreError: The recording is being written, or a segment of it cannot be read.
@@ -103,7 +103,7 @@ def mark(
         )
 
         def announce(sealed: Sealed) -> None:
-            # In this order: of a mark whose segment is not listed there is nothing.
+            # In this order: a mark whose segment is not listed does not exist.
             Journal(path).append(marked, sealed_event(sealed))
 
         try:
@@ -118,9 +118,9 @@ def mark(
 
 
 def _take_back(segment: SegmentFile) -> None:
-    """Remove a segment that came to nothing, unless the journal lists it.
+    """Remove the segment of a failed mark, unless the journal lists it.
 
-    What is not done here, or is listed, the next opening finishes.
+    The next opening of the store finishes a removal that fails, or a listed mark.
     """
     with suppress(StoreError, OSError):
         state = journal.read(segment.path.parent)
@@ -129,7 +129,7 @@ def _take_back(segment: SegmentFile) -> None:
 
 
 def _channel(inventory: Inventory) -> tuple[Channel, int, int]:
-    """The channel of marks, its id and its schema's: those of the recording, or new ones."""
+    """The channel of marks with its id and schema id: those of the recording, or new ones."""
     wanted = mark_channel()
     known: dict[int, Channel] = {}
     schemas = 0
@@ -161,12 +161,12 @@ def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> in
                 following = max(following, int(reader.read_arrivals(place, count).max()) + 1)
         if following >= int(cast(int, summary.recording.get("next_seq", 0))):
             break
-    # Those of a lost segment are not given again: it may come back out of a copy.
+    # Numbers of a lost segment are not reused: it may be restored from a copy.
     return following + sum(sealed.messages for sealed in inventory.lost)
 
 
 def _chunk(channel_id: int, moment: int, payload: bytes, seq: int) -> PackedChunk:
-    """A chunk of one message."""
+    """Make a chunk of one message."""
     one = np.ones(1, np.int64)
     batch = Batch(
         payload,

@@ -1,4 +1,4 @@
-"""Copying recordings in from another store: checked, and resumed after an interruption."""
+"""Imports recordings from another store, with checks; resumes after an interruption."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _PIECE = 8 << 20  # bytes copied at once
 
 @dataclass(slots=True)
 class ImportReport:
-    """What an import did.
+    """The result of an import.
 
     Attributes:
-        imported: Labels here of the recordings that were copied.
-        known: Labels of those that were here already.
-        bytes_copied: Bytes copied now; what an interrupted import had copied is not among them.
+        imported: Labels in this store of the copied recordings.
+        known: Labels of recordings that were here already.
+        bytes_copied: Bytes copied now, without those copied by an interrupted import.
     """
 
     imported: list[str] = field(default_factory=list)
@@ -47,19 +47,18 @@ def run(
 ) -> ImportReport:
     """Copy recordings from one store into another.
 
-    Each is copied into a directory out of sight, every byte is checked there, and only then
-    it gets its name. Segments that an interrupted import has copied are checked, not copied
-    again.
+    Each is copied into a hidden directory, which gets its name after every byte is checked.
+    Segments copied by an interrupted import are checked, but not copied again.
 
     Args:
         source: The store to read.
         target: The store to write.
         entries: Recordings of `source`.
-        progress: Called with bytes copied and checked.
+        progress: Called with the bytes copied and checked.
 
     Raises:
-        StoreError: A recording is damaged, or being written; those before it are imported.
-        DiskFullError: There is no room; the import can be run again.
+        StoreError: A recording is damaged or being written; those before it are imported.
+        DiskFullError: No room; the import can be run again.
     """
     target.check_writable()
     report = ImportReport()
@@ -76,7 +75,7 @@ def run(
         if entry.status == "unfinished":
             raise StoreError(
                 f"Recording {entry.label!r} of {source.path} was cut short by a crash. Open that "
-                "store once with the right to write, so that it is recovered, and import it then."
+                "store once with write permission, which recovers it, then import it."
             )
         report.imported.append(_import_one(source, target, entry, report, progress))
     return report
@@ -103,9 +102,9 @@ def _import_one(
     inventory = take_inventory(source, entry.label)
     if inventory.misfits or not inventory.is_proven:
         raise StoreError(
-            f"Recording {entry.label!r} of {source.path} is not whole: "
-            f"`hybridlog verify --store {source.path} {entry.label}` says what is wrong. "
-            "Nothing of it was imported."
+            f"Recording {entry.label!r} of {source.path} is incomplete: "
+            f"`hybridlog verify --store {source.path} {entry.label}` shows what is missing. "
+            "It was not imported."
         )
     hidden = f"{IMPORTING}{entry.id}"
     path = target.recording(hidden)
@@ -117,7 +116,9 @@ def _import_one(
         raise durability.explain(error, path, "importing into") from error
     with target.writing(hidden) as mine:
         if not mine:
-            raise StoreError(f"Another process imports {entry.label!r} at this moment.")
+            raise StoreError(
+                f"Another process is importing {entry.label!r}. Wait until it is done."
+            )
         clear_away(target, hidden)
         _copy_segments(source, path, inventory, report, progress)
         data = files.read_file(source.recording(entry.label) / JOURNAL, journal.MAX_JOURNAL)
@@ -147,7 +148,7 @@ def _copy_segments(
             if not _is_there(path / name, summary.digest, summary.size):
                 raise StoreError(
                     f"{source.recording(inventory.label) / name} is damaged: what was copied "
-                    "does not fit its checksums. `hybridlog verify` says where."
+                    "does not match its checksums. `hybridlog verify` shows where."
                 )
         done += summary.size
         if progress is not None:
@@ -155,7 +156,7 @@ def _copy_segments(
 
 
 def _is_there(path: Path, digest: str, size: int) -> bool:
-    """Whether a copy is whole, byte for byte."""
+    """True if a copy is complete, byte for byte."""
     try:
         with SegmentCheck(path) as check:
             if check.summary is None or (check.summary.digest, check.summary.size) != (
@@ -169,7 +170,7 @@ def _is_there(path: Path, digest: str, size: int) -> bool:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file; it gets its name only whole and on the disk.
+    """Copy a file, which gets its name when it is complete and on the disk.
 
     Raises:
         StoreError: The source cannot be read.

@@ -48,18 +48,18 @@ def bring_up_to_date(
     report: RepairReport,
     progress: Progress | None = None,
 ) -> bool:
-    """Index what is not in the index, and remove from it what is gone.
+    """Index missing chunks, and remove documents of removed recordings.
 
     Args:
         directory: The store.
         catalog: Its catalog.
         database: The index.
         entries: All recordings.
-        report: Gets what was done.
+        report: Collects the actions.
         progress: Called while a recording is indexed.
 
     Returns:
-        Whether something of an entry is not as it was.
+        Whether an entry has changed.
 
     Raises:
         DatabaseError: MongoDB fails.
@@ -78,11 +78,11 @@ def bring_up_to_date(
         if not directory.is_writable:
             raise StoreError(
                 f"The index of recording {entry.label!r} is not complete, and the store "
-                f"{directory.path} is read-only. Open it once with the right to write."
+                f"{directory.path} is read-only. Open it once with write permission."
             )
         with directory.writing(entry.label) as mine:
             if not mine:
-                continue  # who holds it indexes it
+                continue  # the process that holds the lock indexes it
             try:
                 chunks = _tend(directory, catalog, database, entry, progress)
             except SegmentError as error:
@@ -95,7 +95,7 @@ def bring_up_to_date(
 
 
 def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
-    """Restore the catalog's list of unreadable chunks from the index; True if it had changed."""
+    """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
     with suppress(CatalogError):
         if catalog.damage(entry.id) == indexed.damage:
             return False
@@ -104,7 +104,7 @@ def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
 
 
 def _is_settled(indexed: Indexed | None, entry: RecordingEntry) -> bool:
-    """Whether a completely indexed recording needs no further work."""
+    """True if a completely indexed recording needs no further work."""
     is_shown = indexed is not None and not indexed.has_list and indexed.mirrors(entry)
     return is_shown and entry.is_decoded
 
@@ -116,13 +116,13 @@ def _tend(
     entry: RecordingEntry,
     progress: Progress | None,
 ) -> int | None:
-    """Bring one recording up to date, which this process holds.
+    """Bring one recording, locked by this process, up to date.
 
     Returns:
-        How many chunks were indexed; None when all were in the index.
+        Number of indexed chunks; None if all were in the index.
     """
     state = IndexState(database)
-    indexed = state.one(entry.key)  # as it is now that nobody writes it
+    indexed = state.one(entry.key)  # read again, now that it is locked
     if indexed is None or not indexed.is_whole(entry):
         return catch_up(directory, catalog, database, entry.label, progress)
     if not entry.is_decoded:
@@ -141,10 +141,10 @@ def _remove_strangers(
     known: Mapping[str, Indexed],
     report: RepairReport,
 ) -> None:
-    """Remove recordings from the index that have no directory any more.
+    """Remove recordings without a directory from the index.
 
-    The directories are listed after the index was: one that has begun meanwhile is in them.
-    Where one cannot be read, nobody can say what is gone, and nothing is removed.
+    The directories are listed after the index, so they include recordings that have begun
+    meanwhile. If one cannot be read, nothing is removed.
     """
     present = ids_present(directory)
     if present is None:
@@ -158,9 +158,9 @@ def _remove_strangers(
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
-    """Keys of all recordings that have a directory; None when one does not say what it is.
+    """Keys of all recordings with a directory; None if one cannot be identified.
 
-    One that gets another name meanwhile must not be missed, so all are listed again then.
+    If one is renamed meanwhile, all are listed again, so that none is missed.
     """
     for _ in range(_TRIES):
         labels = directory.labels()
@@ -191,7 +191,7 @@ def _ids_of(directory: StoreDirectory, labels: Iterable[str]) -> set[str] | None
 
 
 def forget(state: IndexState, key: str) -> None:
-    """Remove all documents of a recording; its place in the mirror goes last."""
+    """Remove all documents of a recording, and its mirror last."""
     state.clear(key, state.topic_collections())
     state.remove(key)
 
@@ -203,20 +203,20 @@ def catch_up(
     label: str,
     progress: Progress | None = None,
 ) -> int:
-    """Index the chunks of a recording that are not in the index; returns how many.
+    """Index the missing chunks of a recording; return their number.
 
-    A chunk that cannot be read is noted in the catalog, and the others are indexed.
+    An unreadable chunk is noted in the catalog, and the others are indexed.
 
     Args:
         directory: The store.
         catalog: Its catalog.
         database: The index.
-        label: The recording, which this process holds for writing.
+        label: The recording, locked by this process for writing.
         progress: Called after each chunk.
 
     Raises:
-        DatabaseError: the database does not take them.
-        SegmentError: a segment cannot be read.
+        DatabaseError: MongoDB fails.
+        SegmentError: A segment cannot be read.
     """
     state = IndexState(database)
     entry = put_entry(directory, catalog, label)
@@ -241,7 +241,7 @@ def catch_up(
     )
     catalog.put_damage(entry.id, damage)
     entry = finish(directory, catalog, database, label, turn=indexed.turn)
-    if not entry.is_decoded:  # what was in the index before
+    if not entry.is_decoded:  # documents indexed before
         state.show(decode_again(directory, catalog, entry, progress))
     return len(missing.keys() - damage.keys())
 
@@ -249,11 +249,11 @@ def catch_up(
 def _prepare(
     state: IndexState, entry: RecordingEntry, catalog: Catalog
 ) -> tuple[Indexed, dict[Place, int]]:
-    """Remove from the index what does not fit the segments; returns what is left.
+    """Remove documents from the index that do not fit the segments; return the rest.
 
     Returns:
-        What the index says of the recording now, and the offsets of chunks that are in it, of
-        segments that are not in it whole.
+        The state of the recording's index, and the offsets of indexed chunks in
+        incompletely indexed segments.
     """
     indexed = state.one(entry.key)
     done = state.places(entry.key)
@@ -272,10 +272,10 @@ def _prepare(
         state.put(entry, "indexing", turn=turn, segments=left)
         state.forget_chunks(entry.key)
         return Indexed(entry.id, "indexing", left, turn, ()), {}
-    # Until all of this has come to its end, the next opening begins it again.
+    # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn, segments=left)
     if indexed is None:
-        # Nothing is known to be there. What there is all the same lies in the same times.
+        # No documents are known. Unknown ones are within the same times.
         state.clear(entry.key, {collection_of(c.topic) for c in entry.channels}, entry.span)
     else:
         state.clear(entry.key, state.topic_collections(), but=[int(n) for n in left])
@@ -284,9 +284,9 @@ def _prepare(
 
 
 def _fits(entry: RecordingEntry, catalog: Catalog, done: Mapping[Place, int]) -> bool:
-    """Whether all chunks that are in the index lie where it says.
+    """True if the positions of all indexed chunks match the segments.
 
-    A power cut may take back chunks whose index documents are on the disk already.
+    A power cut may remove chunks whose index documents are on the disk already.
     """
     tables = {
         number: catalog.table(entry, number).chunks["offset"].tolist()
@@ -378,10 +378,10 @@ def _chunks(
 def finish(
     directory: StoreDirectory, catalog: Catalog, database: Database, label: str, *, turn: int
 ) -> RecordingEntry:
-    """Say that the index of a recording is complete; returns the recording's whole entry.
+    """Mark the index of a recording as complete; return the recording's complete entry.
 
-    What the decoded messages told goes into the catalog, then the mirror says `complete`,
-    and last the list of chunks goes.
+    Decoding results go into the catalog, then the mirror becomes `complete`, and last the
+    list of chunks is dropped.
     """
     state = IndexState(database)
     inventory = take_inventory(directory, label)
@@ -420,10 +420,10 @@ def reindex(
     *,
     everything: bool = False,
 ) -> list[str]:
-    """Make the index of recordings again from their segments, one after the other.
+    """Rebuild the index of recordings from their segments, one after the other.
 
-    While one is made again, the others answer; what is interrupted, the next opening
-    finishes.
+    The other recordings can be asked meanwhile. The next opening finishes an interrupted
+    rebuild.
 
     Args:
         directory: The store.
@@ -431,10 +431,10 @@ def reindex(
         database: The index.
         labels: The recordings.
         progress: Called after each chunk.
-        everything: Whether these are all, and `remove_rest` follows.
+        everything: Whether these are all recordings, and `remove_rest` follows.
 
     Returns:
-        Labels of those that are being written, which were left as they are.
+        Labels of those that are being written, which are unchanged.
 
     Raises:
         DatabaseError: MongoDB fails.
@@ -447,17 +447,17 @@ def reindex(
                 left.append(label)
                 continue
             entry = put_entry(directory, catalog, label)
-            # What lies outside of its times takes a look at every document.
+            # Finding documents outside of its times would read every document.
             _clear(state, entry, entry.span if everything else None)
             catch_up(directory, catalog, database, label, progress)
     return left
 
 
 def _clear(state: IndexState, entry: RecordingEntry, span: tuple[int, int] | None = None) -> None:
-    """Remove the documents of a recording that is about to be indexed from its beginning."""
+    """Remove the documents of a recording before it is indexed from the beginning."""
     indexed = state.one(entry.key)
     turn = 1 if indexed is None else indexed.turn + 1
-    # Until all of them are gone, the next opening begins with that.
+    # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn)
     state.clear(entry.key, state.topic_collections(), span)
     state.put(entry, "indexing", turn=turn)
@@ -470,7 +470,7 @@ def remove_rest(
     entries: Iterable[RecordingEntry],
     progress: Progress | None = None,
 ) -> None:
-    """Remove documents that belong to no recording, or that their recording does not account for.
+    """Remove documents of no recording, and surplus documents of recordings.
 
     Each collection is read once.
 
@@ -496,11 +496,11 @@ def remove_rest(
             if entry is None:
                 strangers.append((key, collection))
                 continue
-            # Fewer, too: a document of no recording may have stood in the place of one.
+            # Fewer, too: a document of no recording may have had the key of one.
             missing = _messages_in(entry, collection) - found["count"]
             if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
                 again.add(entry.key)
-    # Listed only now: of a recording that has begun meanwhile there is a directory by now.
+    # Listed after the index: a recording that has begun meanwhile has a directory by now.
     present = ids_present(directory) if strangers else None
     for key, collection in strangers:
         if present is not None and not (isinstance(key, str) and key in present):
@@ -518,10 +518,10 @@ def _messages_in(entry: RecordingEntry, collection: str) -> int:
 
 
 def mirror(catalog: Catalog, database: Database, recording: str) -> None:
-    """Bring the mirror of a recording up to date after its journal has grown.
+    """Update the mirror of a recording after its journal has grown.
 
     Raises:
-        DatabaseError: MongoDB fails; the next connection does it.
+        DatabaseError: MongoDB fails; the next connection repeats it.
     """
     state = IndexState(database)
     known = catalog.recordings().get(recording)

@@ -1,7 +1,7 @@
-"""Which place a database belongs to, so that a copied store is noticed.
+"""Registers the place of a store in its database, so that a copied store is noticed.
 
 A copy of a store has the same id and names the same MongoDB. If both used it, each would
-take the other's recordings for gone. So the database says where its store lies.
+treat the other's recordings as removed. So the database stores the place of its store.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def place_of(directory: StoreDirectory) -> dict[str, Any]:
-    """A store's id, and the host and path where it lies."""
+    """A store's id, host and path."""
     return {
         "id": directory.settings.store_id,
         "host": platform.node(),
@@ -38,20 +38,19 @@ def check(
     *,
     embedded: bool = False,
 ) -> bool:
-    """Check that a database holds no index but that of a store at a place.
+    """Check that a database holds only the index of the store at this place.
 
     Args:
-        mark: What the database says; None if it is nobody's.
-        place: From `place_of`; its `id` is empty for a store that is yet to be made.
-        database: For messages.
-        embedded: Whether it lies in the store itself, and moves and is copied with it.
+        mark: The database's owner; None without one.
+        place: From `place_of`; its `id` is empty for a store that does not exist yet.
+        database: The database, for messages.
+        embedded: Whether it lies in the store, and is moved and copied with it.
 
     Returns:
-        Whether the database has to be told of the place.
+        Whether the place must be written to the database.
 
     Raises:
-        StoreError: It holds the index of another store, or of the store that this one is a
-            copy of.
+        StoreError: It holds the index of another store, or of the original of this copy.
     """
     if mark is None:
         return True
@@ -75,7 +74,7 @@ def check(
 
 
 def _has_moved(mark: Mapping[str, Any], place: Mapping[str, Any]) -> bool:
-    """Whether the store is no longer where the database says; only this host can be asked."""
+    """True if the store is no longer at the registered place; only known for this host."""
     if mark["host"] != place["host"]:
         return False
     try:
@@ -85,14 +84,14 @@ def _has_moved(mark: Mapping[str, Any], place: Mapping[str, Any]) -> bool:
 
 
 def become_another(path: Path, mongo: str | None) -> None:
-    """Give a store that is a copy an id of its own.
+    """Give a copied store a new id.
 
     Args:
         path: The store.
         mongo: URI of the MongoDB for its index, or `embedded`; None to keep the embedded one.
 
     Raises:
-        UsageError: It names a MongoDB, and no other one was given.
+        UsageError: It names a MongoDB, and no other one is given.
         StoreError: It cannot be written.
     """
     from hybridlog import consent

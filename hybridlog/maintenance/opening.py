@@ -1,7 +1,7 @@
 """Opens a store: recovers recordings after a crash and brings the catalog up to date.
 
-No server is asked. A recording whose files look as they did when its catalog row was made
-is believed without opening them.
+No server is needed. If the state of a recording's files matches its catalog row, the files
+are not opened.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ _TRIES = 10
 
 
 def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catalog:
-    """The catalog of a store; one in memory where the store cannot be written.
+    """Open the catalog of a store; in memory if the store cannot be written.
 
     Args:
         directory: The store.
-        in_memory: Because its disk is full.
+        in_memory: Use memory in any case, for a full disk.
     """
     store_id = directory.settings.store_id
     if in_memory or not directory.is_writable:
@@ -64,12 +64,12 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
 def repair_on_open(
     directory: StoreDirectory, catalog: Catalog, report: RepairReport
 ) -> list[RecordingEntry]:
-    """Bring files and catalog in order; returns all recordings, oldest log time first.
+    """Repair files and catalog; return all recordings, oldest log time first.
 
     Args:
         directory: The store.
         catalog: Its catalog.
-        report: Gets what was found and mended.
+        report: Collects problems and repairs.
     """
     try:
         return _repair_on_open(directory, catalog, report)
@@ -89,17 +89,17 @@ def _repair_on_open(
         labels = directory.labels()
         report.unreadable.clear()
         found = _find(directory, catalog, labels, known, report)
-        # One that got another name meanwhile must not be missed.
+        # A recording that was renamed meanwhile must not be missed.
         if directory.labels() == labels:
             break
     report.copies.clear()
     entries = [_one_of(directory, copies, known, report) for copies in found.values()]
     for recording, (_, entry) in catalog.recordings().items():
-        # What is known of one that cannot be read now may fit again later.
+        # The row of a recording that is unreadable now may be valid again later.
         if recording not in found and entry.label not in report.unreadable:
             catalog.remove(recording)
     for entry in entries:
-        if len(found[entry.id]) > 1:  # the row may be the copy's
+        if len(found[entry.id]) > 1:  # the row may be that of the copy
             put_entry(directory, catalog, entry.label)
     return in_order(entries)
 
@@ -111,7 +111,7 @@ def _find(
     known: Mapping[str, tuple[str, RecordingEntry]],
     report: RepairReport,
 ) -> dict[str, list[RecordingEntry]]:
-    """By id: entries of the recordings with these labels, which are recovered first."""
+    """Recover the recordings with these labels; return their entries by id."""
     found: dict[str, list[RecordingEntry]] = {}
     for label in labels:
         looks, kept = known.get(label, ("", None))
@@ -139,7 +139,7 @@ def in_order(entries: list[RecordingEntry]) -> list[RecordingEntry]:
 def _is_current(
     directory: StoreDirectory, entry: RecordingEntry, looks: str, listing: Listing
 ) -> bool:
-    """Whether a catalog row still fits the files."""
+    """True if a catalog row still matches the files."""
     if looks != listing.print:
         return False
     if listing.open or entry.status == "open" or any(map(is_left_over, listing.others)):
@@ -153,7 +153,7 @@ def _refresh(
     label: str,
     report: RepairReport,
 ) -> RecordingEntry | None:
-    """Recover a recording if a crash left it, and put it into the catalog; None if it is gone."""
+    """Recover a recording after a crash and update its catalog row; None if it is gone."""
     may_write = not catalog.is_in_memory
     listing = directory.listing(label)
     is_empty = not (listing.journal or listing.sealed or listing.open)
@@ -165,13 +165,13 @@ def _refresh(
         return put_entry(directory, catalog, label, is_open=directory.is_held(label))
     with directory.writing(label) as mine:
         if not mine and not _has_begun(directory, label):
-            return None  # somebody is about to begin
+            return None  # a process is about to begin it
         now = recover(directory, label, report) if mine else label
         return put_entry(directory, catalog, now, is_open=not mine) if now else None
 
 
 def _has_begun(directory: StoreDirectory, label: str) -> bool:
-    """Whether something says what recording it is: the first line of its journal, or a segment."""
+    """True if a recording can be identified, by the first line of its journal or a segment."""
     listing = directory.listing(label)
     if listing.sealed or listing.open:
         return True
@@ -185,10 +185,10 @@ def _one_of(
     known: Mapping[str, tuple[str, RecordingEntry]],
     report: RepairReport,
 ) -> RecordingEntry:
-    """The one of several directories with the same recording that answers.
+    """Choose one of several directories with the same recording.
 
-    The one that is most whole; of equals the one that the catalog knew, then the one whose
-    journal is older.
+    The most complete one; of equals the one in the catalog, then the one with the older
+    journal.
     """
     if len(copies) == 1:
         return copies[0]
@@ -211,14 +211,14 @@ def _one_of(
 
 
 def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
-    """Finish what a crash left of a recording that this process holds.
+    """Finish the interrupted work on a recording that this process has locked.
 
     Returns:
-        Its label, which a renaming that was interrupted may change; empty when it is gone.
+        Its label, which an interrupted renaming may change; empty if it is gone.
 
     Raises:
         StoreError: It cannot be written, or its journal cannot be read.
-        DiskFullError: There is no room; nothing is lost.
+        DiskFullError: No room; nothing is lost.
     """
     path = directory.recording(label)
     clear_away(directory, label)
@@ -259,12 +259,12 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
 
 
 def is_left_over(name: str) -> bool:
-    """Whether a file in a recording's directory is what an interruption has left of a step."""
+    """True if a file in a recording's directory is left from an interrupted step."""
     return bool(_LEFT_OVER.fullmatch(name) or _MOVING.fullmatch(name))
 
 
 def clear_away(directory: StoreDirectory, label: str) -> None:
-    """Remove files that never got their name, and give segments theirs that were to get it."""
+    """Remove temporary files, and finish the renaming of segments."""
     finish_moves(directory, label)
     path = directory.recording(label)
     for name in directory.listing(label).others:
@@ -276,23 +276,23 @@ def clear_away(directory: StoreDirectory, label: str) -> None:
 
 
 def moving_name(name: str, number: int) -> str:
-    """Name of a segment on its way to the name that it should have."""
+    """Temporary name of a segment that is being renamed."""
     return f"{name}.moving-{number:06d}"
 
 
 def finish_moves(
     directory: StoreDirectory, label: str, *, replace: bool = False
 ) -> list[tuple[str, str]]:
-    """Give segments that are on the way to another name that name.
+    """Finish the renaming of segments.
 
     Args:
         directory: The store.
-        label: The recording, which this process holds.
-        replace: Keep a file that has the name already as `.damaged`: it is nothing that the
-            journal lists. Without, it may be on its way itself, and stays.
+        label: The recording, locked by this process.
+        replace: Rename an existing file of that name to `.damaged`: the journal does not list
+            it. Otherwise it stays, as it may be renamed itself.
 
     Returns:
-        The name that each had before, and the one that it has now.
+        Old and new name of each.
     """
     path = directory.recording(label)
     done = []
@@ -316,7 +316,7 @@ def finish_moves(
 
 
 def _free_name(directory: StoreDirectory, label: str, name: str) -> str:
-    """A name that no file has: this one, or one with a number before its last part."""
+    """A free file name: this one, or one with a number before its suffix."""
     taken = set(directory.listing(label).others)
     stem, _, last = name.rpartition(".")
     return next(
@@ -325,9 +325,9 @@ def _free_name(directory: StoreDirectory, label: str, name: str) -> str:
 
 
 def finish_renaming(directory: StoreDirectory, label: str, state: JournalState | None) -> str:
-    """Give a directory the label that its journal announces; returns its label now.
+    """Give a directory the label that its journal announces; return its label.
 
-    Whoever has moved it elsewhere meanwhile has had the last word.
+    A directory that a user has renamed meanwhile is unchanged.
     """
     if state is None or state.moving is None:
         return label
@@ -364,7 +364,7 @@ def _recover_segments(
             and state.end is not None
             and number not in state.sealed
         ):
-            # A mark that was to be added to a recording that had ended.
+            # An unfinished mark of a recording that had ended.
             try:
                 files.unlink(path / name)
             except OSError as error:
@@ -380,9 +380,9 @@ def _end_of(inventory: Inventory) -> dict[str, Any]:
 
 
 def announce_removal(directory: StoreDirectory, label: str) -> None:
-    """Write into the journal that a recording is about to be removed.
+    """Announce the removal of a recording in its journal.
 
-    On a full disk there may be no room for that; then the directory's new name says it.
+    On a full disk the line may not fit; then the directory's hidden name announces it.
     """
     path = directory.recording(label)
     if directory.listing(label).journal:
@@ -391,14 +391,14 @@ def announce_removal(directory: StoreDirectory, label: str) -> None:
 
 
 def remove_files(directory: StoreDirectory, label: str) -> None:
-    """Delete the files of a recording: first out of sight, then from the disk."""
+    """Hide a recording's directory, then delete its files."""
     directory.sweep(directory.hide(label))
 
 
 def put_entry(
     directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
 ) -> RecordingEntry:
-    """Describe a recording as its files are now, and put it into the catalog.
+    """Read a recording's files and update its catalog row.
 
     Raises:
         SegmentError: Nothing says what recording it is.
@@ -420,10 +420,10 @@ def _put_entry(
 
 
 def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Restore catalog rows of a recording that were lost.
+    """Restore lost catalog rows of a recording.
 
     Raises:
-        StoreError: Its files cannot be read any more, or differ from what is known of them.
+        StoreError: Its files cannot be read, or have changed.
     """
     catalog.mend()
     for _ in range(2):
@@ -444,7 +444,7 @@ def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry
 def describe_now(
     directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
 ) -> Described:
-    """A recording as its files are now.
+    """Read a recording from its files.
 
     Raises:
         SegmentError: Nothing says what recording it is.
@@ -455,7 +455,7 @@ def describe_now(
 def describe_inventory(
     catalog: Catalog, inventory: Inventory, *, is_open: bool = False
 ) -> Described:
-    """A recording as an inventory has it.
+    """Make the catalog row of a recording from its inventory.
 
     Raises:
         SegmentError: Nothing says what recording it is.

@@ -1,4 +1,4 @@
-"""Removing recordings, so that an interruption at any step is finished later."""
+"""Removes recordings; the next opening finishes an interrupted removal."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def remove(
 ) -> None:
     """Delete a recording.
 
-    The journal says so first. Then the directory goes out of sight, and from then on the
-    recording is gone: whatever is left of it, the next opening removes.
+    The journal announces it first. Then the directory gets a hidden name, and the recording
+    is gone; the next opening removes remaining files.
 
     Args:
         directory: The store.
@@ -50,7 +50,7 @@ def remove(
             if database is not None:
                 _clear(IndexState(database), entry)
         finally:
-            # On a full disk it is the room of these files that all else waits for.
+            # On a full disk, the space of these files is needed first.
             directory.sweep(hidden)
 
 
@@ -63,7 +63,7 @@ def _clear(state: IndexState, entry: RecordingEntry) -> None:
 
 
 def remove_copy(directory: StoreDirectory, label: str) -> None:
-    """Delete a directory that is a copy of another one's recording; the index stays.
+    """Delete a directory with a copy of a recording; the index stays.
 
     Raises:
         StoreError: It is being written, or cannot be removed.

@@ -1,4 +1,4 @@
-"""Cures that lose nothing: what can be proven is put right, all else is left and told."""
+"""Repairs that lose no data: provable problems are repaired, others are reported."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """Something that was put right, or could not be.
+    """A repair, or a problem that could not be repaired.
 
     Attributes:
         recording: Label of the recording.
-        place: File, or what else it is about.
-        done: What was done, or what is left to do.
-        is_cured: Whether it is right now.
+        place: File or other subject.
+        done: The repair, or the remaining work.
+        is_cured: Whether the problem is solved.
     """
 
     recording: str
@@ -51,23 +51,23 @@ def repair(
     repairs: RepairReport,
     labels: Iterable[str] | None,
 ) -> list[Repaired]:
-    """Put files, journals and the catalog right.
+    """Repair files, journals and the catalog.
 
     Args:
         directory: The store.
         catalog: Its catalog.
-        repairs: What was found when the store was opened.
-        labels: Which recordings; None for all.
+        repairs: The report of the store's opening.
+        labels: The recordings; None for all.
 
     Raises:
         StoreError: The store cannot be written.
     """
     directory.check_writable()
-    done = [Repaired(label, "journal", "written again") for label in repairs.journals]
+    done = [Repaired(label, "journal", "rebuilt") for label in repairs.journals]
     if not catalog.is_sound():
         catalog.rebuild()
-        done.append(Repaired("", "catalog", "made again"))
-        labels = None  # it has lost all others, too
+        done.append(Repaired("", "catalog", "rebuilt"))
+        labels = None  # all other rows are lost, too
     for label in directory.labels() if labels is None else labels:
         if label in repairs.copies:
             original = repairs.copies[label]
@@ -109,11 +109,11 @@ def _repair_tables(directory: StoreDirectory, catalog: Catalog, label: str) -> l
 
 
 def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:
-    """Give segments their own names again, and damaged summaries their bytes."""
+    """Restore the names of segments and rebuild damaged summaries."""
     path = directory.recording(label)
     inventory = take_inventory(directory, label)
     done = [
-        Repaired(label, misfit.file, "its summary was made again")
+        Repaired(label, misfit.file, "its summary was rebuilt")
         for misfit in inventory.misfits
         if misfit.file and _rebuild(inventory, misfit, path)
     ]
@@ -124,8 +124,8 @@ def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]
         for misfit in moved:
             if misfit.belongs is not None and misfit.belongs in wanted:
                 wanted.discard(misfit.belongs)
-                # Out of the way first: two that were exchanged want each other's name. From
-                # here on the name says what is to be done, if this is interrupted.
+                # Temporary names first, since two exchanged segments need each other's name. If
+                # this is interrupted, the temporary name tells the remaining step.
                 files.rename(path / misfit.file, path / moving_name(misfit.file, misfit.belongs))
     except OSError as error:
         raise durability.explain(error, path, "renaming segments of") from error
@@ -136,7 +136,7 @@ def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]
 
 
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
-    """Make a damaged summary again, if what comes out is what the journal lists."""
+    """Rebuild a damaged summary, if the result has the digest in the journal."""
     sealed = inventory.state.sealed.get(misfit.segment) if inventory.state is not None else None
     if sealed is None or misfit.belongs is not None:
         return False
@@ -153,14 +153,14 @@ def _put_journal_right(directory: StoreDirectory, label: str) -> list[Repaired]:
     if state.damaged:
         reason = f"{len(state.damaged)} of its lines could not be read"
         log.replace(journal_from_segments(inventory, directory.settings.store_id, reason))
-        return [Repaired(label, "journal", "written again; the old one is journal.old")]
+        return [Repaired(label, "journal", "rebuilt; the old one is journal.old")]
     done = []
     if state.torn:
         log.append()
         done.append(Repaired(label, "journal", f"{state.torn} bytes behind its last line cut off"))
     unlisted = [m for m in inventory.misfits if m.is_unlisted]
     if unlisted:
-        # It may have listed others that are gone: nobody can prove now that it has not.
+        # It may have listed other segments that are gone; this cannot be excluded.
         reason = f"it did not list {', '.join(misfit.file for misfit in unlisted)}"
         log.append(
             journal.event(journal.REBUILT, reason=reason),
@@ -179,7 +179,7 @@ def repair_index(
     labels: Iterable[str] | None,
     progress: Progress | None = None,
 ) -> list[Repaired]:
-    """Index what is not in the index whole.
+    """Index incompletely indexed recordings.
 
     Raises:
         DatabaseError: MongoDB fails.
@@ -194,7 +194,7 @@ def repair_index(
             continue
         if _is_restored(directory, catalog, entry):
             if not reindex(directory, catalog, database, [entry.label], progress):
-                done.append(Repaired(entry.label, "index", "chunks that were damaged are right"))
+                done.append(Repaired(entry.label, "index", "damaged chunks are readable again"))
             continue
         if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
             continue
@@ -206,7 +206,7 @@ def repair_index(
 
 
 def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
-    """Whether a chunk that could not be read can be read now: its file came from a copy."""
+    """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
         path = directory.recording(entry.label) / f"{number:06d}.mcap"
         with suppress(SegmentError), SegmentReader(path, number) as reader:

@@ -1,4 +1,4 @@
-"""What the opening of a store found and mended."""
+"""The report of a store's opening."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(slots=True)
 class RepairReport:
-    """What the opening of a store had to mend; all by label.
+    """Repairs at the opening of a store; recordings by label.
 
     Attributes:
-        recovered: Segments that a crash had left open.
-        indexed: Recordings whose index was behind, and by how many chunks.
-        removed: Recordings whose removal was finished, or that have no files any more.
-        journals: Recordings whose journal was written again.
+        recovered: Segments that a crash left open.
+        indexed: Recordings whose index was behind, and the number of missing chunks.
+        removed: Recordings whose removal was finished, or whose files are gone.
+        journals: Recordings whose journal was rebuilt.
         adopted: Recordings that came from another store.
-        copies: Copies of a recording, and the label of the one that answers.
-        unreadable: Recordings that could not be mended, and why; the others are.
-        disk_full: Why nothing could be mended: there was no room.
+        copies: Copies of a recording, and the label of the one in use.
+        unreadable: Recordings that could not be repaired, and the reason.
+        disk_full: The error if the disk had no room for repairs, else None.
     """
 
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)

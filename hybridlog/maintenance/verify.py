@@ -34,13 +34,13 @@ _KNOWN = frozenset({LOCK, "journal.old"})
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is off.
+    """A problem found by `verify`.
 
     Attributes:
         recording: Label of the recording; empty for the store itself.
-        place: File and byte, or what else it is about.
-        problem: What is wrong.
-        cure: What to do.
+        place: File and byte, or other subject.
+        problem: The problem.
+        cure: The cure.
     """
 
     recording: str
@@ -51,14 +51,14 @@ class Finding:
 
 @dataclass(slots=True)
 class Verification:
-    """What `verify` has read, and found.
+    """The result of `verify`.
 
     Attributes:
-        recordings: Recordings looked at.
-        chunks: Chunks read.
-        messages: Messages in them.
+        recordings: Number of recordings read.
+        chunks: Number of chunks read.
+        messages: Number of messages in them.
         bytes_read: Bytes read from segments and journals.
-        findings: All that is off.
+        findings: All problems.
         index: Whether the index was compared, too; MongoDB may be unavailable.
     """
 
@@ -81,15 +81,15 @@ def verify(
 ) -> Verification:
     """Check every byte of segments, journals and tables, and compare the index with them.
 
-    The documents of each chunk are made again and compared with those in the database, so
-    that each reference is seen to name the message it was made for.
+    The documents of each chunk are made again and compared with those in the database. This
+    proves that each reference leads to its message.
 
     Args:
         directory: The store.
         catalog: Its catalog.
-        database: The index; None to leave it out.
-        repairs: What was found when the store was opened.
-        labels: Which recordings; None for all.
+        database: The index; None to skip it.
+        repairs: The report of the store's opening.
+        labels: The recordings; None for all.
         progress: Called after each part of a segment.
     """
     result = Verification(index=database is not None)
@@ -128,11 +128,11 @@ class _Check:
         self._has_index = False
 
     def found(self, place: str, problem: str, cure: str) -> None:
-        """Note something that is off."""
+        """Add a problem."""
         self._result.findings.append(Finding(self._label, place, problem, cure))
 
     def run(self, repairs: RepairReport, progress: Progress | None) -> None:
-        """Look at everything.
+        """Check the whole recording.
 
         Raises:
             StoreError: The recording cannot be read at all.
@@ -172,7 +172,7 @@ class _Check:
     def _journal(self, inventory: Inventory) -> None:
         state = inventory.state
         if state is None:
-            self.found("journal", "it is missing, so nobody can say what else is", _REPAIR)
+            self.found("journal", "it is missing, so other losses are unknown", _REPAIR)
             return
         self._result.bytes_read += state.length + state.torn
         for number in state.damaged:
@@ -184,8 +184,8 @@ class _Check:
         if state.rebuilt is not None:
             self.found(
                 "journal",
-                f"it was written again from the segments ({state.rebuilt}), so nobody can say "
-                "whether one was missing",
+                f"it was rebuilt from the segments ({state.rebuilt}), so a missing "
+                "segment could not be noticed",
                 "compare with a copy, if there is one; nothing else can prove it",
             )
 
@@ -196,10 +196,10 @@ class _Check:
             self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE)
         for name in inventory.listing.open.values():
             if not is_held:
-                self.found(name, "a crash has left it open", "open the store to write")
+                self.found(name, "a crash has left it open", "open the store with write permission")
         for name in inventory.listing.others:
             if name not in _KNOWN and not name.endswith(".damaged"):
-                self.found(name, "it is no file of a recording", "move it out of the store")
+                self.found(name, "it is not a file of a recording", "move it out of the store")
 
     def _segment(
         self,
@@ -208,7 +208,7 @@ class _Check:
         name: str,
         tell: Callable[[int], None],
     ) -> None:
-        """Every byte of a segment, and every chunk as a reader reads it."""
+        """Check every byte of a segment, and every chunk as a reader reads it."""
         summary = inventory.summaries.get(number)
         try:
             with SegmentCheck(self._path / name) as check:
@@ -253,7 +253,7 @@ class _Check:
         return f"run `hybridlog reindex -r {self._label}`"
 
     def _row(self, entry: RecordingEntry) -> None:
-        """The catalog's row, and its tables of chunks."""
+        """Check the catalog's row and its chunk tables."""
         known = self._catalog.recordings().get(entry.id)
         if known is None:
             self.found("catalog", "the recording is missing", _REPAIR)
@@ -266,7 +266,7 @@ class _Check:
                 self.found("catalog", str(error), _REPAIR)
 
     def _index(self, entry: RecordingEntry) -> None:
-        """What the database has beyond the segments."""
+        """Find documents that are not in the segments."""
         if self._database is None:
             return
         state = IndexState(self._database)
@@ -274,7 +274,7 @@ class _Check:
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._reindex)
         elif not state.is_mirrored(entry):
-            self.found("index", "what it says of the recording differs", self._reindex)
+            self.found("index", "its entry of the recording differs", self._reindex)
         for collection in state.topic_collections():
             have = self._database.count(collection, {"_meta.rec": entry.key})
             want = self._expected.get(collection, 0)
@@ -288,7 +288,7 @@ class _Check:
 
 
 def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
-    """Single documents; several channels of a chunk may share a topic."""
+    """Documents by collection; several channels of a chunk may share a topic."""
     found: dict[str, list[bytes]] = {}
     for part in documents:
         found.setdefault(part.collection, []).extend(
@@ -300,7 +300,7 @@ def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
 def _compare(
     database: Database, key: str, chunk: StoredChunk, collection: str, want: list[bytes]
 ) -> str | None:
-    """What is wrong with the documents of a chunk in one collection."""
+    """Compare the documents of a chunk in one collection; return a problem or None."""
     times = chunk.batch.log_time
     query = {
         "_id": {"$gte": key_bound(int(times.min())), "$lt": key_bound(int(times.max()) + 1)},

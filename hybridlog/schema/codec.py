@@ -1,4 +1,4 @@
-"""From payloads to index bodies, columns and objects, whatever they are encoded in."""
+"""Codecs: payloads of any encoding to index bodies, columns and objects."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl")}
 
 
 class BodyGroup(NamedTuple):
-    """Bodies of index documents, all of one width.
+    """Bodies of index documents of equal width.
 
     Attributes:
         rows: intp[k], rows of the input.
         body: uint8[k, width], BSON elements without the document's length and end.
-        error: Why these payloads could not be read; the width is 0 then.
-        stamps: int64[k], header stamps, ns; None when there are none, or when they are
-            to be had from `Codec.columns` only.
+        error: Reason why these payloads could not be read; the width is then 0.
+        stamps: int64[k], header stamps, ns; None if there are none, or if only
+            `Codec.columns` provides them.
     """
 
     rows: NDArray[np.intp]
@@ -81,23 +81,23 @@ class DecodedObjects:
 
 
 class Codec(Protocol):
-    """What can be done with the payloads of a channel. Thread safe."""
+    """Decodes the payloads of a channel. Thread safe."""
 
     @property
     def indexed(self) -> bool:
-        """False when only `_meta` goes into the index."""
+        """False if only `_meta` is indexed."""
 
     @property
     def reason(self) -> str | None:
-        """Why the fields are not indexed, None when they are."""
+        """Reason why the fields are not indexed, None if they are."""
 
     def paths(self) -> list[FieldPath]:
-        """The fields that can be asked for; empty when no definition fixes them."""
+        """The fields for predicates; empty if no definition fixes them."""
 
     def bodies(
         self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
     ) -> Iterator[BodyGroup]:
-        """Index bodies; each row of the input is in exactly one group.
+        """Make index bodies; each row of the input is in exactly one group.
 
         Args:
             buffer: Holds the payloads.
@@ -106,7 +106,7 @@ class Codec(Protocol):
         """
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message; empty when it holds nothing."""
+        """The fields of this message in its index document; empty without any."""
 
     def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
         """The whole message as plain values: dict, list, str, bool, int, float, None.
@@ -123,11 +123,11 @@ class Codec(Protocol):
         """
 
     def decode(self, payload: Buffer) -> object:
-        """The whole message as an object.
+        """Decode the whole message into an object.
 
         Raises:
             PayloadError: The payload does not fit its definition.
-            DefinitionError: There is no definition to read it by.
+            DefinitionError: It has no definition.
         """
 
     def columns(
@@ -137,16 +137,16 @@ class Codec(Protocol):
         length: NDArray[np.int64],
         fields: Collection[str] | None,
     ) -> Decoded:
-        """Fields as columns, arrays whole.
+        """Decode fields into columns, with whole arrays.
 
         Args:
             buffer: Holds the payloads.
             offset: int64[n], where each payload starts.
             length: int64[n], bytes of each payload.
-            fields: Dotted paths of those wanted, each with all below it; None for all.
+            fields: Dotted paths of the fields to read, each with all below it; None for all.
 
         Raises:
-            DefinitionError: There is no definition to read them by.
+            DefinitionError: They have no definition.
         """
 
     def arrow(
@@ -183,10 +183,10 @@ class Codec(Protocol):
 
 
 class OpaqueCodec:
-    """Payloads that are stored and fetched as they are.
+    """Codec of payloads that are stored and fetched, but not decoded.
 
     Args:
-        reason: Why.
+        reason: The reason.
     """
 
     indexed = False
@@ -195,7 +195,7 @@ class OpaqueCodec:
         self.reason: str | None = reason
 
     def paths(self) -> list[FieldPath]:
-        """None are known."""
+        """No fields are known."""
         return []
 
     def bodies(
@@ -204,7 +204,7 @@ class OpaqueCodec:
         offset: NDArray[np.int64],
         length: NDArray[np.int64],
     ) -> Iterator[BodyGroup]:
-        """One group without any element."""
+        """One group of empty bodies."""
         if len(offset):
             yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
 
@@ -217,7 +217,7 @@ class OpaqueCodec:
         return {}
 
     def decode(self, payload: Buffer) -> object:
-        """Refuses.
+        """Raise, since the payload cannot be decoded.
 
         Raises:
             DefinitionError: Always.
@@ -231,7 +231,7 @@ class OpaqueCodec:
         length: NDArray[np.int64],
         fields: Collection[str] | None,
     ) -> Decoded:
-        """Refuses.
+        """Raise, since the payload cannot be decoded.
 
         Raises:
             DefinitionError: Always.
@@ -263,10 +263,10 @@ class OpaqueCodec:
 
 
 def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
-    """The codec of a channel. Never raises: what cannot be read is opaque and says why.
+    """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
 
     Args:
-        channel: Its message encoding and schema count.
+        channel: The channel; its message encoding and schema determine the codec.
         array_limit: Arrays of more elements are summarised in the index.
     """
     return _codec(channel.message_encoding, channel.schema, array_limit)
@@ -293,7 +293,7 @@ def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
 
 
 def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
-    """The codec of messages that a definition is needed for."""
+    """The codec of messages that need a definition."""
     if encoding not in {"ros1", "cdr", "protobuf"}:
         named = f"encoding {encoding!r}" if encoding else "a message without an encoding"
         return OpaqueCodec(f"{named} is stored and fetched, not indexed")
@@ -315,10 +315,10 @@ def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
 
 
 def error_group(rows: NDArray[np.intp], error: str) -> BodyGroup:
-    """The group of payloads that could not be read."""
+    """The group of unreadable payloads."""
     return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
 
 
 def nothing_decoded(unreadable: list[Unreadable]) -> Decoded:
-    """No row could be read."""
+    """The columns for rows of which none could be read."""
     return Decoded(np.empty(0, np.intp), Records({}, 0), unreadable)

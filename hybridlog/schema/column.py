@@ -1,7 +1,7 @@
-"""Columns: the fields of many messages, one array a field.
+"""Columns: the fields of many messages, with one array for each field.
 
-The wire reader (`wire.py`) turns payloads into these; BSON documents, Arrow tables
-and pandas frames are made from them. A column never holds a Python object a row.
+The wire reader (`wire.py`) makes them from payloads; BSON documents, Arrow tables and
+pandas frames are made from them. No row of a column is a Python object.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Scalars:
     Attributes:
         values: shape (n,), native byte order, dtype as on the wire (bool, int8 to
             uint64, float32, float64). Times and durations are int64 nanoseconds.
-        kind: What the numbers mean.
+        kind: Meaning of the numbers.
     """
 
     values: NDArray[Any]
@@ -37,7 +37,7 @@ class Scalars:
 
 @dataclass(slots=True)
 class Strings:
-    """Strings, as their bytes came (UTF-8 is not checked here), without terminating NUL.
+    """Strings as unchanged bytes (UTF-8 is not checked here), without terminating NUL.
 
     Attributes:
         data: uint8, all strings one after the other, from `offset[0]` to `offset[n]`.
@@ -59,7 +59,7 @@ class Arrays:
     Attributes:
         values: All elements one after the other.
         offset: int64[n + 1]; offset[0] is 0.
-        width: Elements a row when the definition fixes that number, else None.
+        width: Elements of each row if the definition fixes that number, else None.
     """
 
     values: Column
@@ -73,11 +73,11 @@ class Arrays:
 
 @dataclass(slots=True)
 class Records:
-    """Messages within messages, and the top level itself.
+    """Nested messages, and the top level itself.
 
     Attributes:
         fields: Column of each field, in the order of the definition.
-        rows: Number of rows (a message without fields has rows all the same).
+        rows: Number of rows (also of a message without fields).
     """
 
     fields: dict[str, Column]
@@ -93,11 +93,11 @@ AnyColumn = TypeVar("AnyColumn", bound=Column)
 _T = TypeVar("_T", bound=np.generic)
 
 LONG = 64
-"""Mean elements a row from which rows are copied one by one."""
+"""Mean number of elements from which rows are copied one by one."""
 
 
 def take(column: AnyColumn, rows: NDArray[np.intp] | NDArray[np.int64]) -> AnyColumn:
-    """The chosen rows of a column, in the order chosen."""
+    """Select rows of a column, in the given order."""
     return cast("AnyColumn", _take(column, rows))
 
 
@@ -118,16 +118,16 @@ def _take(column: Column, rows: NDArray[np.intp] | NDArray[np.int64]) -> Column:
 
 
 def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
-    """`data[start[i]:start[i] + count[i]]` of all i, one after the other."""
+    """Concatenate `data[start[i]:start[i] + count[i]]` for all i."""
     if int(count.sum()) <= LONG * len(count):
         return data[ranges(start, count)]
-    # An index of eight bytes an element would be larger than what it picks.
+    # An index of eight bytes per element would be larger than the elements.
     ends = (start + count).tolist()
     return np.concatenate([data[a:b] for a, b in zip(start.tolist(), ends, strict=True)])
 
 
 def concatenate(columns: Sequence[AnyColumn]) -> AnyColumn:
-    """The rows of several columns of one type, one column after the other."""
+    """Concatenate columns of one type."""
     return cast("AnyColumn", _concatenate(columns))
 
 
@@ -146,14 +146,14 @@ def _concatenate(columns: Sequence[Any]) -> Column:
 
 
 def ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.intp]:
-    """All of `start[i]`, `start[i] + 1`, ... `start[i] + count[i] - 1`, one after the other."""
+    """Concatenate the ranges `start[i]` to `start[i] + count[i] - 1`."""
     done = np.cumsum(count) - count
     total = int(count.sum())
     return (np.repeat(start - done, count) + np.arange(total)).astype(np.intp, copy=False)
 
 
 def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Offsets of rows of so many elements each: int64[n + 1], starting with 0."""
+    """Offsets of rows with these numbers of elements: int64[n + 1], starting with 0."""
     result = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=result[1:])
     return result
@@ -194,7 +194,7 @@ def row_of(column: Column, row: int) -> object:
 
 
 def header_stamps(records: Records) -> NDArray[np.int64] | None:
-    """The header stamps of decoded messages, ns; None when they have no header."""
+    """The header stamps of decoded messages, ns; None without a header."""
     header = records.fields.get("header")
     stamp = header.fields.get("stamp") if isinstance(header, Records) else None
     return stamp.values if isinstance(stamp, Scalars) and stamp.kind == "time" else None

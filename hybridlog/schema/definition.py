@@ -1,7 +1,7 @@
-"""What a message consists of, made from the definition that came with it.
+"""Parses message definitions into types.
 
-A definition is untrusted text. Its size, its nesting and the number of fields it
-unfolds to are bounded before anything is made of it, and nothing in it is executed.
+A definition is untrusted text. Its size, its nesting and its number of unfolded fields
+are limited before types are built, and nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Schema
 
 MAX_DEFINITION = 1 << 20
-"""Largest definition that is read, in bytes."""
+"""Largest definition, in bytes."""
 MAX_DEPTH = 64
 """Deepest nesting of messages."""
 MAX_FIELDS = 100_000
-"""Most fields that a type may unfold to, nested ones counted wherever they occur."""
+"""Most fields of an unfolded type; nested ones count at each occurrence."""
 MAX_PATH_CHARACTERS = 1 << 24
-"""Most characters that the paths of all these fields may have together."""
+"""Most characters of the paths of all these fields."""
 MAX_WIDTH = 1 << 28
 """Most elements of a fixed array."""
 MAX_FIXED_BYTES = 1 << 40
-"""Most bytes that a message takes at the least; a nest of fixed arrays can multiply."""
+"""Largest minimum size of a message in bytes; nested fixed arrays multiply."""
 
 PrimitiveName: TypeAlias = Literal[
     "bool",
@@ -63,7 +63,7 @@ class Primitive:
     """A number or a boolean.
 
     Attributes:
-        name: As the definition spells it.
+        name: Its name in the definition.
         dtype: Native numpy type; `byte` and `char` differ between ROS 1 and ROS 2.
     """
 
@@ -76,7 +76,7 @@ class Text:
     """A string.
 
     Attributes:
-        bound: Largest number of characters, None when there is no bound.
+        bound: Largest number of characters, None without a bound.
     """
 
     bound: int | None = None
@@ -87,8 +87,8 @@ class Instant:
     """A time or a duration: 32 bits of seconds, then 32 bits of nanoseconds.
 
     Attributes:
-        kind: What it means.
-        signed_seconds: True but for the time of ROS 1.
+        kind: Time or duration.
+        signed_seconds: True except for the time of ROS 1.
         signed_nanoseconds: True only for the duration of ROS 1.
     """
 
@@ -103,7 +103,7 @@ class ArrayOf:
 
     Attributes:
         element: Type of each element.
-        width: Number of elements when the definition fixes it, and it is not on the wire.
+        width: Number of elements if the definition fixes it; it is then not on the wire.
         bound: Largest number of elements of a bounded sequence. Not enforced on reading.
     """
 
@@ -114,7 +114,7 @@ class ArrayOf:
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message: its name as the definition spells it, and its fields in wire order."""
+    """A message: its name in the definition, and its fields in wire order."""
 
     name: str
     fields: tuple[tuple[str, FieldType], ...]
@@ -125,13 +125,13 @@ FieldType: TypeAlias = Primitive | Text | Instant | ArrayOf | MessageType
 
 @dataclass(frozen=True, slots=True)
 class FieldPath:
-    """A field that can be asked for.
+    """A field for predicates.
 
     Attributes:
         path: Names joined by dots; `[]` after the name of an array of messages that
             the path passes through: `transforms[].header.stamp`.
-        type: As it would be written in a definition, `float64[9]`.
-        array: True when a message holds several values at this path.
+        type: Its type as in a definition, `float64[9]`.
+        array: True if a message holds several values at this path.
     """
 
     path: str
@@ -165,23 +165,22 @@ _WORDS = frozenset({*_DTYPES, "byte", "string", *_NOT_PORTABLE})
 
 
 def parse_definition(schema: Schema) -> MessageType:
-    """Read a definition of encoding `ros1msg`, `ros2msg` or `ros2idl`.
+    """Parse a definition of encoding `ros1msg`, `ros2msg` or `ros2idl`.
 
-    Standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) that the definition
-    refers to and leaves out are completed; a definition that is there always counts.
+    Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are added;
+    definitions in the text take precedence.
 
     Args:
-        schema: Name, encoding and text as they came.
+        schema: Name, encoding and text of the source.
 
     Raises:
-        DefinitionError: There is no definition, it is malformed, it refers to unknown
-            types or to itself, it unfolds to too much, or it uses a type that has no
-            portable wire form.
+        DefinitionError: It is missing or malformed, refers to unknown types or to itself,
+            unfolds to too many fields, or uses a type without a portable wire form.
     """
     if not schema.encoding:
         raise DefinitionError(f"{schema.name}: no definition in the source")
     if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl"}:
-        raise DefinitionError(f"{schema.name}: {schema.encoding!r} is no ROS definition")
+        raise DefinitionError(f"{schema.name}: {schema.encoding!r} is not a ROS definition")
     if len(schema.data) > MAX_DEFINITION:
         raise DefinitionError(
             f"{schema.name}: the definition has {len(schema.data)} bytes; "
@@ -197,9 +196,9 @@ def parse_definition(schema: Schema) -> MessageType:
 
 
 def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
-    """The type of that name as the distributions of ROS define it, None when unknown.
+    """The standard ROS type of this name, None if unknown.
 
-    For sources that carry type names only.
+    For sources with type names only.
 
     Args:
         name: Type name in either spelling, `sensor_msgs/Imu` or `sensor_msgs/msg/Imu`.
@@ -212,7 +211,7 @@ def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
 
 
 def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]], str]:
-    """Fields by canonical type name, and the name of the first type of the text."""
+    """Parse the text: fields by canonical type name, and the name of the first type."""
     text = schema.data.decode("utf-8", errors="replace")
     types: dict[str, list[RawField]] = {}
     idl = IdlTypes()
@@ -239,8 +238,8 @@ def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawFiel
 
 
 def _standard_fields(name: str, ros: int) -> list[RawField] | None:
-    """Fields of a standard type from the tables that rosbags ships."""
-    # Slow to import, and most definitions are complete.
+    """Fields of a standard type from the tables of rosbags."""
+    # Imported here, since it is slow and most definitions are complete.
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, get_typestore
 
@@ -274,7 +273,7 @@ def _standard_fields(name: str, ros: int) -> list[RawField] | None:
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
-    """What a type unfolds to: levels, fields, characters of their paths, least bytes."""
+    """Size of an unfolded type: levels, fields, characters of their paths, least bytes."""
 
     depth: int
     fields: int
@@ -283,7 +282,7 @@ class _Extent:
 
 
 class _Resolver:
-    """Turns names of types into types, each type once."""
+    """Resolves type names to types, each type once."""
 
     def __init__(self, owner: str, types: dict[str, list[RawField]], ros: int) -> None:
         self._owner = owner
@@ -380,7 +379,7 @@ class _Resolver:
         return self._message(name)
 
     def _name(self, owner: str, kind: str) -> str:
-        """The canonical name that a type spelled `kind` within `owner` has."""
+        """The canonical name of a type spelled `kind` within `owner`."""
         name = canonical(kind)
         if "/" in name:
             return name
@@ -397,7 +396,7 @@ class _Resolver:
         return named[0] if len(named) == 1 else here[-1]
 
     def _instant(self, name: str) -> Instant | None:
-        """A type that is a time, however it is spelled, else None."""
+        """The time or duration type of this name, in any spelling, else None."""
         if self._ros == 1:
             if name in _TIME_TYPES and name not in self._types:
                 return _ROS1_TIMES[_TIME_TYPES[name]]
@@ -414,7 +413,7 @@ class _Resolver:
 
 
 def type_text(field_type: FieldType) -> str:
-    """A type as a definition would spell it: `float64[9]`, `string<=10`, `time`."""
+    """A type in the spelling of a definition: `float64[9]`, `string<=10`, `time`."""
     if isinstance(field_type, Text):
         return "string" if field_type.bound is None else f"string<={field_type.bound}"
     if isinstance(field_type, Instant):
@@ -428,9 +427,9 @@ def type_text(field_type: FieldType) -> str:
 
 
 def paths(message_type: MessageType) -> list[FieldPath]:
-    """Every field that can be asked for, in the order of the definition.
+    """All fields for predicates, in the order of the definition.
 
-    Messages are listed before what is in them; so are arrays of messages.
+    Messages and arrays of messages precede their content.
     """
     found: list[FieldPath] = []
 

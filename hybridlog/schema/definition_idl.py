@@ -1,9 +1,8 @@
-"""Reading OMG IDL as ROS 2 uses it: modules, structs, typedefs, constants, enums.
+"""Parses OMG IDL as ROS 2 uses it: modules, structs, typedefs, constants, enums.
 
-A tokenizer and a descent over the few constructs that have a ROS wire form. Every
-construct outside of them is refused by name. Constants matter only as array sizes,
-so their expressions are not evaluated: a size is a number or the name of a constant
-that is one.
+A tokenizer and a recursive-descent parser for the few constructs with a ROS wire form.
+Every other construct is refused by name. Constants matter only as array sizes, so
+expressions are not evaluated: a size is a number or the name of a numeric constant.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from hybridlog.schema.definition_text import RawField, canonical
 from hybridlog_storage.errors import DefinitionError
 
-# What is not closed reaches to the end of the text: a failed match would be tried again
-# at the next character, and the time would grow with the square of the length.
+# An unclosed token extends to the end of the text. Otherwise a failed match would be
+# retried at the next character, in quadratic time.
 _TOKEN = re.compile(
     r"""(?P<skip>\s+|//[^\n]*|/\*(?s:.*?)(?:\*/|\Z)|\#[^\n]*)
       |(?P<name>(?:::)?[A-Za-z_][A-Za-z0-9_]*(?:::[A-Za-z_][A-Za-z0-9_]*)*)
@@ -51,7 +50,7 @@ _ENUM = "uint32"
 
 @dataclass(slots=True)
 class IdlTypes:
-    """What all IDL texts of one definition declare, by scoped name with slashes."""
+    """Declarations of all IDL texts of one definition, by scoped name with slashes."""
 
     structs: dict[str, list[RawField]] = field(default_factory=dict)
     typedefs: dict[str, RawField] = field(default_factory=dict)
@@ -59,10 +58,10 @@ class IdlTypes:
     enums: set[str] = field(default_factory=set)
 
     def resolved(self) -> dict[str, list[RawField]]:
-        """Structs by canonical name, their typedefs replaced.
+        """Structs by canonical name, with typedefs resolved.
 
         Raises:
-            DefinitionError: Typedefs in a circle, or arrays of arrays.
+            DefinitionError: Circular typedefs, or arrays of arrays.
         """
         return {
             canonical(name): [self._resolve(name, raw) for raw in fields]
@@ -99,7 +98,7 @@ class IdlTypes:
 
 
 def _candidates(scope: str, name: str) -> list[str]:
-    """Where a name may be declared, innermost scope first."""
+    """Possible scoped names of a name, innermost scope first."""
     path = name.replace("::", "/")
     if path.startswith("/"):
         return [path[1:]]
@@ -145,7 +144,7 @@ class _Parser:
         return token
 
     def _annotations(self) -> set[str]:
-        """Skip annotations; the names of those found."""
+        """Skip annotations; return their names."""
         found = set()
         while self._peek() == "@":
             self._at += 1
@@ -205,7 +204,7 @@ class _Parser:
             self._types.typedefs["/".join([*scope, raw.name])] = raw
 
     def _declared(self, scope: str) -> list[RawField]:
-        """A type and its declarators, through the semicolon."""
+        """Parse a type and its declarators, up to the semicolon."""
         kind = self._type(scope)
         fields: list[RawField] = []
         while True:
@@ -282,7 +281,7 @@ class _Parser:
 
 
 def _integer(token: str) -> int | None:
-    """An unsigned integer literal: decimal, `0x` hexadecimal or octal."""
+    """Parse an unsigned integer literal: decimal, `0x` hexadecimal or octal."""
     if not token[0].isdigit() or len(token) > _MAX_DIGITS:
         return None
     octal = len(token) > 1 and token.isdigit() and token[0] == "0"
@@ -298,9 +297,9 @@ def parse_idl(owner: str, text: str, types: IdlTypes) -> None:
     Args:
         owner: Type name, for messages.
         text: One IDL file.
-        types: Collects; later texts see the constants of earlier ones.
+        types: Collects the declarations; later texts see the constants of earlier ones.
 
     Raises:
-        DefinitionError: The text is malformed, or uses what has no ROS wire form.
+        DefinitionError: The text is malformed, or uses a construct without a ROS wire form.
     """
     _Parser(owner, text, types).parse()

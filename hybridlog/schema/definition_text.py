@@ -1,8 +1,8 @@
-"""Reading the text of `.msg`, `.srv` and `.action` definitions into unresolved fields.
+"""Parses `.msg`, `.srv` and `.action` definitions into unresolved fields.
 
-The grammar is a line a field, so lines are matched one by one; the result still names
-its types and is resolved in `definition.py`. What may stand in the text and means
-nothing on the wire (comments, constants, defaults, annotations) is dropped here.
+Each line is one field, so lines are matched one by one. `definition.py` resolves the type
+names of the result. Text without a wire form (comments, constants, defaults, annotations)
+is dropped here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FIELD = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class RawField:
-    """A field as it is written: its type is a name.
+    """An unresolved field; its type is a name.
 
     Attributes:
         name: Field name, not yet checked.
@@ -54,7 +54,7 @@ class Section:
 
     Attributes:
         name: Type name from the header line; empty for a first section without one.
-        kind: `MSG`, `IDL`, `SRV` or `ACTION`; empty when there was no header line.
+        kind: `MSG`, `IDL`, `SRV` or `ACTION`; empty without a header line.
         text: The definition.
     """
 
@@ -64,9 +64,9 @@ class Section:
 
 
 def canonical(name: str) -> str:
-    """The spelling under which types are kept: `pkg/Name`, `pkg/srv/Name`.
+    """The canonical spelling of a type: `pkg/Name`, `pkg/srv/Name`.
 
-    The part `msg` says nothing and is spelled in ROS 2 only.
+    The part `msg` is dropped; only ROS 2 uses it.
     """
     parts = name.replace("::", "/").strip("/").split("/")
     if len(parts) > 2 and parts[-2] == "msg":
@@ -75,7 +75,7 @@ def canonical(name: str) -> str:
 
 
 def split_sections(text: str) -> list[Section]:
-    """Cut a concatenation at its lines of `=`, each followed by a header line."""
+    """Split a concatenation at its lines of `=`, each followed by a header line."""
     sections: list[Section] = []
     name = kind = ""
     lines: list[str] = []
@@ -101,15 +101,15 @@ def split_sections(text: str) -> list[Section]:
 
 
 def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
-    """Fields of one `.msg` text, in order.
+    """Parse the fields of one `.msg` text, in order.
 
     Args:
         name: Type name, for messages.
         text: The definition of this type alone.
-        defaults: True where default values may follow the name (ROS 2).
+        defaults: Whether default values may follow the name (ROS 2).
 
     Raises:
-        DefinitionError: A line is neither field, constant nor comment.
+        DefinitionError: A line is neither a field, a constant nor a comment.
     """
     fields: list[RawField] = []
     for number, raw_line in enumerate(text.splitlines(), 1):
@@ -118,12 +118,12 @@ def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
             continue
         match = _FIELD.match(line)
         if match is None:
-            raise DefinitionError(f"{name}: line {number} is no field: {line[:80]!r}")
+            raise DefinitionError(f"{name}: line {number} is not a field: {line[:80]!r}")
         rest = match["rest"]
         if rest.startswith("="):
             continue
         if rest and not rest.startswith("#") and not defaults:
-            raise DefinitionError(f"{name}: line {number} is no field: {line[:80]!r}")
+            raise DefinitionError(f"{name}: line {number} is not a field: {line[:80]!r}")
         count = int(match["count"]) if match["count"] else None
         at_most = match["at_most"] is not None
         if at_most and count is None:
@@ -155,10 +155,10 @@ _PART_SUFFIX = re.compile(
 
 
 def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
-    """Types that a `.srv` (two parts) or `.action` (three parts) text stands for.
+    """Types derived from a `.srv` (two parts) or `.action` (three parts) text.
 
     ROS 2 records services and actions as messages of derived types such as
-    `pkg/srv/Name_Event`, and stores with them the text they are derived from.
+    `pkg/srv/Name_Event`, and stores the text of the service or action with them.
 
     Args:
         name: Canonical name of any of the derived types, or of the interface itself.
@@ -168,7 +168,7 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
         Fields by canonical type name.
 
     Raises:
-        DefinitionError: Not two or three parts, or a line that is no field.
+        DefinitionError: It has not two or three parts, or an invalid line.
     """
     parts: list[list[str]] = [[]]
     for line in text.splitlines():
@@ -212,5 +212,5 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
 
 
 def has_parts(text: str) -> bool:
-    """True for the text of a service or an action."""
+    """True if a text is that of a service or an action."""
     return any(line.strip() == _PART_RULE for line in text.splitlines())

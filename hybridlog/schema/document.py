@@ -1,11 +1,10 @@
-"""Columns to BSON: the bodies of index documents for many messages at once.
+"""Converts columns to BSON: the bodies of index documents for many messages at once.
 
-Columns are first turned into a tree of nodes that says what is written for each row:
-its element type and its width are known before a byte is written. Whatever has the
-same layout in all rows (in most topics the whole message) is a template that is
-tiled, into which each value column is assigned with one strided copy. What differs in
-length from row to row (strings, lists) is scattered, still with a few array operations
-for all rows. Lists of messages need nothing special: their elements are rows, too.
+Columns are first converted to a tree of nodes with the element type and width of each row.
+Parts with the same layout in all rows (in most topics the whole message) are a template
+that is tiled; each value column is assigned with one strided copy. Parts whose length
+differs by row (strings, lists) are scattered, also with a few array operations for all
+rows. Elements of lists of messages are rows, too, and need no special case.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _SLAB = 32 << 20
 """Bytes of bodies made at once."""
 
 _UNROLL = 16
-"""Rows for each element of a list that is written with operations of its own."""
+"""Rows per list element from which each element is written with separate operations."""
 
 
 _RESERVED = ("_id", "_meta")
@@ -51,7 +50,7 @@ class Bodies(NamedTuple):
 
 
 class TooLarge(NamedTuple):
-    """Rows whose bodies would be larger than is allowed."""
+    """Rows whose bodies exceed the size limit."""
 
     rows: NDArray[np.intp]
 
@@ -59,10 +58,10 @@ class TooLarge(NamedTuple):
 def bodies(
     records: Records, *, array_limit: int = 32, max_bytes: int = 8 << 20
 ) -> Iterator[Bodies | TooLarge]:
-    """Makes the body of each row; every row is in exactly one of the results.
+    """Make the body of each row; every row is in exactly one of the results.
 
-    The bytes are those that `bson.encode` gives for the dictionary of the row, and
-    depend on that row alone. Memory is bounded whatever the number of rows.
+    The bytes equal `bson.encode` of the row's dictionary and depend on that row alone.
+    Memory does not grow with the number of rows.
 
     Args:
         records: The top level.
@@ -87,12 +86,12 @@ def bodies(
 
 
 def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Iterator[Bodies]:
-    """Bodies of all rows of `top`, which are called `rows`; `width` of each."""
+    """Make the bodies of all rows of `top`, which are the input's `rows`, with these widths."""
     template = _Piece()
     if all(_append(template, name, node, slice(None), len(rows)) for name, node in top.fields):
         yield Bodies(rows, template.tile(len(rows)))
         return
-    # Sorted by width, so that the bodies of equal width are one block of the output.
+    # Sorted by width, so that bodies of equal width form one block of the output.
     order = np.argsort(width, kind="stable")
     at = np.empty(len(rows), np.int64)
     at[order] = np.cumsum(width[order]) - width[order]
@@ -107,9 +106,9 @@ def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Ite
 
 
 def top_level_names(names: Iterable[str]) -> list[str]:
-    """Names of the fields in the index document: `_id` and `_meta` are taken there.
+    """Names of the fields in the index document, where `_id` and `_meta` are reserved.
 
-    A field of that name gets trailing underscores, as many as make it unique.
+    A field with such a name gets as many trailing underscores as make it unique.
     """
     given = list(names)
     spelled = []
@@ -122,16 +121,16 @@ def top_level_names(names: Iterable[str]) -> list[str]:
 
 
 def _spread(value: _Each, rows: int) -> NDArray[np.int64]:
-    """One number a row, whether it is the same for all or not."""
+    """Expand to one number for each row."""
     if isinstance(value, int):
         return np.full(rows, value, np.int64)
     return value
 
 
-# --- nodes: what is written for each row ----------------------------------------------
+# --- nodes: the output of each row ----------------------------------------------------
 
 _Each: TypeAlias = "int | NDArray[np.int64]"
-"""The same number for all rows, or one each."""
+"""One number for all rows, or one for each."""
 
 
 @dataclass(slots=True)
@@ -139,10 +138,10 @@ class _Number:
     """A value of fixed width, or null.
 
     Attributes:
-        tag: BSON type, or one a row (uint8[n]).
+        tag: BSON type, or one for each row (uint8[n]).
         values: shape (n,); assigned with a cast to `stored`.
         stored: Little-endian dtype in the document.
-        has: bool[n], False for null; None when no row is null.
+        has: bool[n], False for null; None if no row is null.
     """
 
     tag: int | NDArray[np.uint8]
@@ -174,7 +173,7 @@ class _Text:
 
 @dataclass(slots=True)
 class _Record:
-    """Documents; `rows` counts them, for there may be no field."""
+    """Documents; `rows` is their number, also without fields."""
 
     fields: list[tuple[bytes, _Node]]
     rows: int
@@ -190,7 +189,7 @@ class _Record:
 
 @dataclass(slots=True)
 class _List:
-    """Arrays that are written out: row i has the next `counts[i]` rows of `child`."""
+    """Whole arrays: row i has the next `counts[i]` rows of `child`."""
 
     child: _Node
     counts: NDArray[np.int64]
@@ -217,7 +216,7 @@ class _List:
 
 @dataclass(slots=True)
 class _Either:
-    """Rows that are written as `yes`, one after the other, and the rest, as `no`."""
+    """Two alternatives: some rows are those of `yes`, in order, the others those of `no`."""
 
     which: NDArray[np.bool_]
     yes: _Node
@@ -239,7 +238,7 @@ _Node: TypeAlias = _Number | _Text | _Record | _List | _Either
 
 
 def _same(numbers: NDArray[np.int64]) -> int | None:
-    """The number that all of them are, None when they differ or there are none."""
+    """The common number, None if they differ or there are none."""
     if len(numbers) and bool((numbers == numbers[0]).all()):
         return int(numbers[0])
     return None
@@ -257,7 +256,7 @@ def _digits(index: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _digits_before(count: int) -> int:
-    """Decimal digits of all array keys below `count` together."""
+    """Total decimal digits of all array keys below `count`."""
     digits, power = count, 10
     while power < count:
         digits += count - power
@@ -298,7 +297,7 @@ def _number(values: NDArray[Any], has: NDArray[np.bool_] | None = None) -> _Numb
     if kind == "u" and size == 8:
         huge = values >= np.uint64(1 << 63)
         if huge.any():
-            # Both have eight bytes: only the type and the bits differ.
+            # Both take eight bytes: only type and bits differ.
             tag = np.where(huge, _DOUBLE, _INT64).astype(np.uint8)
             values = np.where(huge, values.astype(np.float64).view(np.uint64), values)
             values = values.view(np.int64)
@@ -315,8 +314,8 @@ def _text(column: Strings) -> _Text:
     if (data < 0x80).all():
         return _Text(data, start, length)
     raw = data.tobytes()
-    # Whether a string is valid must not depend on its neighbours, so each string that
-    # is not plain ASCII is checked on its own.
+    # The validity of a string must not depend on its neighbours, so each string that is
+    # not plain ASCII is checked separately.
     high = offsets((data >= 0x80).astype(np.int64))
     odd = np.flatnonzero(high[start + length] > high[start])
     mended: dict[int, bytes] = {}
@@ -374,19 +373,19 @@ def _summary(column: Arrays, counts: NDArray[np.int64]) -> _Record:
 
 @dataclass(slots=True)
 class _Piece:
-    """Bytes that are the same in all rows, and the values that go into them.
+    """A byte template shared by all rows, and the values that are written into it.
 
     Attributes:
         template: The bytes of a row.
-        writes: Place in the row, distance of further values in it, and the values,
-            shape (n,) or (n, values a row), with the dtype they are stored in.
+        writes: Position in the row, distance of further values in it, and the values, shape
+            (n,) or (n, values per row), with their stored dtype.
     """
 
     template: bytearray = field(default_factory=bytearray)
     writes: list[tuple[int, int, NDArray[Any], np.dtype[Any]]] = field(default_factory=list)
 
     def header(self, tag: int | NDArray[np.uint8], name: bytes) -> None:
-        """Appends type and key of an element; `tag` for the rows of the piece."""
+        """Append type and key of an element; `tag` for the rows of the piece."""
         if isinstance(tag, np.ndarray):
             if (tag == tag[0]).all():
                 tag = int(tag[0])
@@ -396,7 +395,7 @@ class _Piece:
         self.template += b"%c%b\0" % (tag, name)
 
     def values(self, values: NDArray[Any], stored: np.dtype[Any]) -> None:
-        """Appends one value a row."""
+        """Append one value for each row."""
         self.writes.append((len(self.template), 0, values, stored))
         self.template += bytes(stored.itemsize)
 
@@ -413,14 +412,14 @@ class _Piece:
 
 
 def _append(piece: _Piece, name: bytes, node: _Node, rows: slice, count: int) -> bool:
-    """Appends an element; False, and nothing appended, when rows differ in layout.
+    """Append an element; return False and append nothing if rows differ in layout.
 
     Args:
-        piece: What is appended to.
+        piece: The piece to extend.
         name: Key.
         node: Value.
-        rows: The rows of `node` that the rows of the piece have.
-        count: How many these are, at least 1.
+        rows: The rows of `node` for the rows of the piece.
+        count: Number of these rows, at least 1.
     """
     template, writes = len(piece.template), len(piece.writes)
     piece.header(node.tag if isinstance(node.tag, int) else node.tag[rows], name)
@@ -497,18 +496,18 @@ def _append_list(piece: _Piece, node: _List, rows: slice, count: int) -> bool:
     )
 
 
-# --- bytes: a layout of its own for each row ------------------------------------------
+# --- bytes: a separate layout for each row --------------------------------------------
 
 
 def _overlay(data: NDArray[np.uint8], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An array whose item i lies at byte i of `data`; the items overlap."""
+    """An array whose item i starts at byte i of `data`; the items overlap."""
     return np.ndarray((len(data) - dtype.itemsize + 1,), dtype, data, 0, (1,))
 
 
 def _put_fields(record: _Record, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
-    """Writes the elements of each row from byte `at` of `out`, which is zero before.
+    """Write the elements of each row from byte `at` of the zeroed `out`.
 
-    Neighbouring fields of one layout are tiled and copied together.
+    Neighbouring fields of equal layout are tiled and copied together.
     """
     run = _Piece()
     for name, node in record.fields:
@@ -531,7 +530,7 @@ def _put_run(run: _Piece, out: NDArray[np.uint8], at: NDArray[np.int64]) -> NDAr
 
 
 def _put(node: _Node, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
-    """Writes the value of each row at byte `at` of `out`."""
+    """Write the value of each row at byte `at` of `out`."""
     if len(at) == 0:
         return
     if isinstance(node, _Number):

@@ -1,4 +1,4 @@
-"""JSON messages, indexed as they stand."""
+"""JSON messages, indexed with their own structure."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class JsonCodec:
-    """Messages in JSON, with or without a JSON schema, which nothing depends on.
+    """Messages in JSON. A JSON schema is ignored.
 
     Args:
         array_limit: Arrays of more elements are summarised in the index.
@@ -46,7 +46,7 @@ class JsonCodec:
         self._limit = array_limit
 
     def paths(self) -> list[FieldPath]:
-        """None are known: a message may hold anything, whatever a JSON schema promises."""
+        """No fields are known: a message may hold any content."""
         return []
 
     def bodies(
@@ -56,7 +56,7 @@ class JsonCodec:
         return body_groups(map(self._body, payloads_of(buffer, offset, length)))
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message."""
+        """The fields of this message in its index document."""
         body = self._body(memoryview(payload))
         if isinstance(body, PayloadError):
             return {}
@@ -67,7 +67,7 @@ class JsonCodec:
         return cast("dict[str, object]", top(_parsed(memoryview(payload))))
 
     def decode(self, payload: Buffer) -> object:
-        """What the JSON text says, as Python objects.
+        """Decode the JSON text into Python objects.
 
         Raises:
             PayloadError: It is not JSON.

@@ -1,8 +1,8 @@
-"""Index bodies and columns of messages that come as Python objects, one by one.
+"""Index bodies and columns of messages that are decoded to Python objects.
 
-JSON and protobuf have no fixed layout, so their payloads cannot be read by columns.
-Each becomes a plain object (dict, list, str, bool, int, float, None), and the rules
-that hold for the columns of `document.py` are applied to it here.
+JSON and protobuf have no fixed layout, so their payloads cannot be read by columns. Each
+becomes a plain object (dict, list, str, bool, int, float, None), and this module applies
+the rules of `document.py` to it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | 
 
 MAX_BYTES = 8 << 20
 MAX_DEPTH = 100
-"""Deepest nesting that MongoDB takes with certainty."""
+"""Deepest nesting that MongoDB surely accepts."""
 
 _NUMBERS = (bool, int, float)
 _INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
@@ -54,7 +54,7 @@ class Nanoseconds(Int64):
     """A time or a duration.
 
     Attributes:
-        kind: Which of them.
+        kind: Time or duration.
     """
 
     kind: str = "time"
@@ -70,7 +70,7 @@ def body_of(value: Plain, array_limit: int) -> bytes:
     """The BSON elements of the index document of one message.
 
     Raises:
-        PayloadError: It cannot be a document, and why.
+        PayloadError: It cannot be a document; the message names the reason.
     """
     try:
         fields = {_key(k): _indexed(v, array_limit, 2) for k, v in top(value).items()}
@@ -120,7 +120,7 @@ def _double(value: float) -> float:
 
 
 def _numbers(values: Sequence[Plain]) -> NDArray[Any] | None:
-    """Numbers as an array: bool, int64, uint64 or float64; None when they are not numbers."""
+    """Numbers as an array: bool, int64, uint64 or float64; None if they are not numbers."""
     numbers = [v for v in values if isinstance(v, _NUMBERS)]
     if len(numbers) < len(values):
         return None
@@ -163,7 +163,7 @@ def payloads_of(
 
 
 def body_groups(bodies: Iterator[bytes | PayloadError]) -> Iterator[BodyGroup]:
-    """Groups of equal width out of bodies in the order of the rows."""
+    """Group bodies, given in row order, by width."""
     by_width: dict[int, tuple[list[int], list[bytes]]] = {}
     by_error: dict[str, list[int]] = {}
     for row, body in enumerate(bodies):
@@ -188,16 +188,16 @@ def columns_of(
     payloads: Iterator[memoryview],
     fields: Collection[str] | None,
 ) -> Decoded:
-    """Columns of payloads that become objects one by one.
+    """Columns of payloads that are decoded to objects one by one.
 
-    Numbers are float64 (NaN where a message lacks the field), int64 or bool; strings
-    are empty where they are lacking, lists too. What fits none of the columns (fields
-    of changing type, lists of objects) becomes a string column of JSON.
+    Numbers are float64 (NaN for a missing field), int64 or bool; missing strings and lists
+    are empty. Other fields (of changing type, lists of objects) become a string column of
+    JSON.
 
     Args:
-        plain: Makes the object; raises PayloadError.
+        plain: Decodes a payload; raises PayloadError.
         payloads: In the order of the rows.
-        fields: Dotted paths of those wanted, each with all below it; None for all.
+        fields: Dotted paths of the fields to read, each with all below it; None for all.
     """
     rows, objects, unreadable = _read(plain, payloads)
     if not objects:
@@ -310,7 +310,7 @@ def _number_column(values: Sequence[Plain], given: Sequence[Plain]) -> Scalars |
 
 
 def _narrowed(numbers: NDArray[Any]) -> NDArray[Any]:
-    """One type for all numbers that are not int64, so that columns change it rarely."""
+    """One type for all numbers except int64, so that column types rarely change."""
     return numbers.astype(np.float64) if numbers.dtype == np.uint64 else numbers
 
 

@@ -1,4 +1,4 @@
-"""Protobuf messages, when the protobuf package is there."""
+"""Protobuf messages, if the protobuf package is installed."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ _STANDARD = frozenset(
 class ProtobufCodec:
     """Messages of one protobuf type.
 
-    Fields that track their presence and are not set are not in the index document.
+    Unset fields with presence are not in the index document.
 
     Args:
-        schema: Name of the type, and a `FileDescriptorSet` with all it needs.
+        schema: Name of the type, and a `FileDescriptorSet` with its dependencies.
         array_limit: Arrays of more elements are summarised in the index.
 
     Raises:
@@ -92,7 +92,7 @@ class ProtobufCodec:
         self._class = _message_class(schema)
 
     def paths(self) -> list[FieldPath]:
-        """Every field; types that contain themselves are followed once."""
+        """All fields; recursive types are followed once."""
         found: list[FieldPath] = []
         _add_paths(found, self._class.DESCRIPTOR, "", [], within_array=False)
         return found
@@ -104,7 +104,7 @@ class ProtobufCodec:
         return body_groups(map(self._body, payloads_of(buffer, offset, length)))
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message."""
+        """The fields of this message in its index document."""
         body = self._body(memoryview(payload))
         if isinstance(body, PayloadError):
             return {}
@@ -115,7 +115,7 @@ class ProtobufCodec:
         return cast("dict[str, object]", top(_plain(self._parsed(memoryview(payload)))))
 
     def decode(self, payload: Buffer) -> object:
-        """The protobuf message.
+        """Decode the protobuf message.
 
         Raises:
             PayloadError: The payload is not of this type.
@@ -213,7 +213,7 @@ def _message_class(schema: Schema) -> type[Message]:
 
 
 def _fill(pool: DescriptorPool, data: bytes) -> None:
-    """Adds all files of a set to a pool, each after the files that it imports."""
+    """Add all files of a set to a pool, each after its imports."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     waiting = {file.name: file for file in FileDescriptorSet.FromString(data).file}

@@ -1,12 +1,11 @@
-"""Messages whose payload was given up: size, hash, and the fields as the index has them.
+"""Reduced messages, whose payload was dropped: size, hash, and the indexed fields.
 
-When more comes than a disk takes, a recorder keeps of a large message what is small. It
-lies in the segment like any message, on a channel of its own whose encoding is `REDUCED`,
-so that a dropped index is made again from it, too.
+Under pressure a recorder stores only the small parts of a large message. A reduced message
+is in the segment like any message, on a channel of its own with the encoding `REDUCED`, so
+that the index can be rebuilt from it, too.
 
-The payload of a reduced message is a head of 40 bytes, the size of what was given up
-(u64, little-endian) and its SHA-256, and then the BSON elements of the index document
-without `_meta`.
+Its payload is a head of 40 bytes, with the size (u64, little-endian) and the SHA-256 of
+the dropped payload, and then the BSON elements of the index document without `_meta`.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 ORIGINAL_ENCODING = "hybridlog.message_encoding"
-"""Channel metadata of a reduced channel: the encoding of what was given up."""
+"""Metadata key of a reduced channel: the encoding of the dropped payloads."""
 
 _HEAD = struct.Struct("<Q32s")
-_GIVEN_UP = "its payload was given up under pressure; only its fields were kept"
+_GIVEN_UP = "its payload was dropped under pressure; only its fields are stored"
 
 
 @dataclass(frozen=True, slots=True)
 class Remains:
-    """What is known of a payload that was given up.
+    """Size and hash of a dropped payload.
 
     Attributes:
         size: Bytes.
@@ -56,7 +55,7 @@ class Remains:
 
 
 def reduced_channel(channel: Channel) -> Channel:
-    """The channel that carries what is left of a channel's messages."""
+    """The channel of a channel's reduced messages."""
     return Channel(
         channel.topic,
         REDUCED,
@@ -67,10 +66,10 @@ def reduced_channel(channel: Channel) -> Channel:
 
 
 def reduce(channel: Channel, payload: bytes) -> bytes:
-    """What is left of a message. A payload that cannot be read leaves size and hash.
+    """Reduce a message. An unreadable payload is reduced to size and hash.
 
     Args:
-        channel: Its own channel.
+        channel: Its channel.
         payload: The serialized message.
     """
     head = _HEAD.pack(len(payload), hashlib.sha256(payload).digest())
@@ -82,24 +81,24 @@ def reduce(channel: Channel, payload: bytes) -> bytes:
 
 
 def remains_of(payload: Buffer) -> Remains:
-    """Size and hash of what was given up.
+    """Size and hash of the dropped payload.
 
     Raises:
-        PayloadError: It is no reduced message.
+        PayloadError: It is not a reduced message.
     """
     if len(payload) < _HEAD.size:
-        raise PayloadError("the payload is no reduced message: it is too short")
+        raise PayloadError("the payload is not a reduced message: it is too short")
     return Remains(*_HEAD.unpack_from(payload))
 
 
 class ReducedCodec:
-    """Reads what is left of messages."""
+    """Codec of reduced messages."""
 
     indexed = True
     reason: str | None = None
 
     def paths(self) -> list[FieldPath]:
-        """None of its own: those of the whole messages count."""
+        """No fields of its own: those of whole messages count."""
         return []
 
     def bodies(
@@ -109,7 +108,7 @@ class ReducedCodec:
         return body_groups(map(_body, payloads_of(buffer, offset, length)))
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message."""
+        """The fields of this message in its index document."""
         body = _body(memoryview(payload))
         return {} if isinstance(body, PayloadError) else _document(body)
 
@@ -118,7 +117,7 @@ class ReducedCodec:
         return self.fields(payload)
 
     def decode(self, payload: Buffer) -> object:
-        """Refuses.
+        """Raise, since the payload cannot be decoded.
 
         Raises:
             PayloadError: Always.
@@ -174,8 +173,8 @@ def _body(payload: memoryview) -> bytes | PayloadError:
     try:
         remains_of(payload)
         body = bytes(payload[_HEAD.size :])
-        # The elements go into the index as they are, so they must be what they claim.
+        # The elements go into the index unchanged, so they must be valid.
         _document(body)
     except (BSONError, PayloadError) as error:
-        return PayloadError(f"the payload is no reduced message: {error}")
+        return PayloadError(f"the payload is not a reduced message: {error}")
     return body

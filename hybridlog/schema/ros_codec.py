@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 messages."""
+"""Codec of ROS 1 and ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 _MAX_BYTES = 8 << 20
 _MAX_UNROLLED = 10_000
-"""Elements of fixed arrays of strings and messages that rosbags writes code for."""
+"""Most elements of fixed arrays of strings and messages that rosbags unrolls into code."""
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
 
-# rosbags keeps one module of generated classes under one name while it registers them.
+# rosbags uses one module name for generated classes while it registers them.
 _REGISTERING = threading.Lock()
 
 
@@ -72,7 +72,7 @@ class RosCodec:
         self._objects: RosObjects | None = None
 
     def paths(self) -> list[FieldPath]:
-        """Every field, in the order of the definition."""
+        """All fields, in the order of the definition."""
         return self._paths
 
     def bodies(
@@ -94,7 +94,7 @@ class RosCodec:
             yield error_group(bad.rows, text)
 
     def fields(self, payload: Buffer) -> dict[str, object]:
-        """What the index document holds of this message."""
+        """The fields of this message in its index document."""
         start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
         (group,) = self.bodies(payload, start, size)
         body = group.body.tobytes()
@@ -112,11 +112,11 @@ class RosCodec:
         return {n: row_of(column, 0) for n, column in spelled if names is None or n in names}
 
     def decode(self, payload: Buffer) -> object:
-        """The message as rosbags makes it: attributes, arrays as numpy views.
+        """Decode the message with rosbags: fields as attributes, arrays as numpy views.
 
         Raises:
             PayloadError: The payload does not fit the definition.
-            DefinitionError: rosbags cannot make a class of the definition.
+            DefinitionError: rosbags cannot make a class from the definition.
         """
         if self._objects is None:
             with _REGISTERING:
@@ -158,17 +158,17 @@ class RosCodec:
 
 
 class RosObjects:
-    """Makes objects of single messages with rosbags.
+    """Decodes single messages to objects with rosbags.
 
-    rosbags runs code that it generates from type and field names, so it is given the
-    checked type and never the definition's text.
+    rosbags runs code generated from type and field names. So it gets the checked type and
+    never the text of the definition.
 
     Args:
-        message_type: What the payloads hold.
+        message_type: Type of the payloads.
         wire: Their format.
 
     Raises:
-        DefinitionError: rosbags cannot make a class of it.
+        DefinitionError: rosbags cannot make a class from it.
     """
 
     def __init__(self, message_type: MessageType, wire: Literal["ros1", "cdr"]) -> None:
@@ -185,7 +185,7 @@ class RosObjects:
             self._store.get_msgdef(self._name)
         except (TypesysError, SyntaxError, RecursionError, MemoryError) as error:
             raise DefinitionError(
-                f"{message_type.name}: rosbags makes no class of this definition ({error}). "
+                f"{message_type.name}: rosbags cannot make a class from this definition ({error}). "
                 "`.raw` has the bytes"
             ) from error
 
@@ -215,7 +215,7 @@ class RosObjects:
 
 
 class _Typesdict:
-    """A type and all types in it, in the form that rosbags registers."""
+    """A type and all its nested types, in the form that rosbags registers."""
 
     def __init__(self, owner: str) -> None:
         self.types: Typesdict = {}
@@ -224,7 +224,7 @@ class _Typesdict:
         self._unrolled = 0
 
     def add(self, message: MessageType) -> str:
-        """Adds a message; the name it goes by."""
+        """Add a message; return its rosbags name."""
         if message not in self._names:
             name = self._free(_rosbags_name(message.name))
             self.types[name] = ([], [])
@@ -234,7 +234,7 @@ class _Typesdict:
 
     def _free(self, name: str) -> str:
         if not _TYPE_NAME.match(name):
-            raise DefinitionError(f"{self._owner}: {name[:80]!r} is no name for a type")
+            raise DefinitionError(f"{self._owner}: {name[:80]!r} is not a valid type name")
         free, number = name, 2
         while free in self.types:
             free, number = f"{name}_{number}", number + 1
@@ -287,7 +287,7 @@ def _base(name: str) -> FieldDesc:
 
 
 def _rosbags_name(name: str) -> str:
-    """`pkg/Name` as rosbags spells it: `pkg/msg/Name`."""
+    """The rosbags spelling of `pkg/Name`: `pkg/msg/Name`."""
     parts = name.strip("/").split("/")
     if len(parts) == 2:
         parts.insert(1, "msg")

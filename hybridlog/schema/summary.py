@@ -1,4 +1,4 @@
-"""Count, least, greatest and mean of arrays that are too long for an index document."""
+"""Summaries (count, minimum, maximum, mean) of arrays too long for an index document."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from hybridlog.schema.column import Scalars
 
 
-_LONG = 4096  # elements of a row from which a loop over rows costs less than it saves
+_LONG = 4096  # elements of a row from which a loop over rows is faster
 _BLOCK = 16384
-_TABLE = 65536  # elements of equally long rows that are summed at once: caches hold no more
-_LANES = 256  # as many 8-bit values fit into a 16-bit sum, 16-bit ones into 32 bits
+_TABLE = 65536  # elements of equally long rows summed at once, limited by the cache
+_LANES = 256  # number of 8-bit values that fit into a 16-bit sum, or 16-bit values into 32 bits
 
 
 @dataclass(slots=True)
@@ -40,12 +40,11 @@ class Summary:
 
 
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
-    """Summarises every row of a ragged array.
+    """Summarise every row of a ragged array.
 
-    The summary of a row depends on the elements of that row alone, to the last bit,
-    whatever else is in the batch: sums of floats are made by one `reduceat`, which adds
-    up each segment on its own and in the same order, or, of long rows, block by block,
-    and never by a regular-grid reduction, whose order may differ.
+    The summary of a row depends on its elements alone, to the last bit. So sums of floats
+    use one `reduceat`, which adds each segment separately and in the same order, or for long
+    rows a sum by blocks, and never a regular-grid reduction, whose order may differ.
 
     Args:
         values: All elements.
@@ -75,7 +74,7 @@ def _integers(
     low, high = (np.zeros(len(counts), exact) for _ in range(2))
     mean = np.zeros(len(counts), np.float64)
     if has.any():
-        # Rows without elements must not reach reduceat: it would return a neighbour's.
+        # reduceat would return a neighbour's value for rows without elements.
         begin = start[has]
         low[has] = np.minimum.reduceat(elements, begin)
         high[has] = np.maximum.reduceat(elements, begin)
@@ -91,7 +90,7 @@ def _integers(
 def _exact_sums(
     elements: NDArray[Any], begin: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> NDArray[Any]:
-    """Sums of segments of integers of at most 32 bits: the order does not matter."""
+    """Exact sums of segments of integers of at most 32 bits."""
     if elements.dtype.itemsize == 4 or int(counts.mean()) < 16 * _LANES:
         return np.add.reduceat(elements, begin, dtype=np.int64)
     if _are_equal(counts):
@@ -103,9 +102,9 @@ def _exact_sums(
 
 
 def _lane_sums(table: NDArray[Any]) -> NDArray[np.int64]:
-    """Sums of the rows of a table of images or clouds.
+    """Sums of the rows of a table, for images and clouds.
 
-    To add up whole columns is ten times as fast as one long sum.
+    Adding whole columns is ten times as fast as one long sum.
     """
     rows, count = table.shape
     even = count // _LANES * _LANES
@@ -130,14 +129,14 @@ def _floats(
     low, high, mean = (np.zeros(len(counts), np.float64) for _ in range(3))
     if has.any():
         begin = offset[:-1][has]
-        # Adding 0.0 turns -0.0 into 0.0: which of two equal zeros a reduction returns
-        # depends on the order in which the processor compares them.
+        # Adding 0.0 turns -0.0 into 0.0. Otherwise the zero that a reduction returns would
+        # depend on the order of comparisons in the processor.
         low[has] = np.minimum.reduceat(elements, begin) + elements.dtype.type(0)
         high[has] = np.maximum.reduceat(elements, begin) + elements.dtype.type(0)
         wide = elements.astype(np.float64, copy=False)
         mean[has] = np.add.reduceat(wide, begin) / kept[has] + 0.0
         for row in np.flatnonzero(~np.isfinite(mean)):
-            # The sum left the range of a double, the mean cannot.
+            # The sum overflows a double, the mean cannot.
             part = wide[offset[row] : offset[row + 1]]
             mean[row] = np.clip(np.add.reduce(part / kept[row]), low[row], high[row])
     return Summary(counts, low, high, mean, has)
@@ -146,10 +145,10 @@ def _floats(
 def _equal_floats(
     table: NDArray[Any], offset: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> Summary:
-    """Rows of one length, of a block at most: what `_with_long_floats` finds, in a few steps.
+    """Summaries of rows of equal length, one block at most: `_with_long_floats` in fewer steps.
 
-    However short they are, the steps of a row of its own cost as much as its numbers, and at
-    each another thread may take the interpreter.
+    Separate steps for a row cost as much as its numbers, and at each step another thread may
+    take the interpreter lock.
     """
     rows, count = table.shape
     total = np.empty(rows, np.float64)
@@ -179,7 +178,7 @@ def _with_long_floats(
     counts: NDArray[np.int64],
     long: NDArray[np.bool_],
 ) -> Summary:
-    """Rows of which some are long enough to be worth a loop."""
+    """Summaries of rows of which some are long enough for a loop."""
     low, high, mean = (np.zeros(len(counts), np.float64) for _ in range(3))
     has = np.ones(len(counts), np.bool_)
     short = ~long
@@ -202,10 +201,10 @@ def _with_long_floats(
 
 
 def _sum_of_finite(part: NDArray[Any]) -> float | None:
-    """The sum of a long row, None when an element or the sum is not finite.
+    """The sum of a long row, None if an element or the sum is not finite.
 
-    It is made a block at a time, in doubles that stay in the processor's cache. What is
-    not finite shows in the sum, so it need not be looked for.
+    It is computed block by block, in doubles that stay in the processor's cache. An element
+    that is not finite shows in the sum, so no search is needed.
     """
     scratch = np.empty(min(_BLOCK, len(part)), np.float64)
     sums = []

@@ -1,8 +1,8 @@
-"""Reading the wire formats of ROS 1 and ROS 2 (CDR) by columns.
+"""Reads the wire formats of ROS 1 and ROS 2 (CDR) by columns.
 
-For all messages of one type in a chunk, each field is gathered with one numpy
-operation. Payloads are untrusted: what does not fit its definition is reported by row
-with a reason, and everything else is read.
+For all messages of one type in a chunk, each field is gathered with one numpy operation.
+Payloads are untrusted: rows that do not fit their definition are reported with a reason,
+and all other rows are read.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Unreadable:
 
     Attributes:
         rows: Rows of the input, ascending.
-        reason: What is wrong and where, without the topic or the file.
+        reason: The problem and its place, without the topic or the file.
     """
 
     rows: NDArray[np.intp]
@@ -57,10 +57,10 @@ class Unreadable:
 
 @dataclass(slots=True)
 class Decoded:
-    """What was read.
+    """The result of reading.
 
     Attributes:
-        rows: Rows of the input that could be read, ascending.
+        rows: Readable rows of the input, ascending.
         records: Their columns; as many rows as `rows`.
         unreadable: The other rows, each in one of these.
     """
@@ -74,15 +74,15 @@ class WireReader:
     """Reads payloads of one message type.
 
     Args:
-        message_type: What the payloads hold.
+        message_type: Type of the payloads.
         wire: Their format.
         fields: Dotted paths of the fields to read, top-level or nested (`header.stamp`,
-            `transforms[].child_frame_id`; the brackets may be left out). A path takes
-            everything below it. Paths that do not exist are ignored. None reads all.
-            Fields that are not read are checked all the same.
+            `transforms[].child_frame_id`; the brackets are optional). A path includes
+            everything below it. Unknown paths are ignored. None reads all. Fields that are
+            not read are still checked.
 
     Raises:
-        DefinitionError: The type cannot be read with bounded effort.
+        DefinitionError: The type cannot be read with bounded cost.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class WireReader:
         self._program = compile_type(message_type, wire, fields)
 
     def read(self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]) -> Decoded:
-        """Read payloads. Never raises for what is in them.
+        """Read payloads. Never raises because of their content.
 
         Large arrays of a single row may be views into `buffer`.
 
@@ -186,7 +186,7 @@ class WireReader:
         end: NDArray[np.int64],
         bad: dict[str, list[NDArray[np.intp]]],
     ) -> NDArray[np.intp]:
-        """The rows that fit, after each was looked at on its own."""
+        """Check each row separately; return the valid ones."""
         scanner = Scanner(source, self._wire)
         good = np.ones(len(rows), np.bool_)
         places = zip(rows.tolist(), start[rows].tolist(), end[rows].tolist(), strict=True)

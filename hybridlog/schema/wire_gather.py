@@ -1,4 +1,4 @@
-"""Gathering columns out of a buffer, and putting rows of columns into another order."""
+"""Gathers columns from a buffer, and reorders rows of columns."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ if TYPE_CHECKING:
     from hybridlog.schema.wire_program import Fixed
     from hybridlog_storage.messages import Buffer
 
-# From here on a single row is a view into the buffer: below, a copy costs less than
-# keeping the whole buffer alive.
+# Bytes from which a single row is a view into the buffer: for fewer, a copy costs less
+# than keeping the whole buffer alive.
 _VIEW_BYTES = 4096
-# From here on rows are copied one by one into a buffer that is used again: numpy's own
-# gathering takes new memory from the system, which costs more than the copy.
+# Bytes from which rows are copied one by one into a reused buffer: numpy's gathering
+# takes new memory from the system, which costs more than the copy.
 _LONG_BLOCK = 1 << 12
-# Rows of equal length are copied together when that pays for finding them.
+# Rows of equal length are copied together if that is worth finding them.
 _MAX_GROUPS = 32
 _ROWS_A_GROUP = 16
-# From here on it pays to look whether rows are equally far apart.
+# Rows from which a check for equal distances pays.
 _EVEN_ROWS = 16
 
 
 class Source:
     """Reads from a buffer at many positions at once.
 
-    Each gather indexes a view of the buffer that has an element at every byte: the
-    elements overlap, and nothing but the chosen ones is touched. Callers have checked
-    that all they ask for lies within the payloads.
+    Each gather indexes a view of the buffer with an element at every byte: the elements
+    overlap, and only the chosen ones are read. Callers have checked that all positions lie
+    within the payloads.
     """
 
     def __init__(self, buffer: Buffer, order: Literal["<", ">"]) -> None:
@@ -49,7 +49,7 @@ class Source:
         self, dtype: str | np.dtype[np.generic], size: int, base: NDArray[np.int64], delta: int
     ) -> NDArray[np.generic]:
         if base is not self._base:
-            # Many gathers follow from one base: whether it is even is looked up once.
+            # Many gathers use one base: its stride is computed once.
             self._base, self._stride = base, _even_stride(base)
         view: NDArray[np.generic]
         if self._stride:
@@ -76,7 +76,7 @@ class Source:
         return self._gather(f"{self.order}u4", 4, base, delta).astype(np.int64)
 
     def block(self, base: NDArray[np.int64], delta: int, size: int) -> NDArray[np.uint8]:
-        """`size` bytes from each `base + delta`, one row after the other: uint8[n * size]."""
+        """Gather `size` bytes from each `base + delta`, row by row: uint8[n * size]."""
         if size == 0:
             return np.empty(0, np.uint8)
         if len(base) == 1 and size >= _VIEW_BYTES:
@@ -86,7 +86,7 @@ class Source:
         return cast("NDArray[np.uint8]", self._gather(f"V{size}", size, base, delta).view("u1"))
 
     def ragged(self, start: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """`size[i]` bytes from `start[i]`, one row after the other."""
+        """Gather `size[i]` bytes from `start[i]`, row by row."""
         if len(start) >= 2 * _ROWS_A_GROUP and int(size.max()) < _LONG_BLOCK:
             sizes, group = np.unique(size, return_inverse=True)
             if len(sizes) <= _MAX_GROUPS and len(sizes) * _ROWS_A_GROUP <= len(start):
@@ -96,7 +96,7 @@ class Source:
         return self._join(start.tolist(), size.tolist())
 
     def _join_equal(self, start: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
-        """`size` bytes from each start; in one step when these are equally far apart."""
+        """Gather `size` bytes from each start, in one step if the starts are equally spaced."""
         rows = len(start)
         stride = _even_stride(start, least=2)
         if not stride:
@@ -195,7 +195,7 @@ def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
 
 
 def _even_stride(base: NDArray[np.int64], least: int = _EVEN_ROWS) -> int:
-    """The distance of offsets that are all equally far apart, 0 for others and for few."""
+    """The distance of equally spaced offsets, 0 for others and for few."""
     if len(base) < least:
         return 0
     stride = int(base[1] - base[0])

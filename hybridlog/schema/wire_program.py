@@ -1,10 +1,9 @@
-"""Message types compiled into the steps that a reader of their wire form takes.
+"""Compiles message types into the steps of a wire reader.
 
-Nested messages disappear here: a program is a flat list of steps. Neighbouring fields
-of fixed size form one run, whose layout (offsets from where it starts, alignment
-included) is worked out once for each phase at which it can start. Wherever a wanted
-field ends up, its column goes to a numbered slot; a tree of names puts the slots
-together again.
+A program is a flat list of steps; nested messages are flattened. Neighbouring fields of
+fixed size form one run. The layout of a run (offsets from its start, with alignment) is
+computed once for each phase at which it can start. The column of each requested field goes
+to a numbered slot; a tree of names assembles the slots.
 
 Phases: CDR aligns numbers to their size, counted from the end of the encapsulation
 header. The phase of a position is its distance from there modulo 8. ROS 1 does not
@@ -30,10 +29,10 @@ Wanted: TypeAlias = "bool | dict[str, Wanted]"
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A wanted field that is a column.
+    """A requested field with a column.
 
     Attributes:
-        slot: Where the column is put.
+        slot: Number of the column's slot.
     """
 
     slot: int
@@ -41,7 +40,7 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """A message: its wanted fields in the order of the definition."""
+    """A message: its requested fields in the order of the definition."""
 
     fields: tuple[tuple[str, Node], ...]
 
@@ -50,12 +49,12 @@ Node: TypeAlias = Leaf | Branch
 
 
 def assemble(node: Node, slots: list[Column | None], rows: int) -> Column:
-    """The column of a tree of names from its filled slots.
+    """Assemble the column of a tree of names from its filled slots.
 
     Args:
         node: The tree.
         slots: Columns, each of `rows` rows.
-        rows: Number of rows, which a message without fields cannot tell.
+        rows: Number of rows, for a message without fields.
     """
     if isinstance(node, Leaf):
         column = slots[node.slot]
@@ -66,14 +65,14 @@ def assemble(node: Node, slots: list[Column | None], rows: int) -> Column:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """A field that always takes the same number of bytes.
+    """A field of fixed size.
 
     Attributes:
         path: Dotted path, for messages.
         align: Alignment in bytes.
         size: Bytes.
-        slot: Where its column goes, None when it is not wanted.
-        kind: What it is; None for bytes that mean nothing.
+        slot: Slot of its column, None if it is not requested.
+        kind: Its type; None for padding.
         width: Number of elements of a fixed array, None for a single value.
     """
 
@@ -87,12 +86,12 @@ class Fixed:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the fields of a part of a run lie, from a start of known phase.
+    """Positions of the fields in a part of a run, from a start of known phase.
 
     Attributes:
-        stop: Index of the first field that is not part of it.
+        stop: Index of the first field behind it.
         size: Bytes from the start to the end of the last field.
-        wanted: Distance from the start and field, for the wanted ones.
+        wanted: Distance from the start, and field, for the requested ones.
     """
 
     stop: int
@@ -109,11 +108,11 @@ class Run:
     _sizes: list[int | None] = field(default_factory=lambda: [None] * 8)
 
     def layout(self, first: int, phase: int, modulus: int) -> Layout:
-        """Layout from field `first` on, as far as the known phase reaches.
+        """Layout from field `first` on, as far as the known phase allows.
 
         Args:
-            first: Index of a field. When its alignment is larger than `modulus`, the
-                layout is empty.
+            first: Index of a field. If its alignment is larger than `modulus`, the layout is
+                empty.
             phase: Phase of the start, modulo `modulus`.
             modulus: 1, 2, 4 or 8. Fields of larger alignment cannot be placed.
         """
@@ -178,9 +177,9 @@ class ArrayStep:
 
     Attributes:
         path: Dotted path, for messages.
-        slot: Where its column goes, None when nothing of it is wanted.
-        width: Number of elements; None when the count is on the wire.
-        element: Reads one element.
+        slot: Slot of its column, None if it is not requested.
+        width: Number of elements; None if the count is on the wire.
+        element: The program of one element.
     """
 
     path: str
@@ -199,10 +198,10 @@ class Program:
     Attributes:
         steps: In wire order.
         slots: Number of slots.
-        root: Puts the slots together; None when nothing is wanted.
-        least: Bytes that it takes at the least.
-        align: Largest alignment of the fields of fixed size in it.
-        fixed: True when it takes the same number of bytes from starts of the same phase.
+        root: Assembles the slots; None if no field is requested.
+        least: Its minimum size in bytes.
+        align: Largest alignment of its fields of fixed size.
+        fixed: True if its size depends only on the phase of its start.
     """
 
     steps: tuple[Step, ...]
@@ -233,10 +232,10 @@ class Program:
         return size
 
     def span(self, phase: int, count: int) -> int:
-        """Bytes of `count` elements one after the other. Only for fixed programs.
+        """Bytes of `count` consecutive elements. Only for fixed programs.
 
-        From the second element on all start at the same phase modulo `align`: a member
-        of that alignment comes before each of them, always at the same distance.
+        From the second element on all start at the same phase modulo `align`: a member of that
+        alignment precedes each of them at the same distance.
         """
         if count == 0:
             return 0
@@ -268,7 +267,7 @@ def wanted_tree(fields: Collection[str] | None) -> Wanted:
     """Paths as a tree of names; True stands for everything below.
 
     Args:
-        fields: Dotted paths, `[]` after array names optional. None is everything.
+        fields: Dotted paths, `[]` after array names optional. None for all.
     """
     if fields is None:
         return True
@@ -304,7 +303,7 @@ class _Compiler:
             self._run = []
 
     def _leaf(self, wanted: Wanted) -> Leaf | None:
-        # A path that goes on below a leaf leads nowhere.
+        # A path below a leaf does not exist.
         if wanted is not True:
             return None
         self._slots += 1
@@ -336,7 +335,7 @@ class _Compiler:
 
     def _message(self, message: MessageType, path: str, wanted: Wanted) -> Branch | None:
         if not message.fields and self._wire == "cdr":
-            # IDL knows no empty struct, so ROS 2 sends one byte in its place.
+            # IDL has no empty struct, so ROS 2 sends one byte instead.
             self._run.append(Fixed(path or message.name, 1, 1, None, None, None))
         found: list[tuple[str, Node]] = []
         for name, field_type in message.fields:

@@ -1,9 +1,8 @@
-"""Walking over one payload, value by value, to check it or to measure it.
+"""Walks over one payload, value by value, to check or measure it.
 
-This is the slow twin of the column reader. It says what is wrong with a payload and
-where, and it finds the elements of an array when there are too few rows for arithmetic
-on whole columns to pay. Nothing is allocated, and a claimed length is believed only
-when that many bytes are left.
+The slow counterpart of the column reader. It locates problems in a payload, and finds the
+elements of arrays if there are too few rows for column arithmetic. It allocates nothing,
+and accepts a claimed length only if that many bytes are left.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ if TYPE_CHECKING:
 MAX_EMPTY_ELEMENTS = 1_000_000
 """Most elements of an array whose elements take no bytes."""
 MAX_TRAILING = {"ros1": 0, "cdr": 7}
-"""Most bytes that may follow the message in its payload."""
+"""Most bytes behind the message in its payload."""
 
 _U4 = {"<": Struct("<I"), ">": Struct(">I")}
 
 
 class MisfitError(Exception):
-    """A payload does not fit its definition; the message says where."""
+    """A payload does not fit its definition; the message names the place."""
 
 
 class Scanner:
@@ -44,7 +43,7 @@ class Scanner:
 
         Args:
             program: The message.
-            start: First byte; in CDR the one after the encapsulation header.
+            start: First byte; in CDR the one behind the encapsulation header.
             end: End of the payload.
 
         Raises:
@@ -55,13 +54,13 @@ class Scanner:
             raise MisfitError(f"{rest} bytes left over: the definition does not fit")
 
     def walk(self, program: Program, at: int, end: int, origin: int) -> int:
-        """The position after one message or element.
+        """The position behind one message or element.
 
         Args:
-            program: What stands there.
-            at: Where it starts.
+            program: Program of the message or element.
+            at: Its start.
             end: End of the payload.
-            origin: Where alignment counts from.
+            origin: Origin of the alignment.
 
         Raises:
             MisfitError: The payload does not fit.
@@ -82,7 +81,7 @@ class Scanner:
         return at
 
     def _count(self, step: Step, at: int, end: int, origin: int) -> tuple[int, int]:
-        """A length in 32 bits, and the position after it."""
+        """A length in 32 bits, and the position behind it."""
         assert not isinstance(step, Run)
         at += (origin - at) & self._mask & 3
         if end - at < 4:
@@ -132,7 +131,7 @@ class Scanner:
     def elements(
         self, program: Program, at: int, end: int, origin: int, count: int
     ) -> tuple[list[int], int]:
-        """Where each of `count` elements starts, and the position after the last.
+        """Start of each of `count` elements, and the position behind the last.
 
         Raises:
             MisfitError: The payload does not fit.

@@ -1,12 +1,12 @@
-"""Walking over many payloads at once, gathering columns on the way.
+"""Walks over many payloads at once and gathers their columns.
 
-All rows take the same steps. Where a row stands is a vector (`base`) plus a number
-(`delta`); the vector changes only when something of varying length was passed, so most
-fields cost nothing but their gather. Bounds are one comparison a run: `room` is the
-smallest distance from `base` to the end of its payload over all rows.
+All rows take the same steps. Their positions are a vector (`base`) plus a number
+(`delta`). The vector changes only behind fields of varying length, so most fields cost only
+their gather. Bounds take one comparison for each run: `room` is the smallest distance from
+`base` to the end of the payload over all rows.
 
-A row that does not fit stops the walk; the reader then finds out which rows those are
-and starts again without them.
+A row that does not fit stops the walk. The reader then finds these rows and restarts
+without them.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from hybridlog.schema.wire_scan import MAX_EMPTY_ELEMENTS, MAX_TRAILING, MisfitE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Below so many rows, walking from element to element is faster one row at a time.
+# Rows below which walking over elements is faster one row at a time.
 _FEW_ROWS = 12
 
 
 class _Cursor:
-    """Where each row stands.
+    """The position of each row.
 
     Attributes:
         base: int64[n], absolute positions.
         delta: Distance of all rows from `base`.
         end: int64[n], ends of the payloads.
-        origin: int64[n], where alignment counts from; unused in ROS 1.
+        origin: int64[n], origin of the alignment; unused in ROS 1.
         phase: `base - origin` modulo `modulus`, the same for all rows.
-        modulus: 8 when the phase is known in full, down to 1 when nothing is known.
+        modulus: 8 if the phase is fully known, down to 1 if it is unknown.
         room: Smallest `end - base`.
     """
 
@@ -67,7 +67,7 @@ class _Cursor:
         self.move(base, phase, modulus)
 
     def move(self, base: NDArray[np.int64], phase: int, modulus: int) -> None:
-        """Stand at new positions of known phase."""
+        """Move to new positions of known phase."""
         self.base = base
         self.delta = 0
         self.phase = phase
@@ -77,9 +77,9 @@ class _Cursor:
             raise MisfitError
 
     def move_or_step(self, positions: NDArray[np.int64], modulus: int) -> None:
-        """Stand at new positions, keeping what is known when the step is the same for all.
+        """Move to new positions; the phase stays known if the step is equal for all rows.
 
-        `modulus` is what is known otherwise (with phase 0).
+        Otherwise the phase is 0 modulo `modulus`.
         """
         step = positions - self.base
         first = int(step[0])
@@ -90,7 +90,7 @@ class _Cursor:
             self.move(positions, 0, modulus)
 
     def need(self, size: int) -> None:
-        """Stop when any row has less than `size` bytes left."""
+        """Raise if any row has less than `size` bytes left."""
         if self.delta + size > self.room:
             raise MisfitError
 
@@ -111,7 +111,7 @@ class Walker:
         self._source = source
         self._scanner = Scanner(source, wire)
         self._cdr = wire == "cdr"
-        # ROS 1: every phase counts as 0 and as known.
+        # ROS 1: every phase counts as 0 and known.
         self._mask = 7 if self._cdr else 0
         self._count_align = 4 if self._cdr else 1
         self._trailing = MAX_TRAILING[wire]
@@ -119,18 +119,18 @@ class Walker:
     def read(
         self, program: Program, start: NDArray[np.int64], end: NDArray[np.int64]
     ) -> Column | None:
-        """Columns of whole messages.
+        """Read columns of whole messages.
 
         Args:
             program: The message.
-            start: int64[n], first bytes; in CDR the ones after the encapsulation headers.
+            start: int64[n], first bytes; in CDR those behind the encapsulation headers.
             end: int64[n], ends of the payloads. All within the buffer.
 
         Returns:
-            The column, None when nothing is wanted.
+            The column, None if no field is requested.
 
         Raises:
-            MisfitError: Any of the payloads does not fit. It does not say which.
+            MisfitError: At least one payload does not fit; it is not named.
         """
         slots: list[Column | None] = [None] * program.slots
         if len(start) == 0:
@@ -142,7 +142,7 @@ class Walker:
         return None if program.root is None else assemble(program.root, slots, len(start))
 
     def _walk(self, program: Program, cursor: _Cursor, slots: list[Column | None] | None) -> None:
-        """Take all steps of a program; gather when there are slots."""
+        """Take all steps of a program; gather columns if it has slots."""
         for step in program.steps:
             if isinstance(step, Run):
                 self._run(step, cursor, slots)
@@ -173,7 +173,7 @@ class Walker:
             cursor.align(run.fields[first].align)
 
     def _claims(self, cursor: _Cursor) -> int | NDArray[np.int64]:
-        """Lengths in 32 bits: one number when they are equal, else int64[n]."""
+        """Lengths in 32 bits: one number if they are equal, else int64[n]."""
         if self._count_align > 1:
             cursor.align(self._count_align)
         cursor.need(4)
@@ -263,7 +263,7 @@ class Walker:
         slots[step.slot] = Arrays(values, offset, step.width)
 
     def _gather(self, program: Program, cursor: _Cursor) -> Column:
-        """Columns of a program of which something is wanted."""
+        """Gather the columns of a program with requested fields."""
         assert program.root is not None
         slots: list[Column | None] = [None] * program.slots
         rows = len(cursor.base)
@@ -271,7 +271,7 @@ class Walker:
         return assemble(program.root, slots, rows)
 
     def _valueless(self, element: Program, total: int) -> Column:
-        """Columns of elements when there are none, or when they take no bytes."""
+        """Columns of no elements, or of elements without bytes."""
         if total == 0:
             column = self._empty(element)
             assert column is not None
@@ -285,15 +285,15 @@ class Walker:
         """Advance over all elements.
 
         Returns:
-            Where each element starts, rows one after the other, and what is known of
-            their phases: phase and modulus. None when elements take no bytes.
+            Start of each element, row by row, and phase and modulus as far as known. None if
+            elements take no bytes.
         """
         most = counts if isinstance(counts, int) else int(counts.max())
         if element.least == 0:
             if most > MAX_EMPTY_ELEMENTS:
                 raise MisfitError
             return None
-        # Before anything is allocated for them: that many cannot be there.
+        # Before memory is allocated: the payload cannot hold that many.
         if isinstance(counts, int):
             cursor.need(counts * element.least)
         elif bool((counts > (cursor.end - cursor.base - cursor.delta) // element.least).any()):
@@ -326,7 +326,7 @@ class Walker:
             if phase == later:
                 return starts, phase, align if self._cdr else 8
             return starts, 0, 1
-        # Only CDR comes here: in ROS 1 all phases are known.
+        # Only CDR reaches this: in ROS 1 all phases are known.
         sizes = np.array([element.size(phase) for phase in range(align)], np.int64)
         firsts = sizes[(start - cursor.origin) & (align - 1)]
         if isinstance(counts, int):
@@ -341,7 +341,7 @@ class Walker:
         firsts: NDArray[np.int64],
         stride: int,
     ) -> NDArray[np.int64]:
-        """Starts of elements of fixed size; the first of a row may take more or less."""
+        """Starts of elements of fixed size; the first of a row may differ in size."""
         extra = firsts - stride
         ends = start + np.where(counts > 0, counts * stride + extra, 0)
         cursor.move_or_step(ends, self._least_known())
@@ -383,7 +383,7 @@ class Walker:
         return starts
 
     def _least_known(self) -> int:
-        """What is known of a phase after something of varying length."""
+        """The known modulus of a phase behind a field of varying length."""
         return 1 if self._cdr else 8
 
     def _empty(self, program: Program) -> Column | None:

@@ -1,9 +1,8 @@
-"""What every reader of a foreign log offers: batches in file order, and what was lost.
+"""The interface of a reader of foreign logs: batches in file order, and damage.
 
-A source never gives up because a part of its file is damaged: it yields what can be
-read and describes every place that could not be, so that the consumer can store the
-one and report the other. Only a file that gives nothing at all raises `SourceError`,
-and it does so when the source is opened.
+A damaged file does not stop a source: it yields the readable messages and describes every
+damaged place, so that the consumer can store the messages and report the damage. Only a
+file of which nothing can be read raises `SourceError`, when the source is opened.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
 
 BATCH_BYTES = 2 << 20
-"""Payload bytes at which a source closes a batch; one larger payload may exceed it."""
+"""Payload bytes at which a source closes a batch; a single payload may exceed it."""
 
 BATCH_MESSAGES = 16384
 """Most messages of one batch."""
 
 MAX_CHUNK = 1 << 30
-"""Largest chunk or payload, in uncompressed bytes, that a source will unpack."""
+"""Largest chunk or payload that a source unpacks, in uncompressed bytes."""
 
-_TOO_MUCH = 1 << 63  # for BSON, and for the size of any file
+_TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +43,13 @@ class Damage:
 
     Attributes:
         file: The file.
-        offset: Byte in the file where the place starts, None when that is not known.
-        length: Bytes from `offset` on that could not be read, None when not known.
-        reason: What is wrong there, for people to read.
-        messages_lost: Number of messages that lie there, None when it cannot be known.
+        offset: Byte in the file where the place starts, None if unknown.
+        length: Bytes from `offset` on that could not be read, None if unknown.
+        reason: Description of the damage.
+        messages_lost: Number of messages in it, None if unknown.
 
-    Numbers that do not fit into 64 bits, which a file can claim and no file can hold,
-    are not kept: the loss ledger goes into the database.
+    A damaged file can claim numbers of more than 64 bits. They become None, because the
+    loss ledger is stored in the database.
     """
 
     file: Path
@@ -60,7 +59,7 @@ class Damage:
     messages_lost: int | None
 
     def __post_init__(self) -> None:
-        """Forget impossible numbers."""
+        """Replace impossible numbers by None."""
         for name in ("offset", "length", "messages_lost"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < _TOO_MUCH:
@@ -68,25 +67,25 @@ class Damage:
 
 
 class Source(ABC):
-    """A log that hybridlog did not write. Use it as a context manager, read it once.
+    """A foreign log. A context manager; its batches can be read once.
 
     Attributes:
-        path: What was opened: a file, or the directory of a split log.
+        path: The opened file, or the directory of a split log.
         kind: `ROS 1 bag`, `ROS 2 bag (sqlite3)`, `ROS 2 bag (mcap)` or `MCAP`.
         profile: MCAP profile of the messages: `ros1`, `ros2`, or empty.
         files: The files that hold messages, in reading order.
         size_bytes: Sum of the sizes of `files`.
-        channels: Channels met so far; `Batch.channel` indexes it. It only ever grows,
-            and holds every channel of a batch before that batch is yielded.
-        damage: Places that could not be read, so far. It only ever grows.
-        extras: Metadata and attachments met so far (MCAP only). The consumer takes
-            them out as it stores them.
-        message_count: Messages as the log says of itself, None when it does not.
-        time_range: Log time `[start, end)`, ns, as the log's own index says, None when
-            it does not or has no messages.
-        bytes_read: How much of `size_bytes` has been read, for showing progress.
-        packed_messages: The log says of itself that each payload is a zstd frame, and
-            this reader yields the frames (`JoinedSource` unpacks them).
+        channels: Channels found so far; `Batch.channel` indexes it. It only grows, and holds
+            every channel of a batch before that batch is yielded.
+        damage: Damaged places found so far. It only grows.
+        extras: Metadata and attachments found so far (MCAP only). The consumer removes them
+            as it stores them.
+        message_count: Number of messages as stated by the log, None if it states none.
+        time_range: Log time `[start, end)`, ns, by the log's own index, None without an index
+            or without messages.
+        bytes_read: Bytes read of `size_bytes`, for progress.
+        packed_messages: The log states that each payload is a zstd frame, and this reader
+            yields the frames (`JoinedSource` unpacks them).
     """
 
     def __init__(self, path: Path, *, kind: str, profile: str, files: Sequence[Path]) -> None:
@@ -105,18 +104,18 @@ class Source(ABC):
 
     @abstractmethod
     def batches(self) -> Iterator[Batch]:
-        """Yields all messages that can be read, once, in file order, in bounded memory.
+        """Yield all readable messages once, in file order, in bounded memory.
 
         Each batch holds about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages. Its
         buffer stays valid after the source is closed.
 
         Raises:
-            SourceError: The file cannot be read any more at all (an I/O error).
+            SourceError: The file cannot be read any more (an I/O error).
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Closes the files. May be called more than once."""
+        """Close the files. May be called more than once."""
 
     def __enter__(self) -> Self:
         return self
@@ -134,7 +133,7 @@ def size_of(file: Path) -> int:
     """Size of a file in bytes.
 
     Raises:
-        SourceError: The file is missing or may not be looked at.
+        SourceError: The file is missing or not accessible.
     """
     try:
         return file.stat().st_size
@@ -143,7 +142,7 @@ def size_of(file: Path) -> int:
 
 
 def cannot_open(path: Path, error: OSError) -> SourceError:
-    """The error for a path that the system refuses to open, with the cure."""
+    """The error for a path that cannot be opened, with the cure."""
     if isinstance(error, FileNotFoundError):
         return SourceError(f"{path}: no such file or directory; check the spelling of the path")
     if isinstance(error, PermissionError):
@@ -158,11 +157,11 @@ def cannot_open(path: Path, error: OSError) -> SourceError:
 
 
 def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
-    """Joins small batches and splits large ones, in order.
+    """Join small batches and split large ones, in order.
 
     Args:
-        batches: Batches of any size, as the chunks of a file give them. Empty ones are
-            left out.
+        batches: Batches of any size, for example one for each chunk of a file. Empty ones
+            are omitted.
 
     Yields:
         Batches of about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages.
@@ -189,7 +188,7 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
 
 
 def _split(batch: Batch) -> Iterator[Batch]:
-    """Parts of a batch, over the same buffer."""
+    """Split a batch into parts over the same buffer."""
     if len(batch) <= BATCH_MESSAGES and batch.payload_bytes <= 2 * BATCH_BYTES:
         yield batch
         return

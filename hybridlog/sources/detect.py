@@ -1,4 +1,4 @@
-"""Opens any log by what it contains; names and extensions decide nothing."""
+"""Opens any log by its content; names and extensions do not matter."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _KINDS = (
 
 
 class Format(Enum):
-    """What the content of a file says it is; the value is for people."""
+    """The format of a file by its content; the value is its name in messages."""
 
     BAG = "ROS 1 bag"
     SQLITE = "ROS 2 bag (sqlite3)"
@@ -39,15 +39,15 @@ class Format(Enum):
 
 
 def open_source(path: Path) -> Source:
-    """Opens a log: a file, or the directory of a ROS 2 bag or of a split log.
+    """Open a log: a file, or the directory of a ROS 2 bag or of a split log.
 
     A directory without `metadata.yaml` is read when it holds exactly one log, or the
     parts of one log that was split.
 
     Raises:
-        SourceError: There is nothing to read: the path is missing, may not be read, is
-            empty, of no known kind, encrypted or of an old version, or a directory
-            without a log. The message says which and what to do.
+        SourceError: Nothing can be read: the path is missing, not readable, empty, of an
+            unknown kind, encrypted or of an old version, or a directory without a log. The
+            message names the cause and the cure.
     """
     try:
         mode = path.stat().st_mode
@@ -68,10 +68,10 @@ def open_source(path: Path) -> Source:
 
 
 def sniff(path: Path) -> tuple[Format, bool]:
-    """Tells what a file is from its first bytes.
+    """Detect the format of a file from its first bytes.
 
     Returns:
-        The format, and whether the file is a zstd file that holds it.
+        The format, and whether the file is compressed with zstd.
 
     Raises:
         SourceError: It cannot be read.
@@ -94,7 +94,7 @@ def sniff(path: Path) -> tuple[Format, bool]:
 
 
 def _open_file(path: Path) -> Source:
-    """Opens one file on its own."""
+    """Open a single file."""
     found, is_packed = sniff(path)
     if found is Format.OTHER:
         raise _unknown(path, is_packed=is_packed)
@@ -108,8 +108,8 @@ def _open_file(path: Path) -> Source:
 
 
 def _open_plain(path: Path) -> Source:
-    """Opens one uncompressed file with the reader of its format."""
-    # Each reader brings libraries of its own; only the one that is needed is loaded.
+    """Open an uncompressed file with the reader of its format."""
+    # Each reader imports libraries of its own; only the needed one is loaded.
     found, _ = sniff(path)
     if found is Format.BAG:
         from hybridlog.sources.rosbag1 import Rosbag1Source
@@ -169,7 +169,7 @@ def _join(
     metadata: BagMetadata | None,
     damage: Sequence[Damage] = (),
 ) -> Source:
-    """One source of several files, or of one that needs more than its plain reader.
+    """Open several files, or one that needs more than its plain reader, as one source.
 
     Raises:
         SourceError: None of the files is a log.
@@ -180,7 +180,7 @@ def _join(
         try:
             found, is_packed = sniff(file)
         except SourceError:
-            # Reading reports it as damage; another file may be readable.
+            # Reading reports the damage; other files may be readable.
             found, is_packed = Format.OTHER, False
         count = None if metadata is None else _listed(metadata, file)
         has_packed = metadata is not None and metadata.packed_messages
@@ -190,7 +190,7 @@ def _join(
     if not known:
         sniff(files[0])
         raise _unknown(files[0], is_packed=parts[0].packed)
-    # Of an MCAP file only its reader can say more.
+    # Only the reader of an MCAP file knows its profile.
     is_mcap = known[0] is Format.MCAP
     is_bag = metadata is not None
     profiles = {Format.BAG: "ros1", Format.SQLITE: "ros2", Format.MCAP: "ros2" if is_bag else ""}
@@ -213,13 +213,13 @@ def _join(
 
 
 def _listed(metadata: BagMetadata, file: Path) -> int | None:
-    """Messages that the metadata gives a file, by its name with or without `.zstd`."""
+    """The metadata's message count of a file, by its name with or without `.zstd`."""
     names = (file.name, file.name + ".zstd", file.name.removesuffix(".zstd"))
     return next((metadata.counts[name] for name in names if name in metadata.counts), None)
 
 
 def _logs_in(folder: Path) -> list[Path]:
-    """The logs that lie directly in a folder, in natural order of their names."""
+    """The logs directly in a folder, in natural order of their names."""
     try:
         names = [path for path in folder.iterdir() if not path.name.startswith(".")]
         files = [path for path in names if path.is_file() and path.stat().st_size]
@@ -245,13 +245,13 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     ]
 
 
-# What recorders name the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`.
+# Names of the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`.
 _PART = re.compile(r"(?P<stem>.*)_(?P<number>[0-9]{1,9})(?P<end>\.[A-Za-z0-9.]*)")
 _DATE = re.compile(r"[0-9]{4}(?:[-_][0-9]{2}){5}")
 
 
 def _is_split(logs: Sequence[Path]) -> bool:
-    """Whether files are the parts of one log, by their names and formats."""
+    """True if files are the parts of one log, by their names and formats."""
     found = [_PART.fullmatch(path.name) for path in logs]
     series = {(_DATE.sub("", each["stem"]), each["end"]) for each in found if each is not None}
     numbers = {int(each["number"]) for each in found if each is not None}

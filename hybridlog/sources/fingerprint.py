@@ -1,4 +1,4 @@
-"""Telling whether the content of a log has been seen before, without reading it all."""
+"""Fingerprints of logs, to recognize content without reading all of it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 WHOLE = 4 << 20
-"""Files up to this size are read whole, bytes."""
+"""Largest file that is read whole, bytes."""
 
 SAMPLES = 256
 SAMPLE_BYTES = 16 << 10
 
 
 def fingerprint(files: Sequence[Path]) -> str:
-    """Fingerprint of the content of files, in their order; their names do not matter.
+    """Compute the fingerprint of files in their order; their names do not matter.
 
-    It covers the size of each file and its whole content up to `WHOLE` bytes, beyond
-    that `SAMPLES` evenly spaced samples, the first at the start and the last at the end.
+    It covers the size of each file and its whole content up to `WHOLE` bytes. Larger files
+    are covered by `SAMPLES` evenly spaced samples, the first at the start and the last at
+    the end.
 
     Returns:
         32 hexadecimal digits.

@@ -1,4 +1,4 @@
-"""Several files of one log, read as one, and files that are compressed as a whole."""
+"""Reads several files of one log as one source, and whole-file compression."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Part:
 
     Attributes:
         path: The file.
-        message_count: Messages that something else says it has, None when nothing does.
-        packed: The file is a zstd file.
-        packed_messages: Each payload is a zstd frame of its own.
+        message_count: Number of messages by the log's metadata, None if unknown.
+        packed: Whether the file is compressed with zstd.
+        packed_messages: Whether each payload is a zstd frame.
     """
 
     path: Path
@@ -37,18 +37,18 @@ class Part:
 
 
 class JoinedSource(Source):
-    """Files of one log, one after the other; only one of them is open at a time.
+    """Files of one log, read one after the other; only one is open at a time.
 
-    Channels that are alike in all files become one channel. A file that cannot be read
-    is damage, unless none can.
+    Equal channels of all files become one channel. An unreadable file counts as damage,
+    unless all are unreadable.
 
     Args:
-        path: What was opened.
+        path: The opened path.
         kind: See `Source`; empty to take it from the files.
         profile: See `Source`; empty to take it from the files.
         parts: The files in order, at least one.
         opener: Opens one uncompressed file by its content.
-        damage: What is known to be wrong already (files that are missing).
+        damage: Damage known beforehand (missing files).
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class JoinedSource(Source):
         self._inner: Source | None = None
         self._kept: Source | None = None
         if len(self._parts) == 1:
-            # With one file, what is wrong with it should be said at once.
+            # With one file, its error is raised at once.
             self._kept = self._open(self._parts[0])
             self.profile = self._kept.profile or profile
             self.kind = kind or self._kept.kind
@@ -77,7 +77,7 @@ class JoinedSource(Source):
             self.time_range = self._kept.time_range
 
     def look(self) -> None:
-        """Asks each file that is not compressed what it says of itself, and adds it up."""
+        """Add up the statements of each uncompressed file about itself."""
         if self._kept is not None or any(part.packed for part in self._parts):
             return
         counts: list[int | None] = []
@@ -101,14 +101,14 @@ class JoinedSource(Source):
             self.time_range = (min(low for low, _ in ranges), max(high for _, high in ranges))
 
     def close(self) -> None:
-        """Closes the file that is open."""
+        """Close the open file."""
         for source in (self._inner, self._kept):
             if source is not None:
                 source.close()
         self._inner = self._kept = None
 
     def batches(self) -> Iterator[Batch]:
-        """Yields the messages of each file in turn."""
+        """Yield the messages of each file in turn."""
         done = failed = 0
         first: SourceError | None = None
         for part, size in zip(self._parts, self._sizes(), strict=True):
@@ -157,7 +157,7 @@ class JoinedSource(Source):
         return inner
 
     def _read(self, part: Part, inner: Source, done: int, size: int) -> Iterator[Batch]:
-        """Yields the messages of one open file, over the channels of this source."""
+        """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
         got = 0
         found_before = len(self.damage)
@@ -187,7 +187,7 @@ class JoinedSource(Source):
         self._check_count(part, got, found_before)
 
     def _check_count(self, part: Part, got: int, found_before: int) -> None:
-        """Compares with the number of messages that the log's metadata gives the file."""
+        """Compare with the file's message count in the metadata."""
         found = self.damage[found_before:]
         if part.message_count is None or got >= part.message_count:
             return
@@ -205,7 +205,7 @@ class JoinedSource(Source):
         inner.extras.clear()
 
     def _number(self, channel: Channel) -> int:
-        """Number of a channel in this source."""
+        """Index of a channel in this source."""
         schema = channel.schema
         key = (
             channel.topic,
@@ -221,7 +221,7 @@ class JoinedSource(Source):
         return number
 
     def _unpacked(self, part: Part, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """Unpacks payloads that are zstd frames; leaves out those that are damaged."""
+        """Unpack payloads that are zstd frames; omit damaged ones."""
         unpacker = zstandard.ZstdDecompressor()
         broken = plain = 0
         for batch in batches:
@@ -261,7 +261,7 @@ class JoinedSource(Source):
 
 
 def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes | None:
-    """The content of a zstd frame, None when it is damaged or too large."""
+    """The content of a zstd frame, None if it is damaged or too large."""
     try:
         size = zstandard.frame_content_size(payload)
         if size > MAX_CHUNK:

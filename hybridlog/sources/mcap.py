@@ -1,4 +1,4 @@
-"""Foreign MCAP files, of ROS 2 (rosbag2), ROS 1 or anything else."""
+"""Reads foreign MCAP files, from ROS 2 (rosbag2), ROS 1 or anything else."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ _IDS = 1 << 16
 
 @dataclass(slots=True)
 class _Open:
-    """Damage whose message count may still turn up behind it.
+    """Damage whose message count may still be found behind it.
 
     Attributes:
-        offset: Where it starts.
-        length: Bytes of it, None when not known.
-        reason: What is wrong.
-        chunk: A whole chunk is lost, so message indexes that follow tell what was in it.
+        offset: Byte where it starts.
+        length: Bytes of it, None if unknown.
+        reason: Description of the damage.
+        chunk: A whole chunk is lost, so the message indexes behind it list its messages.
         counted: Messages listed by the message indexes behind it, None before the first.
     """
 
@@ -69,16 +69,16 @@ class _Open:
 class McapSource(Source):
     """One MCAP file, read forward.
 
-    Definitions come from the data; the summary's stand in for those that were lost with
-    a damaged chunk. A channel id that is defined anew with other content is another
-    channel from there on. Messages on a channel whose schema is defined nowhere are
-    kept, without a schema, and the fact is noted in `damage`.
+    Definitions come from the data; those of the summary replace definitions lost with a
+    damaged chunk. A channel id that is redefined with other content is another channel from
+    there on. Messages on a channel with an undefined schema are read without a schema, and
+    `damage` notes it.
 
     Args:
         path: The file.
 
     Raises:
-        SourceError: It cannot be opened, or is no MCAP file.
+        SourceError: It cannot be opened, or is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +111,7 @@ class McapSource(Source):
                 "check that the file was copied whole"
             )
         summary = read_summary(self._file, self.size_bytes)
-        # With the summary at hand, this reads no more than the first record.
+        # With the summary known, this reads only the first record.
         first = next(scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=summary), None)
         if first is not None and isinstance(first[1], records.Header):
             self.profile = first[1].profile
@@ -126,14 +126,14 @@ class McapSource(Source):
         return summary
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._file.close()
 
     def batches(self) -> Iterator[Batch]:
-        """Yields all messages that can be read, once, in file order.
+        """Yield all readable messages once, in file order.
 
         Raises:
-            SourceError: The file cannot be read any more at all.
+            SourceError: The file cannot be read any more.
         """
         scanned = scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=self._summary)
         try:
@@ -164,11 +164,11 @@ class McapSource(Source):
             self._end(item)
 
     def _index(self, offset: int, item: records.MessageIndex) -> None:
-        """Message indexes count what is in a lost chunk, and betray one that is not seen."""
+        """Process a message index: count messages of a lost chunk, or find a missed one."""
         if self._pending is not None and self._pending.chunk:
             self._pending.counted = (self._pending.counted or 0) + len(item.records)
             return
-        # A chunk has one index a channel. Totals, where there are any, count better.
+        # A chunk has one index for each channel. Totals, if they exist, count better.
         foreign = self._indexed is None or item.channel_id in self._indexed
         if foreign and item.records and self.message_count is None:
             self._settle()
@@ -189,7 +189,7 @@ class McapSource(Source):
     def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
         reason = item.reason
         if item.opcode == Opcode.DATA_END and (self.damage or self._uncounted):
-            return  # the checksum of all data only repeats what is known
+            return  # the checksum of all data adds nothing to known damage
         if item.torn is not None:
             content = item.torn.content()
             before = self._given
@@ -207,7 +207,7 @@ class McapSource(Source):
     def _content(
         self, content: ChunkContent, offset: int, *, relative: bool = False
     ) -> Iterator[Batch]:
-        """The messages of one chunk or run, split where a definition changes."""
+        """Yield the messages of one chunk or run, split where a definition changes."""
         for damage in content.damage:
             self._note(offset, None, damage.reason, damage.messages)
         if len(content.invalid):
@@ -228,7 +228,7 @@ class McapSource(Source):
         yield from self._rows(content.batch, row, len(content.batch), offset)
 
     def _rows(self, batch: Batch, start: int, end: int, offset: int) -> Iterator[Batch]:
-        """Rows `[start, end)` in batches of bounded size, their channels looked up."""
+        """Yield rows `[start, end)` in batches of bounded size, with channels resolved."""
         rows = batch if (start, end) == (0, len(batch)) else batch.take(slice(start, end))
         for channel in np.flatnonzero(np.bincount(rows.channel)).tolist():
             reason = self._definitions.use(channel)
@@ -260,12 +260,12 @@ class McapSource(Source):
         self._lost += lost or 0
 
     def _settle(self) -> None:
-        """No message index follows any more: note the pending damage, or keep it for later."""
+        """Note pending damage, or defer it, since no message index follows."""
         pending, self._pending = self._pending, None
         if pending is None:
             return
         if pending.counted is None and self.message_count is not None:
-            self._uncounted.append(pending)  # the totals may tell, at the end
+            self._uncounted.append(pending)  # the totals at the end may show it
         else:
             self._note_open(pending, pending.counted)
 
@@ -297,7 +297,7 @@ class McapSource(Source):
 
 
 def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
-    """Rows in runs of at most `BATCH_MESSAGES`, closed once they hold `BATCH_BYTES`."""
+    """Runs of at most `BATCH_MESSAGES` rows, closed once they hold `BATCH_BYTES`."""
     count = len(length)
     total = np.cumsum(length)
     start, before = 0, 0
@@ -309,29 +309,29 @@ def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
 
 
 class _Definitions:
-    """Which channel each MCAP channel id stands for at the moment.
+    """The present meaning of each MCAP channel id.
 
     Attributes:
-        table: int32[65536], index in the source's channels by channel id, -1 when the id
-            is not defined or was not used yet.
+        table: int32[65536], index in the source's channels by channel id, -1 if the id is
+            undefined or unused.
     """
 
     def __init__(self, channels: list[Channel], summary: Summary | None) -> None:
         self.table = np.full(_IDS, _UNDEFINED, np.int32)
         self._channels = channels
-        # The summary repeats all definitions, also of chunks that cannot be read.
+        # The summary repeats all definitions, also those in unreadable chunks.
         self._schemas: dict[int, records.Schema] = dict(summary.schemas) if summary else {}
         self._records: dict[int, records.Channel] = dict(summary.channels) if summary else {}
         self._made: dict[int, list[tuple[records.Channel, records.Schema | None, int]]] = {}
         self._shared: dict[tuple[str, str, bytes], Schema] = {}
 
     def changes(self, record: records.Schema | records.Channel) -> bool:
-        """Whether this definition gives an id that has a meaning another one."""
+        """True if this definition changes the meaning of an id."""
         known = self._known(record)
         return known is not None and known != record
 
     def add(self, record: records.Schema | records.Channel) -> None:
-        """Let this definition hold from now on."""
+        """Apply this definition from now on."""
         if self._known(record) == record:
             return
         if isinstance(record, records.Channel):
@@ -351,10 +351,10 @@ class _Definitions:
         return self._records.get(record.id)
 
     def use(self, channel_id: int) -> str:
-        """Make sure that the table has this id, if it is defined.
+        """Enter this id into the table, if it is defined.
 
         Returns:
-            What is wrong with its definition, empty when nothing is or was said before.
+            The problem of its definition, empty if none or if it was reported before.
         """
         record = self._records.get(channel_id)
         if record is None or self.table[channel_id] != _UNDEFINED:

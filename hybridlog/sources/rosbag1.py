@@ -1,12 +1,11 @@
-"""ROS 1 bags (format 2.0), read from the top as they were written.
+"""Reads ROS 1 bags (format 2.0) from the start.
 
-The index at the end of a bag serves only to say what should be there. Messages are
-found by walking the records, so bags without an index (`.bag.active`), bags that were
-cut short and bags with damage in the middle give everything that can still be read.
+Messages are found by walking the records, so bags without an index (`.bag.active`),
+truncated bags and bags with damage in the middle yield everything that is readable. The
+index at the end only serves to count missing messages.
 
-After damage the reader looks for the next bytes that make a sound record. What was
-lost is counted with the index records that follow each chunk, or with the chunk list
-at the end of the bag.
+After damage the reader searches for the next valid record. Lost messages are counted with
+the index records behind each chunk, or with the chunk list at the end of the bag.
 """
 
 from __future__ import annotations
@@ -64,13 +63,13 @@ class _Record:
 
 @dataclass(frozen=True, slots=True)
 class _Space:
-    """Bytes that records lie in: the file, or a chunk that was unpacked.
+    """Bytes with records: the file, or an unpacked chunk.
 
     Attributes:
-        read: `read(pos, n)` gives up to n bytes.
+        read: `read(pos, n)` returns up to n bytes.
         size: Number of bytes.
-        packed: The bytes lie in a compressed chunk.
-        cut: The bytes are known to end too early.
+        packed: Whether the bytes come from a compressed chunk.
+        cut: Whether the bytes are known to end too early.
     """
 
     read: Callable[[int, int], bytes]
@@ -81,17 +80,17 @@ class _Space:
 
 @dataclass(slots=True)
 class _Place:
-    """A chunk with its index records, or what stands where one should be.
+    """A chunk with its index records, or the bytes in its place.
 
     Attributes:
         start: Byte in the file.
-        end: Byte after it, as far as it is known by now.
-        got: Messages that were read in it.
-        indexed: Messages that its index records list, None before the first one.
-        reasons: What is wrong with it.
-        broken: Messages may be missing from what was read of it.
-        torn_index: Some of its index records could not be read.
-        cut: The file ends in it.
+        end: Byte after it, as far as known.
+        got: Number of messages read in it.
+        indexed: Number of messages in its index records, None before the first one.
+        reasons: Descriptions of its damage.
+        broken: Whether messages may be missing.
+        torn_index: Whether some of its index records could not be read.
+        cut: Whether the file ends in it.
     """
 
     start: int
@@ -104,25 +103,25 @@ class _Place:
     cut: bool = False
 
     def blame(self, reason: str) -> None:
-        """Notes damage that may have cost messages."""
+        """Note damage that may have lost messages."""
         self.reasons.append(reason)
         self.broken = True
 
     @property
     def is_complete(self) -> bool:
-        """Its index records account for all its messages: what follows is another place."""
+        """True if its index records cover all its messages, so another place follows."""
         return self.indexed is not None and self.indexed >= self.got
 
 
 @dataclass(frozen=True, slots=True)
 class _Unpacked:
-    """What came out of a compressed chunk.
+    """The result of unpacking a compressed chunk.
 
     Attributes:
-        data: The bytes; a sound prefix when `state` is `short`, empty when `broken`.
-        used: Compressed bytes that belong to the stream.
-        state: `whole`, `short` (the stream goes on past its bytes) or `broken`.
-        reason: What is wrong with a broken one.
+        data: The bytes; an intact prefix if `state` is `short`, empty if `broken`.
+        used: Compressed bytes of the stream.
+        state: `whole`, `short` (the stream continues past its bytes) or `broken`.
+        reason: Description of the damage of a broken one.
     """
 
     data: bytes
@@ -137,7 +136,7 @@ class Rosbag1Source(Source):
     Each connection of the bag becomes a channel of its own.
 
     Raises:
-        SourceError: No such file, no bag of version 2.0, or an encrypted one.
+        SourceError: It does not exist, is not a bag of version 2.0, or is encrypted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -170,14 +169,14 @@ class Rosbag1Source(Source):
             raise
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._file.close()
 
     def batches(self) -> Iterator[Batch]:
-        """Yields all messages that can be read, in file order."""
+        """Yield all readable messages in file order."""
         return regroup(self._pieces())
 
-    # Opening: the bag header, and the index when there is one.
+    # Opening: the bag header, and the index if it exists.
 
     def _open(self) -> None:
         magic = self._read(0, len(MAGIC))
@@ -211,7 +210,7 @@ class Rosbag1Source(Source):
         self._read_index(conn_count, chunk_count, is_bare=self._index_pos == record.end)
 
     def _read_index(self, conn_count: int, chunk_count: int, *, is_bare: bool) -> None:
-        """Reads connections and chunk list; what it says counts only when it is whole."""
+        """Read connections and chunk list; the index counts only if it is complete."""
         chunks: list[tuple[int, int]] = []
         begins: list[int] = []
         ends: list[int] = []
@@ -234,21 +233,21 @@ class Rosbag1Source(Source):
             else:
                 return
             pos = record.end
-        # Cut between two of its records, the index looks whole but for their number.
+        # An index truncated between two records is recognized by their number only.
         self._index_is_short = connections < conn_count or len(chunks) < chunk_count
         if connections != conn_count or len(chunks) != chunk_count:
             return
         chunks.sort()
         self._chunk_positions = [place for place, _ in chunks]
         self._chunk_counts = [count for _, count in chunks]
-        # Messages of a bag without chunks are in no list.
+        # A bag without chunks has no list of messages.
         if chunks or is_bare:
             self.message_count = sum(self._chunk_counts)
         if chunks and self.message_count:
             self.time_range = (min(begins), max(ends) + 1)
 
     def _keep_definition(self, record: _Record) -> None:
-        """Remembers a connection of the index: its definition in a chunk may be lost."""
+        """Store a connection of the index: its definition in a chunk may be lost."""
         if record.end - record.start > MAX_CHUNK:
             return
         data = self._read(record.start, record.end - record.start)
@@ -263,11 +262,11 @@ class Rosbag1Source(Source):
         return self._file.read(count)
 
     def _record(self, pos: int) -> _Record | None:
-        """The sound record at a place of the file, see `_record_in`."""
+        """The valid record at a position of the file, see `_record_in`."""
         return _record_in(self._space, pos)
 
     def _pieces(self) -> Iterator[Batch]:
-        """Walks the file record by record, chunk by chunk."""
+        """Walk the file record by record and chunk by chunk."""
         try:
             while self._pos < self.size_bytes:
                 yield from self._step()
@@ -297,23 +296,23 @@ class Rosbag1Source(Source):
         self._report_undefined()
 
     def _step(self) -> Iterator[Batch]:
-        """Reads one record, chunk or run of loose messages at `_pos` and moves it on."""
+        """Read one record, chunk or run of loose messages at `_pos` and advance it."""
         pos = self._pos
         record = self._record(pos)
-        # After a record that is only skipped, its length may be what is wrong.
+        # The length of a record that was only skipped may be wrong.
         skipped, self._skipped = self._skipped, None
         if record is None:
             self._skip_damage(pos, skipped or pos + 1)
         elif record.header.op == OP_CHUNK:
             yield from self._chunk(pos, record)
         elif record.header.op in {OP_MESSAGE, OP_CONNECTION}:
-            # Also what follows an uncompressed chunk whose length field is too small.
+            # Also messages behind an uncompressed chunk whose length field is too small.
             yield from self._run(self._space, pos, None)
         else:
             self._skip_record(pos, record)
 
     def _skip_record(self, pos: int, record: _Record) -> None:
-        """Passes a record that holds no messages; counts those that an index lists."""
+        """Skip a record without messages; count those that an index record lists."""
         if record.end > self.size_bytes:
             self._skip_damage(pos, record.start)
             return
@@ -327,7 +326,7 @@ class Rosbag1Source(Source):
         self._pos = record.end
 
     def _skip_damage(self, pos: int, start: int) -> None:
-        """Nothing sound at `pos`: goes to the first place from `start` on that is."""
+        """Skip from damage at `pos` to the first valid record at or behind `start`."""
         place = self._place_at(pos)
         place.torn_index = place.start < pos
         place.broken |= place.indexed is None
@@ -342,7 +341,7 @@ class Rosbag1Source(Source):
         place.end = max(place.end, found)
 
     def _search(self, space: _Space, pos: int) -> int | None:
-        """First place from `pos` on that looks like a record."""
+        """First position at or behind `pos` that looks like a record."""
         while pos < space.size:
             data = space.read(pos, min(_SEARCH + _OVERLAP, space.size - pos))
             found = find_record(data, space.size - pos, partial(_is_sound, space, pos))
@@ -388,7 +387,7 @@ class Rosbag1Source(Source):
     def _plain_chunk(
         self, place: _Place, record: _Record, compression: bytes, size: int
     ) -> Iterator[Batch]:
-        """Reads a chunk without compression, or with one that is not known."""
+        """Read a chunk without compression, or with an unknown one."""
         if compression != b"none":
             name = compression.decode(errors="replace")
             first = self._record(record.start)
@@ -413,7 +412,7 @@ class Rosbag1Source(Source):
         yield from self._run(space, 0, len(data))
 
     def _unpack(self, record: _Record, compression: bytes, size: int) -> _Unpacked:
-        """Unpacks a chunk, reading on when its record says too few bytes."""
+        """Unpack a chunk; read further if its record states too few bytes."""
         length = min(record.end, self.size_bytes) - record.start
         if length > MAX_CHUNK:
             return _Unpacked(b"", length, "broken", "the chunk is too large to be one")
@@ -421,7 +420,7 @@ class Rosbag1Source(Source):
         unpacked = unpack(self._read(record.start, length), size)
         rest = self.size_bytes - record.end
         if unpacked.state == "short" and rest > 0:
-            # Index records follow in a sound bag, so a little more is enough to see.
+            # In a valid bag index records follow, so a little more is enough.
             more = min(length + max(length, 1 << 20), self.size_bytes - record.start)
             unpacked = unpack(self._read(record.start, more), size)
             if unpacked.state == "short":
@@ -430,7 +429,7 @@ class Rosbag1Source(Source):
         return unpacked
 
     def _after_broken_chunk(self, record: _Record) -> None:
-        """Goes on after a chunk that gave nothing, believing its length only if it fits."""
+        """Continue after an unreadable chunk; trust its length only if a record follows."""
         place = self._place_at(record.start)
         if record.end == self.size_bytes or (
             record.end < self.size_bytes and self._record(record.end) is not None
@@ -444,12 +443,12 @@ class Rosbag1Source(Source):
     # Runs of messages.
 
     def _run(self, space: _Space, pos: int, soft_end: int | None) -> Iterator[Batch]:
-        """Reads message and connection records from `pos` on until another kind comes.
+        """Read message and connection records from `pos` on, up to another kind.
 
         Args:
-            space: Where they lie. In the file, `_pos` is moved to where the run ended.
+            space: The bytes. In the file, `_pos` moves to the end of the run.
             pos: First byte.
-            soft_end: Where the run should end; nothing is read past it in vain.
+            soft_end: Expected end of the run, which limits reading ahead.
         """
         need = 0
         while pos < space.size and (soft_end is None or pos < soft_end):
@@ -475,11 +474,11 @@ class Rosbag1Source(Source):
     def _after_run(
         self, space: _Space, run: Run, pos: int, soft_end: int | None
     ) -> tuple[int | None, int]:
-        """Decides where to go on after a run that started at `pos`.
+        """Find the position to continue at after a run that started at `pos`.
 
         Returns:
-            The next place (None: the run is over where it stopped), and how many bytes
-            to read there at least.
+            The next position (None: the run ends where it stopped), and the least number of
+            bytes to read there.
         """
         end = pos + run.end
         if run.why is Stop.END:
@@ -501,20 +500,20 @@ class Rosbag1Source(Source):
         return self._resume(space, run, pos), 0
 
     def _need(self, space: _Space, run: Run, end: int, soft_end: int | None) -> int:
-        """Bytes to read for the incomplete record at `end`, 0 when it cannot be whole."""
+        """Bytes to read for the incomplete record at `end`, 0 if it cannot be complete."""
         if end + run.need > space.size or run.need > MAX_CHUNK:
             return 0
         if soft_end is None or end + run.need <= soft_end:
             return run.need
-        # It crosses the end of its chunk. Either the chunk's length is wrong or its own:
-        # that one is right after which another record stands.
+        # It crosses the end of its chunk: the chunk's length or its own is wrong. The right
+        # one is followed by another record.
         record = self._record(end)
         if record is None or record.end - end > MAX_CHUNK or not _is_sound(space, 0, record.end):
             return 0
         return record.end - end
 
     def _cut_in_file(self, space: _Space, end: int) -> int:
-        """A record reaches past the end of the file: cut, or its length is wrong."""
+        """Handle a record past the end of the file: truncated, or with a wrong length."""
         found = self._search(space, end + 8)
         if found is not None:
             self._trouble(space, end, "a record whose length is wrong")
@@ -527,7 +526,7 @@ class Rosbag1Source(Source):
         return space.size
 
     def _resume(self, space: _Space, run: Run, pos: int) -> int:
-        """Where records go on after bad bytes; drops the last message if it reaches there."""
+        """Position of the next record after bad bytes; drops a last message that reaches it."""
         end = pos + run.end
         found = self._search(space, end + 1 if run.last is None else pos + run.last)
         if found is None:
@@ -540,21 +539,21 @@ class Rosbag1Source(Source):
         return found
 
     def _trouble(self, space: _Space, pos: int, reason: str) -> None:
-        """Notes that something in the current place is wrong."""
+        """Note damage in the current place."""
         place = self._place_at(pos) if not space.packed else self._place
         assert place is not None
         where = f"at byte {pos}" + (" of the unpacked chunk" if space.packed else "")
         place.blame(f"{reason} {where}")
 
     def _batch(self, space: _Space, data: bytes, run: Run, pos: int) -> Batch:
-        """Gives the messages of a run their channels; counts those that have none."""
+        """Assign channels to the messages of a run; count those without one."""
         channel = np.full(len(run.offset), -1, np.int32)
         done = 0
         for before, header, span in run.connections:
             conn = header.u32(data, b"conn")
             number = self._define(conn, data, header, span)
             if self._channel_of.get(conn, number) != number:
-                # The id now means something else: what came before keeps the old meaning.
+                # The id now has another meaning; earlier messages keep the old one.
                 channel[done:before] = self._channels(run.connection[done:before])
                 done = before
             self._channel_of[conn] = number
@@ -579,7 +578,7 @@ class Rosbag1Source(Source):
     def _channels(
         self, connection: np.ndarray[tuple[int], np.dtype[np.int64]]
     ) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
-        """Channel numbers of connection ids, -1 for ids without a definition."""
+        """Channel indexes of connection ids, -1 for undefined ids."""
         ids, where = np.unique(connection, return_inverse=True)
         numbers = np.empty(len(ids), np.int32)
         for row, conn in enumerate(ids.tolist()):
@@ -589,7 +588,7 @@ class Rosbag1Source(Source):
         return numbers[where]
 
     def _define(self, conn: int, data: bytes, header: Header, span: tuple[int, int]) -> int:
-        """Channel number of a connection record; the same record twice is one channel."""
+        """Channel index of a connection record; equal records share a channel."""
         topic = header.raw(data, b"topic").decode(errors="replace")
         fields = parse_fields(data, *span) or {}
         values = {
@@ -608,10 +607,10 @@ class Rosbag1Source(Source):
             self.channels.append(Channel(topic, "ros1", schema, metadata, has_publish_time=False))
         return number
 
-    # What was lost.
+    # Losses.
 
     def _place_at(self, pos: int, *, has_index: bool = False) -> _Place:
-        """The place that `pos` belongs to: the current one unless that is complete."""
+        """The place of `pos`: the current one unless that is complete."""
         place = self._place
         if place is None or (not has_index and place.is_complete):
             self._finish_place()
@@ -619,7 +618,7 @@ class Rosbag1Source(Source):
         return place
 
     def _finish_place(self) -> None:
-        """Reports what the current place lacks."""
+        """Report the losses of the current place."""
         place, self._place = self._place, None
         if place is None:
             return
@@ -634,12 +633,12 @@ class Rosbag1Source(Source):
         if lost is None and not place.broken:
             lost = 0
         if place.cut and not 0 < self._index_pos <= self.size_bytes:
-            # Nobody knows what stood after the end.
+            # The content behind the end is unknown.
             lost = None
         self._report(place.start, max(place.end - place.start, 0), "; ".join(place.reasons), lost)
 
     def _listed(self, place: _Place) -> int | None:
-        """Messages that the chunk list at the end of the bag has in a place."""
+        """Number of messages in a place by the chunk list at the end of the bag."""
         if not self._chunk_positions:
             return None
         first = bisect_left(self._chunk_positions, place.start)
@@ -650,7 +649,7 @@ class Rosbag1Source(Source):
         self.damage.append(Damage(self.path, offset, length, reason, lost))
 
     def _report_undefined(self) -> None:
-        """Reports messages of connections that the bag does not define."""
+        """Report messages of undefined connections."""
         if not self._undefined:
             return
         ids = sorted(self._undefined)
@@ -664,7 +663,7 @@ class Rosbag1Source(Source):
 
 
 def _record_in(space: _Space, pos: int) -> _Record | None:
-    """The record at a place, None when there is no sound one.
+    """The record at a position, None without a valid one.
 
     The end of its data may lie past the end of the space.
     """
@@ -682,7 +681,7 @@ def _record_in(space: _Space, pos: int) -> _Record | None:
 
 
 def _is_sound(space: _Space, base: int, pos: int) -> bool:
-    """Whether a record starts at `base + pos`, or the space ends there."""
+    """True if a record starts at `base + pos`, or the space ends there."""
     return base + pos == space.size or _record_in(space, base + pos) is not None
 
 
@@ -717,7 +716,7 @@ class _Decompressor(Protocol):
 def _unpack_with(
     make: Callable[[], _Decompressor], data: bytes, magic: bytes, size: int
 ) -> _Unpacked:
-    """Unpacks the streams at the start of `data`, at most `MAX_CHUNK` bytes."""
+    """Unpack the streams at the start of `data`, at most `MAX_CHUNK` bytes."""
     parts: list[bytes] = []
     total = 0
     rest = data

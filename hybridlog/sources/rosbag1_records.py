@@ -1,14 +1,14 @@
-"""The records of the ROS bag format 2.0, as bytes: headers, and whole runs of messages.
+"""Parses records of the ROS bag format 2.0: headers, and runs of messages.
 
 A record is `u32 header length, header, u32 data length, data`; a header is a list of
-`u32 length, name=value`. Message records have headers that differ only in two values,
-so a run of them is read by columns: one pass finds where each record starts, then
-numpy checks all headers against a template and gathers the values. Whatever does not
-look like the template takes the general way, one header at a time. Where messages are
-small that one pass is numpy's too: it looks for the length of the template's headers and
-one byte of theirs, and believes those places only where each record ends at the next one.
+`u32 length, name=value`. Headers of message records differ in two values only, so a run of
+them is read by columns: one pass finds the start of each record, then numpy checks all
+headers against a template and gathers the values. Other headers are parsed one at a time.
+For small messages numpy makes the first pass, too: it searches for the template's header
+length and one byte of the template, and accepts positions only if each record ends at the
+next one.
 
-Nothing here trusts a size: a run stops at the first record that does not fit.
+Sizes are not trusted: a run stops at the first record that does not fit.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ OP_CHUNK_INFO: Final = 6
 OP_CONNECTION: Final = 7
 
 MAX_HEADER = 1 << 20
-"""Longest record header that is believed, bytes."""
+"""Longest valid record header, bytes."""
 
 _OP_FIELD = b"\x04\x00\x00\x00op="
 _LOOK_BACK = 320
 _TEMPLATE_HEADER = 512
 _TEMPLATES = 16
-_LEAST_HEADER = 8  # of the field `op` alone
-_MANY = 100  # records in a run, from which on the next one is looked through by columns,
-_SMALL = 4096  # if they have no more bytes than this each, in the mean
-_SAMPLE = 1 << 16  # bytes that tell which values are rare
-_MOST_HITS = 1 / 16  # places that may be a header's, of all: with more, columns cost too much
+_LEAST_HEADER = 8  # bytes of a header with the field `op` only
+_MANY = 100  # records in a run from which the next run is searched by columns,
+_SMALL = 4096  # if their mean size is at most this
+_SAMPLE = 1 << 16  # bytes sampled to find rare values
+_MOST_HITS = 1 / 16  # share of candidate positions above which columns cost too much
 
-# What a header of each kind must hold to be believed: name and length of the value
-# (None: any length).
+# Required fields of a header of each kind: name and length of the value (None: any
+# length).
 _REQUIRED: dict[int, tuple[tuple[bytes, int | None], ...]] = {
     OP_MESSAGE: ((b"conn", 4), (b"time", 8)),
     OP_BAG_HEADER: ((b"index_pos", 8),),
@@ -63,42 +63,42 @@ _u64 = struct.Struct("<Q").unpack_from
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """A record header that was believed.
+    """A valid record header.
 
     Attributes:
         op: Kind of record.
-        fields: Where each value lies in the bytes it was read from, `[start, end)`.
+        fields: Position of each value in the parsed bytes, `[start, end)`.
     """
 
     op: int
     fields: dict[bytes, tuple[int, int]]
 
     def u32(self, data: bytes, name: bytes, default: int = 0) -> int:
-        """A value as uint32, `default` when it is missing or of another length."""
+        """A value as uint32, `default` if it is missing or of another length."""
         start, end = self.fields.get(name, (0, 0))
         return int(_u32(data, start)[0]) if end - start == 4 else default
 
     def u64(self, data: bytes, name: bytes, default: int = 0) -> int:
-        """A value as uint64, `default` when it is missing or of another length."""
+        """A value as uint64, `default` if it is missing or of another length."""
         start, end = self.fields.get(name, (0, 0))
         return int(_u64(data, start)[0]) if end - start == 8 else default
 
     def time(self, data: bytes, name: bytes) -> int:
-        """A value as a time in ns, 0 when it is missing or of another length."""
+        """A value as a time in ns, 0 if it is missing or of another length."""
         packed = self.u64(data, name)
         return (packed & 0xFFFFFFFF) * 1_000_000_000 + (packed >> 32)
 
     def raw(self, data: bytes, name: bytes) -> bytes:
-        """A value as it stands, empty when it is missing."""
+        """A value as bytes, empty if it is missing."""
         start, end = self.fields.get(name, (0, 0))
         return data[start:end]
 
 
 def parse_fields(data: bytes, pos: int, end: int) -> dict[bytes, tuple[int, int]] | None:
-    """Splits `data[pos:end]` into its `name=value` fields; a later one wins.
+    """Split `data[pos:end]` into its `name=value` fields; the last of a name counts.
 
     Returns:
-        Where each value lies in `data`, or None when the bytes are no list of fields.
+        Position of each value in `data`, or None if the bytes are not a list of fields.
     """
     fields: dict[bytes, tuple[int, int]] = {}
     while pos < end:
@@ -116,11 +116,11 @@ def parse_fields(data: bytes, pos: int, end: int) -> dict[bytes, tuple[int, int]
 
 
 def parse_header(data: bytes, pos: int, end: int) -> Header | None:
-    """Reads the record header `data[pos:end]`.
+    """Parse the record header `data[pos:end]`.
 
     Returns:
-        The header, or None when it lacks what a record of its kind must have. Kinds
-        that the format does not know are returned, so that they can be skipped.
+        The header, or None if it lacks a required field. Unknown kinds are returned, so
+        that they can be skipped.
     """
     fields = parse_fields(data, pos, end)
     if not fields:
@@ -137,21 +137,21 @@ def parse_header(data: bytes, pos: int, end: int) -> Header | None:
 
 
 class Stop(Enum):
-    """Why a run of records ended."""
+    """Reason for the end of a run of records."""
 
     END = "end"
     """All bytes were used."""
     CUT = "cut"
     """The next record needs more bytes than there are."""
     FOREIGN = "foreign"
-    """The next record is sound and is neither a message nor a connection."""
+    """The next record is valid, but neither a message nor a connection."""
     BAD = "bad"
-    """The next bytes are no record."""
+    """The next bytes are not a record."""
 
 
 @dataclass(slots=True)
 class Run:
-    """Message and connection records found in a row. n is the number of messages.
+    """A run of n message records, and connection records between them.
 
     Attributes:
         offset: int64[n], start of each payload.
@@ -160,10 +160,10 @@ class Run:
         log_time: int64[n], ns.
         connections: Connection records: number of messages before it, its header, and
             `[start, end)` of its data.
-        why: Why the run ended.
-        end: Where it ended: the start of the record that is not part of it.
-        need: When `why` is CUT, bytes that the next record takes as far as is known.
-        last: Start of the data of the last record when that is a message, else None.
+        why: Reason for the end of the run.
+        end: End of the run: the start of the next record.
+        need: If `why` is CUT, bytes of the next record as far as known.
+        last: Start of the data of the last record if that is a message, else None.
     """
 
     offset: NDArray[np.int64]
@@ -177,7 +177,7 @@ class Run:
     last: int | None
 
     def without_last(self) -> None:
-        """Drops the last message, whose length turned out to be wrong."""
+        """The run without its last message, whose length is wrong."""
         self.offset = self.offset[:-1]
         self.length = self.length[:-1]
         self.connection = self.connection[:-1]
@@ -185,10 +185,10 @@ class Run:
 
 
 class _Template:
-    """The bytes that all message headers of one writer share."""
+    """The bytes shared by all message headers of one writer."""
 
     def __init__(self, raw: bytes, conn: int, time: int) -> None:
-        """Takes a sound message header and where its two values start in it."""
+        """Make a template of a valid message header and the positions of its two values."""
         self.size = len(raw)
         fixed = np.ones(self.size, np.bool_)
         fixed[conn : conn + 4] = False
@@ -208,7 +208,7 @@ class _Template:
     def read(
         self, data: NDArray[np.uint8], starts: NDArray[np.int64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-        """Reads headers of this template's size at `starts`: fits, connection, log time."""
+        """Read headers of this template's size at `starts`: match, connection, log time."""
         headers = sliding_window_view(data, self.size)[starts]
         fits = (headers[:, self._columns] == self._bytes).all(axis=1)
         values = headers.view(self._values)[:, 0]
@@ -220,35 +220,35 @@ class _Template:
         )
 
     def find(self, data: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Every place where a record with such a header may start, ascending.
+        """Every position where a record with such a header may start, ascending.
 
-        Between them there may be others, and a payload may hold what looks like a header.
+        Other records may lie between them, and a payload may look like a header.
         """
-        count = len(data) - self.size - 7  # the lengths of header and data must be there, too
+        count = len(data) - self.size - 7  # the lengths of header and data must fit, too
         if count <= 0:
             return np.empty(0, np.int64)
         if self._rare is None:
-            # Of all bytes that must be there the one that is seen least leaves least to look at.
+            # The rarest of the template's bytes leaves the fewest candidates.
             seen = np.bincount(data[:_SAMPLE], minlength=256)
             self._rare = int(seen[self._bytes].argmin())
         at = 4 + int(self._columns[self._rare])
         places = np.flatnonzero(data[at : at + count] == self._bytes[self._rare])
         if len(places) > _MOST_HITS * len(data):
             return np.empty(0, np.int64)
-        # The rest of each header is looked at once, when it is known where records start.
+        # The rest of each header is checked once, when the starts of records are known.
         found: NDArray[np.int64] = places[_u32_at(data, places) == self.size]
         return found
 
 
 class RunReader:
-    """Reads runs of message records, and remembers what their headers look like."""
+    """Reads runs of message records, and learns the template of their headers."""
 
     def __init__(self) -> None:
         self._templates: list[_Template] = []
         self._usual: _Template | None = None
 
     def read(self, data: bytes) -> Run:
-        """Reads the message and connection records at the start of `data`."""
+        """Read the message and connection records at the start of `data`."""
         raw = np.frombuffer(data, np.uint8)
         found = None if self._usual is None else self._usual.find(raw)
         head, body, end, need = _walk(data) if found is None else _follow(data, raw, found)
@@ -317,17 +317,17 @@ class RunReader:
 
 
 _Records = tuple["NDArray[np.int64]", "NDArray[np.int64]", int, int]
-"""Starts of the records, starts of their data lengths, where the first record that does
-not fit starts, and how many bytes that one needs."""
+"""Starts of the records, starts of their data lengths, start of the first record that does
+not fit, and the bytes that it needs."""
 
 
 def _walk(data: bytes, pos: int = 0, most: int | None = None) -> _Records:
-    """Finds records by their lengths alone.
+    """Find records by their lengths only.
 
     Args:
-        data: Where they lie, one after the other.
-        pos: Where the first one starts.
-        most: Most records; None for all. With so many, the place of the next is given.
+        data: The consecutive records.
+        pos: Start of the first one.
+        most: Most records; None for all. At this number the position of the next is returned.
     """
     u32 = _u32
     heads: list[int] = []
@@ -340,7 +340,7 @@ def _walk(data: bytes, pos: int = 0, most: int | None = None) -> _Records:
             break
         body = pos + 4 + u32(data, pos)[0]
         if body - pos - 4 < _LEAST_HEADER:
-            break  # else zeros would be a record every eight bytes
+            break  # otherwise zeros would be a record every eight bytes
         if body + 4 > size:
             need = body + 4 - pos
             break
@@ -355,18 +355,18 @@ def _walk(data: bytes, pos: int = 0, most: int | None = None) -> _Records:
 
 
 def _follow(data: bytes, raw: NDArray[np.uint8], head: NDArray[np.int64]) -> _Records:
-    """Finds what `_walk` finds, from one to the next of places where records may start.
+    """Find records like `_walk`, by following candidate positions.
 
     Args:
-        data: Where they lie, one after the other.
-        raw: The same.
-        head: Such places, ascending; a header and the length of the data are there.
+        data: The consecutive records.
+        raw: The same bytes.
+        head: Candidate positions, ascending; a header and the data length fit at each.
     """
     body = head + 4 + _u32_at(raw, head)
     after = body + 4 + _u32_at(raw, body)
     whole = after <= len(raw)
     head, body, after = head[whole], body[whole], after[whole]
-    # Each of these is the last of some of which one ends where the next starts.
+    # Each of these is the last of a chain of records that end where the next starts.
     lasts = np.append(np.flatnonzero(after[:-1] != head[1:]), len(head) - 1)
     heads, bodies = [], []
     pos, need, most = 0, 0, 1
@@ -377,8 +377,8 @@ def _follow(data: bytes, raw: NDArray[np.uint8], head: NDArray[np.int64]) -> _Re
             heads.append(head[first:stop])
             bodies.append(body[first:stop])
             pos = int(after[stop - 1])
-        # What lies between is walked over, in ever longer walks: to find the way back costs
-        # as much as some records.
+        # Gaps are walked, in ever longer walks, since returning to columns costs as much as
+        # some records.
         more, more_bodies, pos, need = _walk(data, pos, most)
         heads.append(more)
         bodies.append(more_bodies)
@@ -388,13 +388,13 @@ def _follow(data: bytes, raw: NDArray[np.uint8], head: NDArray[np.int64]) -> _Re
 
 
 def _u32_at(data: NDArray[np.uint8], places: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The number at each of some places."""
+    """The number at each position."""
     found = sliding_window_view(data, 4)[places]
     return found.view("<u4")[:, 0].astype(np.int64)
 
 
 def _why_cut(data: bytes, pos: int) -> Stop:
-    """Judges the incomplete record at `pos` by as much of its header as there is."""
+    """Classify the incomplete record at `pos` by the available part of its header."""
     if pos + 4 > len(data):
         return Stop.CUT
     body = pos + 4 + _u32(data, pos)[0]
@@ -415,7 +415,7 @@ def _apply(
     todo: NDArray[np.intp],
     into: tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]],
 ) -> NDArray[np.intp]:
-    """Reads the headers in rows `todo` that fit the template; returns the other rows."""
+    """Read the headers in rows `todo` that match the template; return the other rows."""
     head, body = where
     rows = todo[body[todo] - head[todo] - 4 == template.size]
     if not len(rows):
@@ -430,25 +430,25 @@ def _apply(
 
 
 def find_record(data: bytes, limit: int, sound_at: Callable[[int], bool]) -> int | None:
-    """Looks for the next place that looks like a record, after damage.
+    """Find the next position that looks like a record, after damage.
 
-    A message is believed only when another record follows it. Pieces of messages stand
-    in compressed chunks too, but nothing sound stands after those.
+    A message counts only if another record follows it. Compressed chunks contain pieces of
+    messages, too, but no valid record follows those.
 
     Args:
         data: Bytes to search.
-        limit: Length of the whole space that `data` is the start of: a record that
-            goes past it is not believed, unless it is a chunk.
-        sound_at: Whether a record, or the end of the space, is at a place past `data`'s
-            start.
+        limit: Length of the whole space that starts with `data`: a record that exceeds it
+            is invalid, unless it is a chunk.
+        sound_at: Returns whether a record, or the end of the space, is at a position
+            relative to the start of `data`.
 
     Returns:
-        Where the record starts in `data`, or None.
+        Start of the record in `data`, or None.
     """
     hit = data.find(_OP_FIELD)
     while hit >= 0:
         low = max(0, hit - _LOOK_BACK)
-        # The header's length stands before its first field and must reach past the op.
+        # The header's length precedes its first field and must reach past the op.
         window = np.frombuffer(data, np.uint8, hit - low, low)
         if len(window) >= 4:
             lengths = sliding_window_view(window, 4).copy().view("<u4")[:, 0]
@@ -470,7 +470,7 @@ def _believable(
     header = parse_header(data, place + 4, body)
     if header is None or header.op not in _REQUIRED:
         return False
-    # A chunk may have been cut short; all other records are small enough to be whole.
+    # A chunk may be truncated; all other records are small enough to be complete.
     end = body + 4 + int(_u32(data, body)[0])
     if header.op == OP_CHUNK:
         return True

@@ -1,4 +1,4 @@
-"""ROS 2 bags that are directories: `metadata.yaml` and the files it lists."""
+"""ROS 2 bag directories: `metadata.yaml` and the files it lists."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def read_metadata(folder: Path) -> BagMetadata | Damage | None:
-    """Reads the metadata of the bag in a folder.
+    """Read the metadata of the bag in a folder.
 
     Returns:
-        What it says, the damage when it cannot be read, None when there is none.
+        The metadata, the damage if it cannot be read, or None without metadata.
     """
     path = folder / NAME
     try:
@@ -34,19 +34,19 @@ def read_metadata(folder: Path) -> BagMetadata | Damage | None:
 
 
 def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage]]:
-    """Finds the files that the metadata lists.
+    """Find the files that the metadata lists.
 
     Returns:
-        The files that are there, in order, and the damage for those that are not.
+        The existing files, in order, and the damage for missing ones.
 
     Raises:
-        SourceError: None of them is there.
+        SourceError: None of them exists.
     """
     files: list[Path] = []
     missing: list[Damage] = []
     for name in metadata.files:
         path = folder / name
-        # Recorders have listed compressed files under their name before compression.
+        # Some recorders list compressed files under their name before compression.
         choices = (path, path.with_name(path.name + ".zstd"), path.with_suffix(""))
         try:
             found = next((choice for choice in choices if choice.is_file()), None)

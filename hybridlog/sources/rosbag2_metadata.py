@@ -1,7 +1,7 @@
-"""`metadata.yaml` of ROS 2 bags: what the recorder says about the files beside it.
+"""Parses `metadata.yaml` of ROS 2 bags, the recorder's description of its files.
 
-Versions 1 to 9 are read alike: every key is optional, and what has the wrong type
-counts as missing. Nothing in it is believed where the files themselves can tell.
+Versions 1 to 9 are parsed alike: every key is optional, and a value of the wrong type
+counts as missing. The files themselves take precedence over it.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ _NO_FILES = {"", ".", ".."}
 
 @dataclass(frozen=True, slots=True)
 class BagMetadata:
-    """What is used of a bag's metadata.
+    """The used part of a bag's metadata.
 
     Attributes:
         files: Names of its files in order, without folders.
-        counts: Messages of each file, where the metadata says it.
-        message_count: Messages in all, None when unknown.
-        time_range: Log time `[start, end)`, ns, None when unknown.
-        packed_messages: Each payload is a zstd frame of its own.
-        ros_distro: Name of the ROS release, empty when unknown.
+        counts: Number of messages of each file, if stated.
+        message_count: Total number of messages, None if unknown.
+        time_range: Log time `[start, end)`, ns, None if unknown.
+        packed_messages: Whether each payload is a zstd frame.
+        ros_distro: Name of the ROS release, empty if unknown.
     """
 
     files: list[str] = field(default_factory=list)
@@ -39,12 +39,12 @@ class BagMetadata:
 
 
 def parse_metadata(text: str) -> BagMetadata | None:
-    """Reads the metadata of a bag.
+    """Parse the metadata of a bag.
 
     Returns:
-        What it says, or None when it is no YAML or not that of a bag.
+        The metadata, or None if it is not YAML or not that of a bag.
     """
-    # Hostile YAML may nest deeply; the safe loader makes nothing but plain values.
+    # Hostile YAML may nest deeply; the safe loader makes plain values only.
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -55,7 +55,7 @@ def parse_metadata(text: str) -> BagMetadata | None:
     except (YAMLError, ValueError, TypeError, RecursionError, OverflowError):
         return None
     bag = _mapping(root)
-    # The copy inside a database has no outer key.
+    # The copy in a database has no outer key.
     bag = bag if "storage_identifier" in bag else _mapping(bag.get("rosbag2_bagfile_information"))
     if not bag:
         return None
@@ -105,5 +105,5 @@ def _count(value: object) -> int | None:
 
 
 def _name(path: str) -> str:
-    """The last part of a path; early versions wrote the folder's name before it."""
+    """The last part of a path; early versions included the folder's name."""
     return PureWindowsPath(path).name

@@ -1,7 +1,7 @@
-"""One `.db3` file of a ROS 2 bag.
+"""Reads a `.db3` file of a ROS 2 bag.
 
-SQLite reads it; this module asks in the order of row ids and, where the database is
-damaged, goes on behind the damage.
+Rows are queried in the order of row ids. In a damaged database, reading continues behind
+the damage.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"SQLite format 3\x00"
 
-# Without an index on time, counting reads the whole file: only small ones are counted.
+# Without an index on time, counting reads the whole file, so only small ones are counted.
 _COUNT_BYTES = 64 << 20
 
 _MIN_ROWID = -(2**63)
@@ -45,7 +45,7 @@ _MAX_ROWID = 2**63 - 1
 
 
 class _Row(NamedTuple):
-    """Message as it comes out of the database."""
+    """A message as read from the database."""
 
     rowid: int
     topic: int
@@ -58,7 +58,7 @@ class SqliteSource(Source):
     """A `.db3` file of rosbag2.
 
     Raises:
-        SourceError: No such file, no ROS 2 bag, or a database that gives nothing.
+        SourceError: It does not exist, is not a ROS 2 bag, or has no readable messages.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,7 +87,7 @@ class SqliteSource(Source):
             raise
 
     def close(self) -> None:
-        """Closes the database."""
+        """Close the database."""
         self._db.close()
 
     # Opening.
@@ -105,7 +105,7 @@ class SqliteSource(Source):
         if log_time is None:
             raise SourceError(f"{self.path}: its messages have no time; record it again")
         has_publish_time = "send_timestamp" in messages
-        # Types in SQLite are those of each value, so all are forced; names come from here.
+        # SQLite has types for each value only, so all are cast; names come from here.
         sent = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
         columns = (
             "rowid",
@@ -123,12 +123,12 @@ class SqliteSource(Source):
         self._read_totals(tables, log_time)
 
     def _tables(self) -> set[str]:
-        """Names of real tables: a view may cost anything to read."""
+        """Names of real tables, without views, whose cost is unlimited."""
         query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%'"
         try:
             rows = self._db.execute(query).fetchall()
         except sqlite3.DatabaseError:
-            # A file that is shorter than its header says is refused unless this is set.
+            # Without this, SQLite refuses a file shorter than its header states.
             self._db.execute("PRAGMA writable_schema = ON")
             rows = self._db.execute(query).fetchall()
         return {name for (name,) in rows}
@@ -137,7 +137,7 @@ class SqliteSource(Source):
         return {row[1] for row in self._db.execute(f"PRAGMA table_info({table})")}
 
     def _read_metadata(self, tables: set[str]) -> str:
-        """Reads the bag's own metadata where it has some; returns the ROS release."""
+        """Read the bag's own metadata if it exists; return the ROS release."""
         distro = ""
         if "metadata" in tables:
             query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
@@ -165,7 +165,7 @@ class SqliteSource(Source):
             name if name in columns else "''"
             for name in ("serialization_format", "offered_qos_profiles", "type_description_hash")
         ]
-        # Without an id, no message can be of the topic.
+        # Without an id, a topic has no messages.
         query = (
             f"SELECT CAST(id AS INTEGER), name, type, {', '.join(optional)} FROM topics "  # noqa: S608
             "WHERE id IS NOT NULL ORDER BY id"
@@ -203,7 +203,7 @@ class SqliteSource(Source):
         if not rows:
             return
         self.message_count = int(rows[0][0])
-        # Two questions: SQLite answers each from the end of the index.
+        # Two queries: SQLite answers each from one end of the index.
         first = self._optional(f"SELECT min({log_time}) FROM messages")  # noqa: S608
         last = self._optional(f"SELECT max({log_time}) FROM messages")  # noqa: S608
         if first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int):
@@ -213,7 +213,7 @@ class SqliteSource(Source):
         return [row[1] for row in self._optional("PRAGMA index_list(messages)")]
 
     def _optional(self, query: str, *values: str) -> list[tuple[Any, ...]]:
-        """Rows of a question whose answer is not needed: none when it fails."""
+        """Rows of an optional query; empty if it fails."""
         try:
             return self._db.execute(query, values).fetchall()
         except (sqlite3.Error, OverflowError):
@@ -222,7 +222,7 @@ class SqliteSource(Source):
     # Reading.
 
     def batches(self) -> Iterator[Batch]:
-        """Yields all messages that SQLite gives, in the order of their row ids."""
+        """Yield all messages that SQLite returns, in the order of row ids."""
         start = _MIN_ROWID
         regions = 0
         while start <= _MAX_ROWID:
@@ -245,7 +245,7 @@ class SqliteSource(Source):
             yield from self._batch(rows, size)
             if not problem:
                 break
-            # The driver reads one row ahead: the last sound one was lost with the error.
+            # The driver reads one row ahead, so the last valid row was lost with the error.
             row = self._one(start)
             if row:
                 yield from self._batch([row], len(row[4]))
@@ -295,7 +295,7 @@ class SqliteSource(Source):
             yield batch
 
     def _one(self, start: int) -> _Row | Literal[False] | None:
-        """The first row from an id on; None when there is none, False when it is bad."""
+        """The first row at or behind an id; None without one, False if it is damaged."""
         try:
             row: _Row | None = self._db.execute(f"{self._select} LIMIT 1", (start,)).fetchone()
         except (sqlite3.Error, OverflowError):
@@ -303,10 +303,10 @@ class SqliteSource(Source):
         return row if row is None or row[0] >= start else False
 
     def _next_sound(self, bad: int) -> int | None:
-        """Smallest id found from which rows can be read again, None when there is none.
+        """Smallest known id from which rows can be read again, None without one.
 
         Args:
-            bad: Id from which they cannot.
+            bad: Id of a damaged row.
         """
         bad, step = max(bad, 0), 1
         while self._one(bad + step) is False:
@@ -324,9 +324,9 @@ class SqliteSource(Source):
         return good
 
     def _report_gap(self, start: int, found: int | None, problem: str) -> None:
-        """Reports rows that SQLite does not give; row ids of rosbag2 have no gaps."""
+        """Report rows that SQLite does not return; row ids of rosbag2 have no gaps."""
         first = max(start, 1)
-        # Past the last row nothing is lost that ids could count.
+        # Losses behind the last row cannot be counted by ids.
         is_last = found is None or self._one(found) is None
         lost: int | None = None
         if not is_last and found is not None:
@@ -356,7 +356,7 @@ _MAX_REGIONS = 4096
 
 
 class _Header(NamedTuple):
-    """What is used of the header of a database file: bytes a page, number of pages."""
+    """The used part of a database header: bytes of a page, number of pages."""
 
     page: int
     pages: int
@@ -377,9 +377,9 @@ def _read_header(path: Path) -> _Header:
 def _connect_whole_pages(
     path: Path, header: _Header, size: int
 ) -> tuple[sqlite3.Connection, Path | None]:
-    """Opens a database without the page that its end cuts.
+    """Open a database without its truncated last page.
 
-    SQLite would read zeros for what is missing of that page, and give them as payload.
+    SQLite would read zeros for the missing part of that page, and return them as payload.
     """
     if header.page < 512 or size % header.page == 0:
         return _connect(path)
@@ -391,13 +391,13 @@ def _connect_whole_pages(
 
 
 def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Opens a database for reading only, without trusting what it says.
+    """Open an untrusted database read-only.
 
-    A database that a crashed recorder left with a write-ahead log is opened together
-    with it; all others as they stand, so that nothing is written beside them.
+    A database with a write-ahead log, left by a crashed recorder, is opened with it. Others
+    are opened as immutable, so that no file is written beside them.
 
     Returns:
-        The connection, and the write-ahead log when it could not be used.
+        The connection, and the write-ahead log if it could not be used.
     """
     unread: Path | None = None
     uri = "file:" + quote(os.fsencode(path.absolute())) + "?mode=ro"
@@ -440,14 +440,14 @@ def _typestore(name: str) -> Typestore:
 
 @lru_cache(maxsize=1024)
 def known_definition(type_name: str, distro: str = "") -> tuple[str, bytes]:
-    """Definition of a standard ROS 2 type, for bags that do not carry definitions.
+    """Definition of a standard ROS 2 type, for bags without definitions.
 
     Args:
-        type_name: As the bag spells it, with or without `/msg/`.
-        distro: ROS release that recorded the bag, empty when unknown.
+        type_name: Its name in the bag, with or without `/msg/`.
+        distro: ROS release that recorded the bag, empty if unknown.
 
     Returns:
-        Schema encoding and definition, both empty when the type is not known.
+        Schema encoding and definition, both empty for an unknown type.
     """
     from rosbags.typesys import Stores, TypesysError
 

@@ -1,4 +1,4 @@
-"""Files that are compressed as a whole, unpacked to where a reader can seek in them."""
+"""Unpacks compressed files to temporary files, so that a reader can seek."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 _PIECE = 1 << 20
 _SPARE = 64 << 20
-# Frames that need more memory than this to unpack are refused (zstd's own `--long=27`).
+# Frames that need more memory than this are refused (as zstd's `--long=27`).
 _MAX_WINDOW = 1 << 27
 
 
 @dataclass(slots=True)
 class Spooled:
-    """A file unpacked to a temporary one. Call `remove` once a reader has it open.
+    """A temporary unpacked file. Call `remove` once a reader has opened it.
 
     Attributes:
         path: The temporary file.
-        problem: Why the content ends too early, None when it is whole.
+        problem: Reason for truncated content, None if it is complete.
     """
 
     path: Path
     problem: str | None
 
     def remove(self) -> None:
-        """Removes the temporary file's name; a reader that has it open keeps it."""
+        """Remove the temporary file's name; a reader may still use the open file."""
         self.path.unlink(missing_ok=True)
 
 
 def peek(path: Path, count: int) -> bytes:
-    """The first bytes of what a zstd file unpacks to, fewer when it is damaged.
+    """The first unpacked bytes of a zstd file, fewer if it is damaged.
 
     Raises:
         SourceError: The file cannot be read.
@@ -64,7 +64,7 @@ def peek(path: Path, count: int) -> bytes:
 
 
 def spool(path: Path) -> Spooled:
-    """Unpacks a zstd file to a temporary file, as much of it as is sound.
+    """Unpack the intact part of a zstd file to a temporary file.
 
     Raises:
         SourceError: It cannot be read, or there is no room for it.
@@ -79,7 +79,7 @@ def spool(path: Path) -> Spooled:
 
 
 def copy_start(path: Path, count: int) -> Spooled:
-    """Copies the first `count` bytes of a file to a temporary file.
+    """Copy the first `count` bytes of a file to a temporary file.
 
     Raises:
         SourceError: It cannot be read, or there is no room for it.
@@ -92,12 +92,12 @@ def copy_start(path: Path, count: int) -> Spooled:
 
 
 def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]) -> Spooled:
-    """Makes a temporary file and fills it.
+    """Create and fill a temporary file.
 
     Args:
-        path: The file that it is made of.
-        size: Bytes it will take at least.
-        fill: Writes to it, at most so many bytes, and returns what is wrong.
+        path: The source file.
+        size: Least number of bytes that it takes.
+        fill: Writes at most the given number of bytes to it, and returns a problem or None.
     """
     folder = Path(tempfile.gettempdir())
     room = shutil.disk_usage(folder).free - _SPARE
@@ -125,7 +125,7 @@ def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:
 
 
 def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
-    """Copies what the frames of `source` hold; returns what is wrong with them."""
+    """Copy the content of the frames of `source`; return a description of damage."""
     done = 0
     data = source.read(_PIECE)
     while data:

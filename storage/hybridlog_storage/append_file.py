@@ -1,12 +1,12 @@
 """A file that only grows, written past the page cache where the file system allows it.
 
-What a recorder writes it does not read again, so copying it into the page cache first
-costs a processor's time twice, then stalls whoever writes next when the kernel decides
-to clean up. Direct writes take neither, but must start and end at whole blocks: so the
-bytes behind the last whole block stay here too, and are written again, with zeros up to
-the next block, together with what follows. A file that nobody closed may therefore end
-in up to a block of zeros. Large content that starts at a block, in memory and in the
-file, is written from where it lies; everything else is staged.
+A recorder does not read its own output again. Copying it into the page cache costs
+processor time, and stalls later writers when the kernel flushes the cache. Direct writes
+avoid both, but must start and end at whole blocks. So the bytes behind the last whole
+block also stay in memory; the next write repeats them, padded with zeros to a whole block.
+A file that was never closed may therefore end in up to a block of zeros. Large content
+that starts at a block, in memory and in the file, is written without a copy; all other
+content is staged.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BLOCK = 4096
-"""Bytes of a block; every device's own blocks divide it."""
+"""Bytes of a block; a multiple of every device's block size."""
 _STAGE = 4 << 20
 DIRECT: int = getattr(os, "O_DIRECT", 0)
-"""Flag of direct reads and writes, 0 where there are none."""
-_OWN = 1 << 18  # bytes from which content is not staged; buffers of the pool start at a block
+"""Flag of direct reads and writes, 0 if not supported."""
+_OWN = 1 << 18  # bytes from which content is not staged; pool buffers start at a block
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
 class AppendFile:
-    """One file, open for appending.
+    """A file open for appending.
 
     Args:
         fd: The file; it is closed with this object.
@@ -54,12 +54,12 @@ class AppendFile:
         self._fd = fd
         self._stage = buffers.take(_STAGE) if direct else None
         self._filled = 0  # bytes in the stage
-        self._begun = 0  # those before are about to be written, with other pieces behind them
-        self._written = 0  # byte of the file up to which whole blocks lie there
+        self._begun = 0  # staged bytes before this are being written
+        self._written = 0  # byte of the file up to which whole blocks are written
 
     @classmethod
     def create(cls, path: Path) -> Self:
-        """A new file of a recording.
+        """Create a file of a recording.
 
         Raises:
             OSError: It exists, or cannot be made.
@@ -72,29 +72,29 @@ class AppendFile:
                 if error.errno not in _REFUSED:
                     raise
                 with suppress(FileNotFoundError):
-                    files.unlink(path)  # some systems refuse only after they have made it
+                    files.unlink(path)  # some systems create the file before they refuse
         return cls(files.open_file(path, flags))
 
     @classmethod
     def reopen(cls, path: Path) -> Self:
-        """An ordinary file that is there already.
+        """Open an existing ordinary file.
 
         Raises:
-            OSError: It cannot be opened for writing, or is no ordinary file.
+            OSError: It cannot be opened for writing, or is not an ordinary file.
         """
         fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
-            raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+            raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))
         return cls(fd, os.lseek(fd, 0, os.SEEK_END))
 
     @property
     def direct(self) -> bool:
-        """Whether what was appended is on the disk already, but for the file's length."""
+        """True if appended bytes are on the disk already, except for the file's length."""
         return self._stage is not None
 
     def append(self, parts: Sequence[Buffer]) -> None:
-        """Write all parts at the end; they are in the file when this returns.
+        """Append all parts; they are in the file when this returns.
 
         Raises:
             OSError: when the system refuses; the file is then as it was before.
@@ -131,21 +131,21 @@ class AppendFile:
         self._put(pieces)
 
     def room_before(self, content: Buffer, position: int) -> int:
-        """Bytes to leave free, so that large content need not be copied to be written.
+        """Bytes of padding that let large content be written without a copy.
 
         Args:
-            content: What is about to be appended.
+            content: The content to append.
             position: Byte of the file where it would begin.
 
         Returns:
-            0 where it makes no difference.
+            0 where padding does not help.
         """
         if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
             return 0
         return -position % BLOCK
 
     def cut(self, position: int) -> None:
-        """Drop everything from a position on; not for direct writes.
+        """Truncate the file at a position; not for direct writes.
 
         Raises:
             OSError: when the system refuses.
@@ -156,7 +156,7 @@ class AppendFile:
         self.position = position
 
     def rewrite(self, position: int, data: Buffer) -> None:
-        """Write over bytes that are in the file; not for direct writes.
+        """Overwrite bytes of the file; not for direct writes.
 
         Raises:
             OSError: when the system refuses; some of them may have been written by then.
@@ -170,7 +170,7 @@ class AppendFile:
             pieces = left_over(pieces, done)
 
     def finish(self, *, sync: bool) -> None:
-        """Give the file its exact length and close it.
+        """Set the file's exact length and close it.
 
         Args:
             sync: Return once everything is on the disk.
@@ -191,26 +191,26 @@ class AppendFile:
         sync_file(self._fd)
 
     def close(self) -> None:
-        """Give the file back as it is."""
+        """Close the file as it is."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
     def _step_back(self, position: int) -> None:
-        """Forget a write that failed: what lay before it is whole, and can be added to.
+        """Undo a failed write; the bytes before it are whole, and can be appended to.
 
-        What is added is not written past the page cache any more: little is.
+        Later writes go through the page cache; they are few.
         """
         self._stage = None
         self.position = position
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
         os.lseek(self._fd, position, os.SEEK_SET)
-        with suppress(OSError):  # what is added is written over it, and `finish` cuts the rest
+        with suppress(OSError):  # later writes overwrite it, and `finish` cuts the rest
             files.system.truncate(self._fd, position)
 
     def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
-        """Write pieces and what was staged behind them; keep what is behind the last block."""
+        """Write pieces and the staged bytes; stage the bytes behind the last block."""
         assert self._stage is not None
         whole = self._filled - self._filled % BLOCK
         rest = self._filled - whole
@@ -244,5 +244,5 @@ class AppendFile:
 
 
 def _is_own(content: NDArray[np.uint8]) -> bool:
-    """Whether content may be written from where it lies."""
+    """True if content is aligned for a direct write without a copy."""
     return len(content) >= _OWN and content.ctypes.data % BLOCK == 0

@@ -1,8 +1,7 @@
-"""Large buffers that are used again, so that the system need not clear new memory each time.
+"""A pool of large buffers, reused to avoid page faults on new memory.
 
-Memory that was just given by the system costs a page fault every four kilobytes, which
-took four times as long as filling it. A buffer goes back to its pool by itself, when the
-last array or memoryview over it is gone.
+New memory costs a page fault every four kilobytes, which takes four times as long as
+filling it. A buffer returns to its pool when the last array or memoryview over it is gone.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SLAB = 8 << 20
-"""Bytes that the system is asked for at a time; buffers of up to so many are cut from them."""
+"""Bytes allocated from the system at a time; buffers up to this size are cut from them."""
 
-_LEAST = 1 << 18  # smaller buffers are malloc's business
+_LEAST = 1 << 18  # smaller buffers come from malloc
 _SPARE_BYTES = 96 << 20
 _HUGE_PAGE = 2 << 20
-_FILLED = 8 << 20  # bytes of a new buffer; what is beyond is laid down by who can wait for it
+_FILLED = 8 << 20  # bytes of a new buffer; larger content is copied by a thread that can wait
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
 _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 
@@ -35,29 +34,28 @@ _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 class Buffers:
     """A pool of buffers. Thread safe.
 
-    They are cut from slabs, all buffers of one from one size. When none of them is taken any
-    more, its memory may serve for another size: who begins to take larger buffers needs no
-    other memory than he had for small ones.
+    Buffers are cut from slabs; all buffers of a slab have one size. A slab without taken
+    buffers may serve another size, so larger buffers reuse the memory of smaller ones.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        # Buffers that nobody has any more. The collector may give one back at any place, on a
-        # thread that has the lock already.
+        # Returned buffers. The garbage collector may return one at any point, on a thread that
+        # already holds the lock.
         self._returned: deque[tuple[_Slab, int]] = deque()
-        self._whole: dict[int, list[_Slab]] = {}  # of which nothing is taken, by their size
+        self._whole: dict[int, list[_Slab]] = {}  # slabs without taken buffers, by slab size
         self._most_whole = _SPARE_BYTES
-        # Of which something is taken and something is not, by the size of their buffers.
+        # Slabs with both taken and free buffers, by buffer size.
         self._cut: dict[int, dict[_Slab, None]] = {}
-        self._given: Counter[int] = Counter()  # bytes that the system gave, by the slabs' size,
-        self._taken: Counter[int] = Counter()  # and those of them that are taken
+        self._given: Counter[int] = Counter()  # bytes allocated from the system, by slab size,
+        self._taken: Counter[int] = Counter()  # and the taken ones of these
 
     def take(self, size: int, *, whole_pages: bool = False) -> NDArray[np.uint8]:
-        """A buffer of at least `size` bytes, whatever they are.
+        """Take a buffer of at least `size` bytes with arbitrary content.
 
         Args:
             size: Bytes.
-            whole_pages: Whether it must begin at a page of memory; large ones always do.
+            whole_pages: Whether it must begin at a memory page; large ones always do.
         """
         if size < _LEAST and not whole_pages:
             return np.empty(size, np.uint8)
@@ -70,19 +68,19 @@ class Buffers:
                     self._unkeep(slab)
                 start, missing = self._cut_off(slab, size)
         if slab is None:
-            slab = _Slab(_slab_size(size))  # that may take long, and others shall not wait for it
+            slab = _Slab(_slab_size(size))  # this may take long, so it runs without the lock
             with self._lock:
                 start, missing = self._cut_off(slab, size)
-        # Other threads go on meanwhile, as they could not when messages are laid there.
+        # Other threads run meanwhile, unlike while a message is copied there.
         for part in missing:
             part.fill(0)
-        # What is over this array keeps this array, and so the memory, from being taken again.
+        # Views of this array keep it alive, and so keep its memory from being reused.
         array = np.frombuffer(slab.memory, np.uint8, size, start)
         weakref.finalize(array, self._give, slab, start).atexit = False
         return array
 
     def is_short(self, size: int, share: float) -> bool:
-        """Whether a buffer would be of new memory, or of what there is less than a share spare."""
+        """True if a buffer needs new memory, or less than a share of the memory is spare."""
         size = _rounded(size)
         kind = _slab_size(size)
         with self._lock:
@@ -99,16 +97,15 @@ class Buffers:
         pause: float = 0.0,
         enough: threading.Event | None = None,
     ) -> None:
-        """Have memory, spare or taken, that the system has given already.
+        """Allocate memory in advance, until that much is spare or taken.
 
-        As many bytes may then be spare until `settle`.
+        That many bytes may stay spare until `settle`.
 
         Args:
             size: Bytes of a buffer that will be taken.
-            total: Bytes of all, about.
-            pause: For how many times as long as each page took to leave the system alone
-                after it.
-            enough: Ends it early.
+            total: Bytes of all buffers, about.
+            pause: Pause after each page, as a multiple of the time that the page took.
+            enough: Ends the allocation early.
         """
         enough = enough or threading.Event()
         size = _rounded(size)
@@ -118,7 +115,7 @@ class Buffers:
             self._most_whole = max(self._most_whole, total, self._whole_bytes + missing)
         while missing >= size and not enough.is_set():
             with self._lock:
-                # What is begun comes first.
+                # Partly allocated slabs come first.
                 whole = self._whole.get(kind)
                 slab = self._unkeep(whole[0]) if whole and whole[0].given < kind else None
             slab = slab or _Slab(kind)
@@ -133,11 +130,11 @@ class Buffers:
             with self._lock:
                 self._given[kind] += got
                 self._keep(slab)
-                # Others may get some as well, or have what is spare given back.
+                # Other threads may also allocate, or return spare memory.
                 missing = min(missing - got, total - self._given[kind])
 
     def settle(self) -> None:
-        """Give back to the system what is more than usually spare."""
+        """Return surplus spare memory to the system."""
         with self._lock:
             self._sort_in()
             self._most_whole = _SPARE_BYTES
@@ -146,7 +143,7 @@ class Buffers:
                     self._given[slab.size] -= self._unkeep(slab).given
 
     def _cut_off(self, slab: _Slab, size: int) -> tuple[int, Iterator[NDArray[np.uint8]]]:
-        """Where a buffer starts, and memory that it has not yet; by who has the lock."""
+        """Start of a new buffer, and its memory still to be allocated. Needs the lock."""
         if not slab.cut:
             slab.cut_into(size)
         cut = self._cut.setdefault(size, {})
@@ -167,17 +164,17 @@ class Buffers:
         return sum(size * len(whole) for size, whole in self._whole.items())
 
     def _find(self, size: int) -> _Slab | None:
-        """The slab to cut a buffer from; by who has the lock.
+        """The slab to cut a buffer from. Needs the lock.
 
-        No new memory if it can be helped, and then the one with the least spare: so others
-        become whole again.
+        It avoids new memory and prefers the slab with the least spare memory, so that other
+        slabs become free.
         """
         slabs = [*self._cut.get(size, ()), *self._whole.get(_slab_size(size), ())[-1:]]
         return min(slabs, key=lambda slab: slab.price(size), default=None)
 
     def _give(self, slab: _Slab, start: int) -> None:
         self._returned.append((slab, start))
-        # Whoever has the lock may be this very thread. The next one that has it sees to it.
+        # This thread may hold the lock already. The next holder takes the buffer back.
         if self._lock.acquire(blocking=False):
             try:
                 self._sort_in()
@@ -185,7 +182,7 @@ class Buffers:
                 self._lock.release()
 
     def _sort_in(self) -> None:
-        """Take back what was returned; by who has the lock."""
+        """Take back returned buffers. Needs the lock."""
         while self._returned:
             slab, start = self._returned.popleft()
             self._taken[slab.size] -= slab.cut
@@ -198,30 +195,30 @@ class Buffers:
                 cut[slab] = None
 
     def _keep(self, slab: _Slab) -> None:
-        """Have a whole slab spare, or give it back to the system; by who has the lock."""
+        """Store a free slab as spare, or return it to the system. Needs the lock."""
         slab.cut = 0
         if self._whole_bytes + slab.size > self._most_whole:
             self._given[slab.size] -= slab.given
             return
-        # The last one is taken first.
+        # The last one is reused first.
         whole = self._whole.setdefault(slab.size, [])
         whole.insert(len(whole) if slab.given == slab.size else 0, slab)
 
     def _unkeep(self, slab: _Slab) -> _Slab:
-        """Have a whole slab spare no more; by who has the lock."""
+        """Remove a free slab from the spare ones. Needs the lock."""
         self._whole[slab.size].remove(slab)
         return slab
 
 
 class _Slab:
-    """Memory that is cut into buffers of one size."""
+    """Memory cut into buffers of one size."""
 
     def __init__(self, size: int) -> None:
         self.memory = new_memory(size)
         self.size = size
-        self.given = 0  # bytes from its start that the system has given
-        self.cut = 0  # bytes of a buffer; 0 while it is whole
-        self.spare: list[int] = []  # where buffers start that are not taken, the next one last
+        self.given = 0  # bytes from its start that are allocated
+        self.cut = 0  # bytes of a buffer; 0 while the slab is free
+        self.spare: list[int] = []  # starts of the free buffers, the next one last
 
     def cut_into(self, size: int) -> None:
         self.cut = size
@@ -231,17 +228,17 @@ class _Slab:
         return len(self.spare) * self.cut == self.size
 
     def is_new(self, size: int) -> bool:
-        """Whether the next buffer would have memory that the system has yet to give."""
+        """True if the next buffer needs memory that is not allocated yet."""
         return self.given < (self.spare[-1] if self.cut else 0) + size
 
     def price(self, size: int) -> tuple[bool, int]:
-        """The less the better it is to cut the next buffer from this one."""
+        """Cost of cutting the next buffer from this slab; lower is better."""
         return self.is_new(size), len(self.spare) if self.cut else self.size
 
     def give(self, end: int, most: int) -> Iterator[NDArray[np.uint8]]:
-        """Memory up to an end that the system has yet to give, in pieces of a page fault each.
+        """Unallocated memory up to `end`, in pieces of one page fault each.
 
-        All of it counts as given; no more than so many bytes are in the pieces.
+        All of it counts as allocated; the pieces hold at most `most` bytes.
         """
         start, self.given = self.given, min(end, self.size)
         array = np.frombuffer(self.memory, np.uint8)[start:end][:most]
@@ -257,7 +254,7 @@ def _rounded(size: int) -> int:
 
 
 def new_memory(size: int) -> mmap.mmap:
-    """Memory of this process alone that the system gives when it is written to, in huge pages.
+    """Private memory in huge pages, allocated when it is first written.
 
     Args:
         size: Bytes.

@@ -1,10 +1,9 @@
-"""The catalog: recordings, channels, chunks and where each lies, in a local file.
+"""The catalog: a local file that lists recordings, channels and chunks.
 
-All of it is made from journals and from the summaries of segments, and may be deleted at
-any time. It is an SQLite file, so that listing and choosing recordings, and fetching by
-topic and time, open one file and ask no server. Each row carries a checksum, and of each
-recording what its files looked like when the row was made: a row is believed only while
-both still fit.
+It is derived from journals and segment summaries, and may be deleted at any time. It is an
+SQLite file, so that listing and choosing recordings, and fetching by topic and time, need
+one file and no server. Each row has a checksum. The row of a recording also stores the
+state of its files (sizes, times). A row is used only while both are unchanged.
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ _NO_DAMAGE: Final = frozenset(
         sqlite3.SQLITE_READONLY,
     }
 )
-"""Errors of SQLite that say nothing of the content of the file."""
+"""SQLite errors that are independent of the file's content."""
 _HEAD: Final = b"SQLite format 3\0\x10\0\1\1"
-"""What the file starts with: then the size of a page, and that it has a rollback journal."""
+"""The first bytes of the file, with its page size and rollback journal mode."""
 _CACHED_BYTES: Final = 64 << 20  # of chunk tables
 _STAMPS = np.dtype(
     [
@@ -68,7 +67,7 @@ _STAMPS = np.dtype(
         ("skew_max", "<i8"),
     ]
 )
-"""Values that come from decoded messages; one row for each row of `ChunkTable.parts`."""
+"""Results of decoding; one row for each row of `ChunkTable.parts`."""
 _TABLES: Final = """
 create table meta (key text primary key, value text not null) without rowid;
 create table recordings (
@@ -89,7 +88,7 @@ create table schemas (
 
 @dataclass(slots=True)
 class ChannelStats:
-    """What is known of the messages of one channel, in a chunk or in a recording.
+    """Statistics of the messages of one channel, in a chunk or in a recording.
 
     Times are nanoseconds; `first` and `last` are both inclusive; None without messages
     or, for stamps, without a header. Skew is log time minus header stamp.
@@ -109,10 +108,10 @@ class ChannelStats:
     skew_min: int | None = None
     skew_max: int | None = None
     longest: int = 0
-    """Most log time that one chunk's messages of the channel span."""
+    """Longest span of log time of the channel's messages in one chunk."""
 
     def add(self, other: ChannelStats) -> None:
-        """Take in the messages of another part of the channel."""
+        """Add the messages of another part of the channel."""
         for name in ("messages", "payload_bytes", "unreadable", "stamped", "skew_sum"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
@@ -133,7 +132,7 @@ class ChannelEntry:
     metadata: dict[str, str]
     has_publish_time: bool
     reason: str | None
-    """Why its fields are not in the index, None when they are."""
+    """Reason why its fields are not indexed, None if they are."""
     stats: ChannelStats = field(default_factory=ChannelStats)
 
 
@@ -142,27 +141,27 @@ class RecordingEntry:
     """One recording.
 
     Attributes:
-        id: 32 hexadecimal digits, drawn when it began; what everything refers to.
-        label: Name of its directory; for people, may change at any time.
-        name: As the user calls it.
-        tags: As the user gave them.
-        source: Where it came from: path, kind, profile, bytes, fingerprint.
-        created: When it was recorded, ns.
+        id: 32 random hexadecimal digits; everything refers to it.
+        label: Name of its directory; may change at any time.
+        name: Name given by the user.
+        tags: Tags given by the user.
+        source: The recorded log: path, kind, profile, bytes, fingerprint.
+        created: Time of recording, ns.
         status: `open` (being recorded), `unfinished` (cut short by a crash, in a store that
             cannot be written), `complete`, `recovered` (from a crash), `damaged`
-            (its source was, or a part of it is), `unproven` (its journal was lost, so nobody
-            can say that nothing else was).
-        end: How it ended: losses, damage.
+            (its source was, or a part of it is), `unproven` (its journal was lost, so other
+            losses could not be noticed).
+            end: The state at its end: losses, damage.
         channels: Its channels.
         stored_bytes: Size of its segments.
         segments: Number of segments.
         chunks: Number of chunks.
-        notes: What people wrote about it: `at` (ns) and `text`.
-        marks: Set after it ended: `time` (ns), `text`, `tags`.
+        notes: Notes of users: `at` (ns) and `text`.
+        marks: Marks set after it ended: `time` (ns), `text`, `tags`.
         spans: Number, first and last log time (ns) of each segment that has messages.
-        digests: Of each segment that is believed, by its number as text.
-        is_decoded: Whether it is known what the decoded messages tell. Without, nobody knows
-            which messages do not fit their definition, nor their header stamps.
+        digests: Digest of each valid segment, by its number as text.
+        is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
+        do not fit their definition, are unknown.
     """
 
     id: str
@@ -185,20 +184,20 @@ class RecordingEntry:
 
     @property
     def key(self) -> str:
-        """Its first 64 bits, 16 hexadecimal digits: what index documents refer to."""
+        """The first 64 bits of the id, 16 hexadecimal digits; index documents refer to it."""
         return self.id[:16]
 
     @property
     def messages(self) -> int:
-        """Messages in all channels."""
+        """Number of messages in all channels."""
         return sum(c.stats.messages for c in self.channels)
 
     def stats_of(self, topic: str) -> list[ChannelStats]:
-        """What is known of each of a topic's channels."""
+        """Statistics of each channel of a topic."""
         return [c.stats for c in self.channels if c.topic == topic]
 
     def messages_of(self, topic: str) -> int:
-        """Messages of a topic."""
+        """Number of messages of a topic."""
         return sum(stats.messages for stats in self.stats_of(topic))
 
     @property
@@ -209,12 +208,12 @@ class RecordingEntry:
         return (min(firsts), max(lasts)) if firsts else None
 
     def to_document(self) -> dict[str, Any]:
-        """As a mapping of plain values."""
+        """The entry as a mapping of plain values."""
         return asdict(self)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
-        """From such a mapping."""
+        """The entry from such a mapping."""
         values = dict(document)
         values["channels"] = [
             ChannelEntry(**{**c, "stats": ChannelStats(**c["stats"])}) for c in values["channels"]
@@ -225,7 +224,7 @@ class RecordingEntry:
 
 @dataclass(frozen=True, slots=True)
 class ChunkEntry:
-    """One chunk: where it lies and what is in it, by channel id.
+    """One chunk: its position and its statistics by channel id.
 
     Attributes:
         recording: Id of its recording.
@@ -234,8 +233,8 @@ class ChunkEntry:
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of message indexes and arrival numbers behind it.
-        crc: CRC-32 of the chunk record as it is stored; None while the segment is open.
-        trailer_crc: CRC-32 of what is behind it; None while the segment is open.
+        crc: CRC-32 of the stored chunk record; None while the segment is open.
+        trailer_crc: CRC-32 of the trailer; None while the segment is open.
         first: Least log time, ns.
         last: Greatest log time, ns.
         stats: By channel id.
@@ -255,7 +254,7 @@ class ChunkEntry:
 
     @property
     def place(self) -> ChunkPlace:
-        """Where it lies in its segment, as the segment's reader wants to know it."""
+        """Its position, as the segment reader expects it."""
         return ChunkPlace(
             offset=self.offset,
             length=self.length,
@@ -274,7 +273,7 @@ class ChunkEntry:
         return sum(stats.messages for stats in self.stats.values())
 
     def span(self, channels: Container[int]) -> tuple[int, int] | None:
-        """First and last log time of some channels in it, None when it has none of them."""
+        """First and last log time of some channels in it; None without messages of them."""
         stats = [s for c, s in self.stats.items() if c in channels]
         firsts = [s.first for s in stats if s.first is not None]
         lasts = [s.last for s in stats if s.last is not None]
@@ -288,9 +287,9 @@ def channel_totals(
 
     Args:
         table: Its chunks.
-        stamps: What the decoded messages tell, a row for each of `table.parts`; None while
-            nobody has decoded them.
-        silent: Ids of channels whose sender tells no publish time.
+        stamps: Results of decoding, a row for each of `table.parts`; None before the
+        messages are decoded.
+        silent: Ids of channels without publish times.
     """
     parts = table.parts
     found: dict[int, ChannelStats] = {}
@@ -320,7 +319,7 @@ def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
     rows = rows[rows["stamped"] > 0]
     if len(rows):
         stats.stamped = int(rows["stamped"].sum())
-        # Exact, so that the order of segments and chunks makes no difference.
+        # Exact, so that the order of segments and chunks does not matter.
         stats.skew_sum = math.fsum(rows["skew_sum"].tolist())
         stats.first_stamp = int(rows["first_stamp"].min())
         stats.last_stamp = int(rows["last_stamp"].max())
@@ -331,11 +330,11 @@ def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
 def stamps_of(
     table: ChunkTable, chunks: Mapping[int, Mapping[int, ChannelStats]]
 ) -> NDArray[np.void]:
-    """Header stamps and decoding failures of a segment, one row for each row of `table.parts`.
+    """Header stamps and decoding failures of a segment, a row for each row of `table.parts`.
 
     Args:
         table: The segment's chunks.
-        chunks: Statistics of each channel, by number of a chunk that could be decoded.
+        chunks: Statistics by channel, for each chunk number that could be decoded.
     """
     rows = np.zeros(len(table.parts), _STAMPS)
     bounds = table.part_bounds().tolist()
@@ -358,12 +357,12 @@ def stamps_of(
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """A recording as its files describe it.
+    """A recording, as read from its files.
 
     Attributes:
         entry: Its entry.
-        files: What the files looked like: the row is believed while they still do.
-        tables: Chunks of each segment that is believed, by number.
+        files: State of the files; the row is used while it is unchanged.
+        tables: Chunks of each valid segment, by number.
         channels: By id.
     """
 
@@ -377,9 +376,9 @@ class Catalog:
     """The catalog of a store. Thread safe.
 
     Args:
-        store: The store's directory; None for a catalog in memory, of a store that this user
-            cannot write.
-        store_id: The store's id; the catalog of another store is made anew.
+        store: The store's directory; None for a catalog in memory, if this user cannot write
+        the store.
+        store_id: The store's id; the catalog of another store is rebuilt.
     """
 
     def __init__(self, store: Path | None, store_id: str) -> None:
@@ -394,11 +393,11 @@ class Catalog:
 
     @property
     def is_in_memory(self) -> bool:
-        """Whether it is this process's own, and goes with it."""
+        """True if it exists in the memory of this process only."""
         return self._path is None
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         with self._lock:
             self._db.close()
             self._forget()
@@ -421,10 +420,10 @@ class Catalog:
         if self._path is None:
             db = sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None)
         else:
-            # SQLite itself follows no symlink but one in place of the file.
+            # SQLite itself follows only a symlink in place of the file.
             path = Path(os.path.realpath(self._path.parent)) / CATALOG
             try:
-                # The group may write it where it may write the store.
+                # The group may write it if it may write the store.
                 fd = files.open_file(path, os.O_RDWR | os.O_CREAT, depth=files.IN_STORE)
                 try:
                     self._file = _identity(os.fstat(fd))
@@ -434,20 +433,18 @@ class Catalog:
             except OSError as error:
                 raise durability.explain(error, self._path, "opening") from error
             if head and (head[:16] != _HEAD[:16] or head[18:] != _HEAD[18:]):
-                raise sqlite3.DatabaseError("it is no catalog")
+                raise sqlite3.DatabaseError("it is not a catalog")
             db = sqlite3.connect(
                 path, timeout=_BUSY_S, check_same_thread=False, isolation_level=None
             )
             ((_, _, opened),) = db.execute("pragma database_list").fetchall()
             if opened != str(path):
                 db.close()
-                raise StoreError(
-                    f"{self._path} is a symlink. Delete it: the catalog is made again."
-                )
+                raise StoreError(f"{self._path} is a symlink. Delete it: the catalog is rebuilt.")
         try:
-            db.execute("pragma synchronous = off")  # what a power cut breaks is made again
+            db.execute("pragma synchronous = off")  # a catalog broken by a power cut is rebuilt
             db.execute("pragma cell_size_check = on")
-            # Text that is damaged is a row that is left out, not the whole catalog.
+            # Damaged text invalidates its row, not the whole catalog.
             db.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")
             if not self._is_ours(db):
                 self._make(db)
@@ -457,7 +454,7 @@ class Catalog:
         return db
 
     def _is_ours(self, db: sqlite3.Connection) -> bool:
-        """Whether the tables are of this version, and of this store."""
+        """True if the tables have this version and belong to this store."""
         found = db.execute("select count(*) from sqlite_master where name = 'meta'").fetchone()
         if not found[0]:
             return False
@@ -465,7 +462,7 @@ class Catalog:
         return sorted(made) == [("store", self._store_id), ("version", str(_VERSION))]
 
     def _make(self, db: sqlite3.Connection, *, anew: bool = False) -> None:
-        """Make the tables, unless another process has just done it."""
+        """Create the tables, unless another process has just done so."""
         db.execute("begin immediate")
         try:
             if anew or not self._is_ours(db):
@@ -491,7 +488,7 @@ class Catalog:
                     files.unlink(self._path.with_name(name), depth=files.IN_STORE)
 
     def rebuild(self) -> None:
-        """Make the catalog anew, empty.
+        """Replace the catalog with an empty one.
 
         Raises:
             StoreError: It cannot be written.
@@ -500,7 +497,7 @@ class Catalog:
             self._forget()
             try:
                 if self._is_sound():
-                    # Other processes may have it open, and go on with it.
+                    # Other processes may still use the open file.
                     self._make(self._db, anew=True)
                     return
             except sqlite3.Error as error:
@@ -511,9 +508,9 @@ class Catalog:
             self._db = self._open()
 
     def mend(self) -> None:
-        """Make the catalog anew, empty, unless only single rows are damaged.
+        """Replace the catalog with an empty one, unless only single rows are damaged.
 
-        Rows that are written into a damaged file damage others.
+        Writing into a damaged file would damage other rows.
 
         Raises:
             StoreError: It cannot be read or written.
@@ -528,7 +525,7 @@ class Catalog:
             self.rebuild()
 
     def is_sound(self) -> bool:
-        """Whether the file as such is whole; its rows are checked when they are read.
+        """True if the file structure is intact; rows are checked when they are read.
 
         Raises:
             StoreError: It cannot be read.
@@ -545,7 +542,7 @@ class Catalog:
         return bool(self._db.execute("pragma quick_check(1)").fetchone() == ("ok",))
 
     def _follow(self) -> None:
-        """Open the file again if another process has made a new one."""
+        """Reopen the file if another process replaced it."""
         if self._path is None:
             return
         try:
@@ -558,7 +555,7 @@ class Catalog:
             self._db = self._open()
 
     def _told(self, error: sqlite3.Error, what: str) -> StoreError | DiskFullError:
-        """An error of SQLite's as one of ours."""
+        """Map an SQLite error to a hybridlog error."""
         name = getattr(error, "sqlite_errorname", "")
         if name == "SQLITE_FULL" or "is full" in str(error):
             return DiskFullError(
@@ -567,16 +564,16 @@ class Catalog:
             )
         if _is_damage(error):
             return CatalogError(
-                f"The catalog {self._path} is damaged: {error}. `hybridlog reindex` makes it again."
+                f"The catalog {self._path} is damaged: {error}. `hybridlog reindex` rebuilds it."
             )
         return StoreError(
-            f"The catalog {self._path} cannot be {what}: {error}. It may be deleted while nobody "
-            "uses the store; it is made again."
+            f"The catalog {self._path} cannot be {what}: {error}. Delete it while no "
+            "process uses the store; it is rebuilt."
         )
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        """Looking something up.
+        """A context for reading.
 
         Raises:
             CatalogError: The file is damaged.
@@ -589,9 +586,9 @@ class Catalog:
                 raise self._told(error, "read") from error
 
     def _change(self, work: Callable[[sqlite3.Connection], None]) -> None:
-        """Make changes of which all are kept, or none; into a new catalog if this is damaged.
+        """A transaction; a damaged catalog is replaced first.
 
-        A recording that ends must not fail because of what can be made again.
+        The end of a recording must not fail because of data that can be rebuilt.
 
         Raises:
             DiskFullError: There is no room.
@@ -607,7 +604,7 @@ class Catalog:
 
     @contextmanager
     def _changing(self) -> Iterator[sqlite3.Connection]:
-        """Changes of which all are kept, or none.
+        """A transaction.
 
         Raises:
             CatalogError: The file is damaged.
@@ -642,9 +639,9 @@ class Catalog:
     # Recordings.
 
     def put(self, described: Described) -> None:
-        """Write or replace a recording and all its chunks."""
+        """Insert or replace a recording and all its chunks."""
         entry = described.entry
-        # In ASCII: the name of a directory need not be UTF-8.
+        # In ASCII: a directory's name may not be UTF-8.
         text = json.dumps(entry.to_document(), separators=(",", ":"))
         row = (entry.id, described.files, text)
 
@@ -667,7 +664,7 @@ class Catalog:
         self._change(work)
 
     def recordings(self) -> dict[str, tuple[str, RecordingEntry]]:
-        """By id: what the files looked like, and the entry; rows that are damaged are left out.
+        """State of the files and entry of each recording, by id; without damaged rows.
 
         Raises:
             CatalogError: More than single rows is damaged.
@@ -695,12 +692,12 @@ class Catalog:
 
         self._change(work)
 
-    # What the decoded messages tell.
+    # Results of decoding.
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
     ) -> None:
-        """Keep what decoded messages tell of a recording's segments.
+        """Store the decoding results of a recording's segments.
 
         Args:
             recording: Its id.
@@ -719,7 +716,7 @@ class Catalog:
         self._change(work)
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
-        """Keep which chunks of a recording cannot be read, by segment and number, and why."""
+        """Store the unreadable chunks of a recording: reason by segment and number."""
 
         def work(db: sqlite3.Connection) -> None:
             db.execute("delete from damage where id = ?", (recording,))
@@ -731,10 +728,10 @@ class Catalog:
         self._change(work)
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
-        """Which chunks of a recording could not be read, by segment and number, and why.
+        """The unreadable chunks of a recording: reason by segment and number.
 
         Raises:
-            CatalogError: It is not known any more.
+            CatalogError: The list is damaged.
         """
         with self._reading() as db:
             row = db.execute(
@@ -745,14 +742,14 @@ class Catalog:
         if _crc(*row[:2]) != row[2] or row[0] != recording:
             raise CatalogError(
                 f"The catalog's list of damaged chunks of recording {recording} is damaged. "
-                "`hybridlog reindex` makes it again."
+                "`hybridlog reindex` rebuilds it."
             )
         return {(segment, chunk): reason for segment, chunk, reason in json.loads(row[1])}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
     ) -> NDArray[np.void] | None:
-        """What decoded messages tell of a segment; None while nobody has decoded them."""
+        """Decoding results of a segment; None before its messages are decoded."""
         with self._reading() as db:
             row = db.execute(
                 "select id, number, digest, rows, crc from stamps where id = ? and number = ?",
@@ -767,7 +764,7 @@ class Catalog:
     # Schemas.
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
-        """Schemas by hash; those that are missing or damaged are left out."""
+        """Schemas by hash, without missing or damaged ones."""
         found: dict[str, Schema] = {}
         with self._reading() as db:
             for digest in hashes:
@@ -806,12 +803,12 @@ class Catalog:
             if row is None or _crc(*row[:4]) != row[4] or row[:3] != key:
                 raise CatalogError(
                     f"The catalog has lost the chunks of segment {number} of recording "
-                    f"{entry.label}. `hybridlog reindex` makes it again."
+                    f"{entry.label}. `hybridlog reindex` rebuilds it."
                 )
             table = ChunkTable.from_bytes(row[3])
             kept = table, self.stamps(entry, number, table)
             if kept[1] is None and entry.is_decoded and len(table.parts):
-                # Without its row the next opening looks at the recording anew.
+                # Without its row the next opening reads the recording's files again.
                 with suppress(sqlite3.Error):
                     db.execute("delete from recordings where id = ?", (entry.id,))
             self._tables[key] = kept
@@ -834,8 +831,8 @@ class Catalog:
             entry: The recording.
             channels: Channel ids, None for all.
             bounds: `[begin, end)`, ns, None for all times.
-            clock: `log`, `publish` or `header`: which time `bounds` is about. Where nobody
-                has decoded the messages, every chunk may hold any stamp.
+            clock: `log`, `publish` or `header`: the time that `bounds` refers to. Before
+            messages are decoded, every chunk may hold any stamp.
         """
         found: list[ChunkEntry] = []
         for number, first, last in entry.spans:
@@ -956,7 +953,7 @@ def schema_hash(schema: Schema) -> str:
 
 
 def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> ChannelEntry:
-    """The catalog entry of a channel, without messages yet."""
+    """The catalog entry of a channel without messages."""
     return ChannelEntry(
         id=channel_id,
         topic=channel.topic,
@@ -973,7 +970,7 @@ def _crc(*values: object) -> int:
     """Checksum of the values of a row."""
     crc = 0
     for value in values:
-        # What SQLite takes for another type is another value.
+        # A value that SQLite stores as another type is a different value.
         kind = type(value).__name__.encode()
         data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
         crc = crc32(data, crc32(kind + len(data).to_bytes(8, "little"), crc))
@@ -985,7 +982,7 @@ def _size(table: ChunkTable) -> int:
 
 
 def _is_damage(error: sqlite3.Error) -> bool:
-    """Whether an error comes from what is in the file."""
+    """True if an error comes from the file's content."""
     code = getattr(error, "sqlite_errorcode", None)
     if code is None:
         return "is full" not in str(error) and "I/O error" not in str(error)

@@ -1,4 +1,4 @@
-"""The checksum of MCAP: CRC-32 as in zlib, by a library that computes it at memory speed."""
+"""The checksum of MCAP: CRC-32 as in zlib, computed at memory speed by isal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A chunk between its closing and its place in a segment: packed, then stored."""
+"""Closed chunks: packed for the file, then stored in a segment."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class PackedChunk:
         data: The compressed content.
         crc: CRC-32 of head and data.
         indexes: Message index record of each channel, by channel id.
-        indexes_crc: CRC-32 of all of them, one behind the other.
+        indexes_crc: CRC-32 of all of them, concatenated.
         arrivals: The arrival numbers, packed.
-        parts: `PART`[c], what the chunk holds of each channel.
+        parts: `PART`[c], statistics of each channel in the chunk.
     """
 
     batch: Batch
@@ -66,7 +66,7 @@ def pack(
     *,
     hurried: bool = False,
 ) -> PackedChunk:
-    """Compress a chunk, build its message indexes and checksums; runs on a worker thread."""
+    """Compress a chunk and build its message indexes and checksums. Runs on a worker thread."""
     compression, data = compressor.compress(batch.buffer, hurried=hurried)
     order = index_order(batch.channel, batch.log_time)
     parts, first, last = parts_of(batch, order)
@@ -107,7 +107,7 @@ def pack(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredChunk:
-    """A chunk that lies in a segment, with its content at hand.
+    """A chunk stored in a segment, with its content in memory.
 
     Attributes:
         segment: Number of the segment in its recording.
@@ -115,7 +115,7 @@ class StoredChunk:
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of the message indexes and arrival numbers that follow it.
-        crc: CRC-32 of the chunk record as it is stored, its head included.
+        crc: CRC-32 of the stored chunk record, including its head.
         trailer_crc: CRC-32 of the trailer.
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.

@@ -1,4 +1,4 @@
-"""The open chunk of a cluster: message records are laid down here as batches arrive."""
+"""The open chunk of a cluster: message records are copied into it as batches arrive."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ if TYPE_CHECKING:
 
 _HEAD = MESSAGE_HEAD.itemsize
 _ONE_HEAD = struct.Struct("<BQHIQQ")  # one `MESSAGE_HEAD`
-_GROWTH = 4  # times as much as one chunk the next one may hold, before it is moved
-_LARGE_SHARE = 8  # so many times a payload fills a chunk, where payloads are large
+_GROWTH = 4  # how many times larger than one chunk the next may grow before it is moved
+_LARGE_SHARE = 8  # a large payload fills at least 1/8 of a chunk
 
 
 class ChunkBuilder:
-    """Collects messages until its owner takes them as one chunk.
+    """Collects messages until the writer takes them as one chunk.
 
     Args:
-        capacity: Bytes at which its owner takes them, about.
+        capacity: Bytes at which the writer takes them, about.
     """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        """As given; it may be changed while nothing is laid down."""
+        """Bytes at which the writer takes the chunk; may change while the builder is empty."""
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
-        self._expected = capacity  # bytes that the next chunk may well have
+        self._expected = capacity  # expected bytes of the next chunk
         self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
         self._rows: list[tuple[int, int, int, int, int, int, int]] = []
         self.copying: list[Lock] = []
-        """A lock a message that was given a place; it is held until the payload is there."""
+        """A lock for each placed message; it is held until the payload is copied."""
         self.messages = 0
-        """Messages laid down so far."""
+        """Messages collected so far."""
         self.first_log_time = 0
         """Log time of the message that opened the chunk, nanoseconds."""
         self.opened = math.inf
-        """When that was, seconds of `time.monotonic`; never, while there is none."""
+        """Time of opening, seconds of `time.monotonic`; infinite while empty."""
 
     def __len__(self) -> int:
-        """Bytes laid down so far."""
+        """Bytes collected so far."""
         return self._used
 
     def append(self, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
-        """Copy the messages of a batch in; `batch.channel` holds the segment's channel ids.
+        """Append the messages of a batch; `batch.channel` holds the segment's channel ids.
 
         Args:
             batch: n messages, n > 0.
@@ -98,7 +98,7 @@ class ChunkBuilder:
         sequence: int,
         seq: int,
     ) -> Callable[[], None]:
-        """Lay down one message: for payloads so large that a batch of one costs more.
+        """Append one message with a large payload, at less cost than a batch of one.
 
         Args:
             payload: The serialized message.
@@ -109,19 +109,19 @@ class ChunkBuilder:
             seq: Arrival number.
 
         Returns:
-            What copies the payload to its place; one below `COPIED_AT_ONCE` is there already,
-            and nothing happens. It must be called once, on any thread; several may be at
-            the same time, and while other messages are laid down.
+            A function that copies the payload into the chunk; it does nothing for one below
+            `COPIED_AT_ONCE`, which is copied already. Call it once, on any thread; several may
+            run at the same time, also while other messages are appended.
         """
         length = len(payload)
         start = self._used + _HEAD
-        # The buffer stays where it is as long as anything is copied into it.
+        # The buffer must not move while payloads are copied into it.
         room = self.capacity if length >= COPIED_AT_ONCE else self._room()
         self._grow(max(start + length, room))
         if not self._used:
             self.first_log_time = log_time
             self.opened = time.monotonic()
-        view = self._buffer.data  # what is laid down without numpy costs less
+        view = self._buffer.data  # without numpy this costs less
         _ONE_HEAD.pack_into(
             view,
             self._used,
@@ -152,9 +152,9 @@ class ChunkBuilder:
         return copy
 
     def take(self) -> tuple[Batch, NDArray[np.int64], int]:
-        """Everything collected, and an empty builder again.
+        """Take all collected messages and empty the builder.
 
-        The content is whole when each lock of `copying`, as it was before, has been released.
+        The content is complete once each lock in the previous `copying` has been released.
 
         Returns:
             The messages, over the chunk's uncompressed content; their arrival numbers;
@@ -179,7 +179,7 @@ class ChunkBuilder:
         return whole, np.concatenate([seq for _, seq in pieces]), used
 
     def _settle(self) -> None:
-        """Make columns of the messages that came one by one."""
+        """Convert messages that were appended one by one into columns."""
         if not self._rows:
             return
         offset, length, channel, log_time, publish_time, sequence, seq = zip(
@@ -198,9 +198,9 @@ class ChunkBuilder:
         self._pieces.append((batch, np.array(seq, np.int64)))
 
     def _room(self) -> int:
-        """Bytes of buffer for a whole chunk, unless more comes than the one before lets expect.
+        """Buffer size for the next chunk, from the size of the one before.
 
-        What says little holds little memory, however much others say.
+        A topic with few messages holds little memory, however much others send.
         """
         return min(self._expected, self.capacity)
 
@@ -208,8 +208,8 @@ class ChunkBuilder:
         if size <= len(self._buffer):
             return
         room = self._room()
-        # Where payloads are large there is room for the whole chunk at once, so that nothing
-        # is copied twice.
+        # With large payloads the buffer has room for the whole chunk, so nothing is copied
+        # twice.
         if size * _LARGE_SHARE < room:
             room = 2 * size
         elif size > room:
@@ -230,4 +230,4 @@ class ChunkBuilder:
 
 
 def _nothing() -> None:
-    """What is left to do for a payload that was copied at once."""
+    """Do nothing: the payload was copied already."""

@@ -1,9 +1,9 @@
-"""The chunk table of a segment: where everything lies, and a checksum of each part.
+"""The chunk table of a segment: positions and checksums of all its parts.
 
-MCAP has a checksum of a chunk's content and one of the summary. It has none of a chunk's
-head, of message indexes, of metadata and of definitions. The table closes the gap: it is
-a record of the summary, and lists a checksum of every byte that stands before the summary.
-So what a reader believes of a segment has always been checked.
+MCAP has checksums of a chunk's content and of the summary. It has none of chunk heads,
+message indexes, metadata and definitions. The chunk table closes the gap: it is a record
+of the summary with checksums that cover every byte before the summary. So a reader uses
+only checked bytes.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ CHUNK: Final = np.dtype(
         ("parts", "<u4"),
     ]
 )
-"""A chunk: byte of its record, bytes of the record, bytes of the message indexes and the
-arrival record behind it, CRC-32 of the one and of the others, first and last log time in
-ns, and its number of rows in `parts`."""
+"""A chunk: offset and bytes of its record, bytes of the message indexes and arrival record
+behind it, CRC-32 of the record and of the part behind it, first and last log time in ns,
+and its number of rows in `parts`."""
 PART: Final = np.dtype(
     [
         ("channel", "<u4"),
@@ -51,10 +51,10 @@ PART: Final = np.dtype(
         ("last_publish", "<i8"),
     ]
 )
-"""The messages of one channel in one chunk: how many, bytes of their payloads, first and
-last log time, first and last publish time, all in ns."""
+"""The messages of one channel in one chunk: number, bytes of their payloads, first and
+last log time, first and last publish time, times in ns."""
 OTHER: Final = np.dtype([("offset", "<u8"), ("length", "<u8"), ("crc", "<u4")])
-"""A stretch of the file that belongs to no chunk: where it starts, its bytes, its CRC-32."""
+"""A stretch of the file outside of chunks: its start, its bytes, its CRC-32."""
 
 _HEAD = struct.Struct("<III")  # rows of chunks, parts and others
 _CHUNK_ROW = struct.Struct("<QQQIIqqI")
@@ -64,12 +64,12 @@ _MAX_BYTES = 1 << 28
 _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
 _FEW = 32  # messages
-_MERGED = 1 << 16  # bytes: a stretch is read whole to check one record of it
+_MERGED = 1 << 16  # bytes: checking one record reads its whole stretch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkTable:
-    """What a segment holds before its summary, byte for byte.
+    """All parts of a segment before its summary.
 
     Chunks with their trailers, and the other stretches, cover every byte from 0 to `end`
     exactly once.
@@ -86,7 +86,7 @@ class ChunkTable:
 
     @property
     def end(self) -> int:
-        """Bytes that the table covers: where the summary starts."""
+        """Bytes covered by the table; the summary starts there."""
         ends = [0]
         if len(self.chunks):
             last = self.chunks[-1]
@@ -96,17 +96,17 @@ class ChunkTable:
         return max(ends)
 
     def part_bounds(self) -> NDArray[np.int64]:
-        """Rows of `parts`, chunk by chunk.
+        """Bounds of each chunk's rows in `parts`.
 
         Returns:
-            int64[n + 1]; those of chunk i are `[bounds[i], bounds[i + 1])`.
+            int64[n + 1]; the rows of chunk i are `[bounds[i], bounds[i + 1])`.
         """
         bounds = np.zeros(len(self.chunks) + 1, np.int64)
         np.cumsum(self.chunks["parts"], out=bounds[1:])
         return bounds
 
     def by_channel(self) -> NDArray[np.void]:
-        """The parts of each channel added up.
+        """Totals of each channel.
 
         Returns:
             `PART`[c], by channel id; only channels with messages. `messages` is taken
@@ -126,7 +126,7 @@ class ChunkTable:
         return found
 
     def stretch(self, offset: int, length: int) -> tuple[int, int, int] | None:
-        """The one of `others` in which a record lies.
+        """The stretch of `others` that holds a record.
 
         Returns:
             Byte at which it starts, its bytes and its CRC-32; None when there is none.
@@ -138,13 +138,13 @@ class ChunkTable:
         return (start, size, crc) if offset + length <= start + size else None
 
     def to_bytes(self) -> bytes:
-        """The content of its record: the numbers of rows, and the rows as one zstd frame."""
+        """The content of the table's record: row counts, then the rows as one zstd frame."""
         rows = (self.chunks, self.parts, self.others)
         return _HEAD.pack(*map(len, rows)) + checked_frame(b"".join(r.tobytes() for r in rows))
 
     @classmethod
     def from_bytes(cls, body: Buffer) -> ChunkTable:
-        """The table that `to_bytes` made.
+        """Parse the output of `to_bytes`.
 
         Raises:
             SegmentError: It is damaged, or contradicts itself.
@@ -170,7 +170,7 @@ class ChunkTable:
 
 
 def _problem(table: ChunkTable) -> str | None:
-    """How a table contradicts itself, None when it does not."""
+    """The contradiction in a table, None if it is consistent."""
     chunks, parts, others = table.chunks, table.parts, table.others
     pieces = [(chunks["offset"], chunks["length"]), (others["offset"], others["length"])]
     pieces.append((chunks["offset"] + chunks["length"], chunks["trailer"]))
@@ -210,7 +210,7 @@ def _part_problem(table: ChunkTable, parts: NDArray[np.void]) -> str | None:
 
 
 def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], int, int]:
-    """What a chunk holds of each channel.
+    """Statistics of each channel in a chunk.
 
     Args:
         batch: Its messages, one at least; `channel` holds channel ids.
@@ -220,8 +220,8 @@ def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], i
         `PART`[c], by channel id; the first and the last log time of all, ns.
     """
     first, last = order[0], order[-1]
-    if batch.channel[first] == batch.channel[last]:  # as of most chunks
-        few = len(order) <= _FEW  # of which lists are the quicker ones
+    if batch.channel[first] == batch.channel[last]:  # as in most chunks
+        few = len(order) <= _FEW  # for few rows lists are faster
         length = batch.length.tolist() if few else batch.length
         publish = batch.publish_time.tolist() if few else batch.publish_time
         times = int(batch.log_time[first]), int(batch.log_time[last])
@@ -249,15 +249,15 @@ class TableBuilder:
 
     def __init__(self) -> None:
         self.chunks = 0
-        """Chunks so far: the number of the next one."""
+        """Number of chunks so far, which is the number of the next one."""
         self.parts = 0
         """Rows of parts so far."""
         self.end = 0
-        """Byte up to which everything is listed."""
+        """Byte up to which the file is covered."""
         self._chunks = bytearray()
         self._parts = bytearray()
         self._others = bytearray()
-        self._last: tuple[int, int, int] | None = None  # the stretch that may still grow
+        self._last: tuple[int, int, int] | None = None  # the last stretch, which may still grow
 
     def chunk(
         self,
@@ -271,7 +271,7 @@ class TableBuilder:
         last: int,
         parts: NDArray[np.void],
     ) -> None:
-        """List a chunk that starts where the last piece ended.
+        """Add a chunk that starts where the last piece ended.
 
         Args:
             offset: Byte of the chunk record.
@@ -294,14 +294,14 @@ class TableBuilder:
         self.end = offset + length + trailer
 
     def other(self, content: Buffer, *, alone: bool = False) -> None:
-        """List a record of no chunk that starts where the last piece ended.
+        """Add a record outside of chunks that starts where the last piece ended.
 
-        Small neighbours share a row. How the rows are cut depends only on the records, not
+        Small neighbours share a row. The division into rows depends only on the records, not
         on when they were written.
 
         Args:
             content: The record.
-            alone: Give it a row of its own: what is read back is not to depend on neighbours.
+            alone: Give it a row of its own, so that reading it does not depend on neighbours.
         """
         if alone:
             self.stretch(len(content), crc32(content))
@@ -318,10 +318,10 @@ class TableBuilder:
         self.end += len(content)
 
     def stretch(self, length: int, crc: int) -> None:
-        """List bytes of no chunk, in a row of their own.
+        """Add bytes outside of chunks, in a row of their own.
 
         Args:
-            length: Their number; 0 lists nothing.
+            length: Their number; 0 adds nothing.
             crc: Their CRC-32.
         """
         self._finish_stretch()
@@ -330,7 +330,7 @@ class TableBuilder:
             self.end += length
 
     def build(self, record: Buffer = b"") -> ChunkTable:
-        """The table of all that was listed, and of a record that is about to follow."""
+        """The table of all added pieces, and of a record that is about to follow."""
         before = self.end, self._last, len(self._others)
         self.other(record)
         others = bytes(self._others)

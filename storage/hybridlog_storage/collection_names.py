@@ -1,8 +1,8 @@
-"""From topics to names of MongoDB collections, one to one.
+"""Maps topics one-to-one to names of MongoDB collections.
 
-The plain rule (drop the leading slash, `/` becomes `__`) maps several topics to one
-name: `/a/b`, `/a__b` and `a/b` meet. It is used for canonical names only, where it can
-be undone; every other topic gets a name with a part of its hash in it.
+The plain rule (drop the leading slash, `/` becomes `__`) maps `/a/b`, `/a__b` and `a/b`
+to one name. It is used for canonical names only, where it is reversible. The name of any
+other topic contains a part of its hash.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def collection_of(topic: str) -> str:
     """The collection that holds the index documents of a topic.
 
     Args:
-        topic: Any string at all.
+        topic: Any string.
 
     Returns:
         `r_gripper_controller__command` for `/r_gripper_controller/command`; for a
-        topic that is no canonical ROS name, a readable form, `~` and eight hex digits.
+        topic that is not a canonical ROS name, a readable form, `~` and eight hex digits.
     """
     if _CANONICAL.fullmatch(topic) and len(topic) <= _LONGEST:
         return topic[1:].replace("/", "__")

@@ -1,7 +1,7 @@
-"""Compressing chunks that gain from it, and decompressing what cannot be trusted.
+"""Compresses chunks that gain from it, and decompresses untrusted data.
 
-A size that a file claims is compared with a limit, and with what its codec can reach
-at all, before a byte is allocated for it.
+A size claimed by a file is compared with a limit, and with the maximum ratio of its
+codec, before memory is allocated.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 MAX_UNCOMPRESSED = 1 << 30
-"""Largest chunk, in uncompressed bytes, that is decompressed unless told otherwise."""
+"""Default limit of a chunk's uncompressed size, bytes."""
 
-# What one compressed byte can become at most: an RLE block of zstd spends 4 bytes on
-# 128 KiB, a run of lz4 one byte on 255. A claim beyond that is a lie, whatever follows.
+# Maximum ratio of each codec: an RLE block of zstd spends 4 bytes on 128 KiB, a run of
+# lz4 one byte on 255. A larger claim is false.
 _MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _RATIO_SLACK = 1 << 17
 
 _PIECE = 1 << 18
-# In a hurry: what shrinks to this share is compressed sooner than it is written whole,
+# In a hurry: compressing to this share or less is faster than writing uncompressed,
 _WORTH_IT = 0.2
-_FAST = 1  # at this level of either codec, which samples are tried with, too.
+_FAST = 1  # at this level of either codec, also used for samples.
 
 _per_thread = threading.local()
 
@@ -38,20 +38,20 @@ _per_thread = threading.local()
 def decompress(
     compression: str, data: Buffer, uncompressed_size: int, *, limit: int = MAX_UNCOMPRESSED
 ) -> bytes | memoryview:
-    """The content of a chunk.
+    """Decompress the content of a chunk.
 
     Args:
         compression: MCAP name of the codec: `zstd`, `lz4`, or empty for none.
-        data: What the codec made.
-        uncompressed_size: Bytes that must come out.
-        limit: Most bytes that may come out.
+        data: The compressed data.
+        uncompressed_size: Expected bytes of output.
+        limit: Most bytes of output.
 
     Returns:
         `uncompressed_size` bytes; for no codec, a view of `data`.
 
     Raises:
-        SegmentError: The codec is not known, the size is above the limit or differs
-            from what comes out, or the data is damaged.
+        SegmentError: The codec is unknown, the size is above the limit or differs from
+        the output, or the data is damaged.
     """
     if uncompressed_size > limit:
         raise SegmentError(
@@ -81,16 +81,16 @@ def decompress(
 def decompress_prefix(
     compression: str, data: Buffer, uncompressed_size: int, *, limit: int = MAX_UNCOMPRESSED
 ) -> bytes | memoryview:
-    """What can be decompressed of data whose end is missing or damaged.
+    """Decompress as much as possible of data whose end is missing or damaged.
 
     Args:
         compression: MCAP name of the codec.
-        data: The beginning of what the codec made.
-        uncompressed_size: Bytes that the whole would give.
-        limit: Most bytes that may come out.
+        data: The beginning of the compressed data.
+        uncompressed_size: Bytes of the whole output.
+        limit: Most bytes of output.
 
     Returns:
-        The beginning of the content, perhaps nothing.
+        The beginning of the content, possibly empty.
     """
     most = min(uncompressed_size, limit)
     if compression == "":
@@ -104,7 +104,7 @@ def decompress_prefix(
                 if len(out) >= most:
                     break
         except (zstandard.ZstdError, RuntimeError, MemoryError):
-            pass  # the pieces before it are sound
+            pass  # the pieces before it are intact
     return bytes(out[:most])
 
 
@@ -163,12 +163,11 @@ def _lz4_pieces(data: Buffer) -> Iterator[bytes]:
 
 
 class Compressor:
-    """Compresses chunks, and leaves alone those that would not shrink.
+    """Compresses chunks, except those that would not shrink.
 
-    Images, and anything else that was compressed before, cost much time and gain
-    nothing. So a large chunk is tried on a few samples first, and whatever gains less
-    than `min_gain` is stored as it is, which spares every reader the decompression too.
-    May be used by several threads at once; the interpreter lock is free meanwhile.
+    Compressed images and the like cost much time and gain nothing. So a few samples of a
+    large chunk are tried first, and a chunk that gains less than `min_gain` is stored
+    uncompressed. Thread safe; compression releases the interpreter lock.
 
     Args:
         name: The codec; `none` stores everything as it is.
@@ -178,7 +177,7 @@ class Compressor:
         min_gain: Share of the size that compressing must save, 0 to 1.
 
     Raises:
-        ValueError: The codec is not known or the level not allowed.
+        ValueError: The codec is unknown or the level not allowed.
     """
 
     def __init__(
@@ -201,15 +200,15 @@ class Compressor:
         self._sample_size = sample_size
         self._samples = samples
         self._keep_above = 1.0 - min_gain
-        self._own = threading.local()  # a ZstdCompressor must not be shared by threads
+        self._own = threading.local()  # threads must not share a ZstdCompressor
 
     def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
-        """Compress a chunk if that is worth it.
+        """Compress a chunk if it gains enough.
 
         Args:
             data: Content of the chunk.
-            hurried: Whether there is time only for what shrinks to a fifth or less, as its
-                samples say, and for no level above 1.
+            hurried: Compress only if samples shrink to a fifth or less, and at level 1 at
+            most.
 
         Returns:
             MCAP name of the codec and the compressed bytes, or the empty name and `data`
@@ -224,7 +223,7 @@ class Compressor:
         return self.name, packed
 
     def _promising(self, data: Buffer, bound: float) -> bool:
-        """Whether samples shrink to a share; always for data hardly larger than the samples."""
+        """True if samples shrink to a share, or the data is hardly larger than the samples."""
         tried = self._sample_size * self._samples
         if len(data) < 4 * tried:
             return True

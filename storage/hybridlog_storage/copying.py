@@ -1,4 +1,4 @@
-"""Moving many payloads at once from one buffer to another."""
+"""Copies many payloads at once from one buffer to another."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 COPIED_AT_ONCE = 1 << 20
-"""Bytes below which a payload that has just come is copied without giving up the interpreter.
+"""Bytes below which a new payload is copied without releasing the interpreter lock.
 
-That takes a tenth of a millisecond, or two. When others have the interpreter meanwhile, it
-comes back after each of them, and where one computes, five milliseconds later.
+The copy takes a tenth of a millisecond, or two. After a release, getting the lock back
+from a computing thread takes five milliseconds.
 """
 
-_SLICE_FROM = 2048  # mean payload bytes from which one slice copy a message is cheapest
+_SLICE_FROM = 2048  # mean payload bytes from which one slice copy per message is cheapest
 
 
 def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
-    """Every run of `width` bytes of a buffer, by the offset at which it starts."""
+    """A view of every run of `width` bytes of a buffer, by start offset."""
     return np.ndarray(
         (max(len(buffer) - width + 1, 0),), dtype=f"V{width}", buffer=buffer, strides=(1,)
     )
@@ -34,12 +34,12 @@ def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
 def copy_payloads(
     batch: Batch | LooseBatch, target: bytearray | memoryview, starts: NDArray[np.int64]
 ) -> None:
-    """Copy each payload of a batch to its place in a buffer that is large enough."""
+    """Copy each payload of a batch to its position in a large enough buffer."""
     if isinstance(batch, LooseBatch):
         _copy_loose(batch, target, starts)
         return
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
-        # Between arrays numpy copies without the interpreter lock.
+        # numpy copies between arrays without the interpreter lock.
         source = np.frombuffer(batch.buffer, np.uint8)
         view = np.frombuffer(target, np.uint8)
         for to, at, size in zip(
@@ -67,10 +67,10 @@ def _copy_loose(
 
 
 def joined(batches: Sequence[Batch]) -> Batch:
-    """Batches one after the other over one new buffer: their buffers, whole.
+    """Concatenate batches, with their whole buffers, over one new buffer.
 
     Args:
-        batches: At least one; that one is returned as it is.
+        batches: At least one; a single one is returned unchanged.
     """
     if len(batches) == 1:
         return batches[0]
@@ -87,11 +87,11 @@ def joined(batches: Sequence[Batch]) -> Batch:
 
 
 def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
-    """The messages of several batches in another order, over one new buffer.
+    """Reorder the messages of several batches over one new buffer.
 
     Args:
         batches: At least one.
-        order: intp[n], row i of the result is row `order[i]` of the batches put together.
+        order: intp[n], row i of the result is row `order[i]` of the concatenated batches.
     """
     length = np.concatenate([b.length for b in batches])[order]
     ends = np.cumsum(length)

@@ -1,8 +1,8 @@
-"""MongoDB as hybridlog sees it: raw BSON in and out, and every driver error mapped.
+"""Access to MongoDB: raw BSON in and out, and driver errors mapped to hybridlog errors.
 
-The only module that talks to pymongo. Documents that hybridlog makes itself travel as
-bytes in both directions, thousands at a time, and never become Python objects.
-pymongo is imported on first use, since it takes longer than most commands.
+The only module that uses pymongo. Documents made by hybridlog are transferred as bytes in
+both directions, thousands at a time, and never become Python objects. pymongo is imported
+on first use, since its import takes longer than most commands.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 Document = dict[str, Any]
-"""A document that was read; the values are those of the `bson` package."""
+"""A decoded document with values of the `bson` package."""
 Sort = Sequence[tuple[str, int]]
 """Field paths with 1 (ascending) or -1 (descending)."""
 
@@ -43,10 +43,10 @@ OLDEST_SERVER = (5, 3)
 """The first MongoDB with clustered collections."""
 
 _MOST_TOGETHER = 100
-"""Most questions that travel in one command."""
+"""Most questions in one command."""
 _BYTES_TOGETHER = 4 << 20
 
-_GONE_S = 1.0  # without an answer, after which a server is taken to have ended
+_GONE_S = 1.0  # seconds without an answer after which the server counts as ended
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = frozenset({14031})
@@ -67,10 +67,10 @@ _WRONG_QUESTION = frozenset(
         241,  # ConversionFailure
     }
 )
-"""Server error codes that mean the predicate of a read is wrong."""
+"""Server error codes that mean an invalid predicate."""
 _UNNAMED_CODE = "Location"
-"""How the server begins the names of codes that have none: checks on the arguments of
-operators and expressions, thousands of them. Failures of the server itself have names."""
+"""Prefix of the server's unnamed error codes: thousands of checks on the arguments of
+operators and expressions. Failures of the server itself have names."""
 _WRITING_STAGES = frozenset({"$out", "$merge"})
 _LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
@@ -78,7 +78,7 @@ _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
 @dataclass(frozen=True, slots=True)
 class CollectionStats:
-    """Size of a collection; all zero when there is none of that name.
+    """Size of a collection; all zero if it does not exist.
 
     Attributes:
         documents: Number of documents.
@@ -94,11 +94,11 @@ class CollectionStats:
 
 
 class Database:
-    """One MongoDB database. Made by `connect`; a context manager; safe for threads.
+    """One MongoDB database, opened by `connect`. A context manager; thread safe.
 
-    Every method raises `DatabaseError` when the server does not answer or refuses, and
-    those that take a `filter` or a pipeline raise `WhereError` when that is wrong.
-    `max_time_ms` bounds what a read may take on the server.
+    Every method raises `DatabaseError` if the server does not answer or refuses. Methods
+    with a `filter` or a pipeline raise `WhereError` if that is invalid. `max_time_ms`
+    limits the time of a read on the server.
     """
 
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
@@ -108,17 +108,17 @@ class Database:
 
     @classmethod
     def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
-        """Connect and make sure that the server answers and is new enough.
+        """Connect and check that the server answers and is new enough.
 
         Args:
             uri: MongoDB connection string. A database named in it wins over `name`, a
                 `serverSelectionTimeoutMS` in it over `timeout_s`.
-            name: Database to use; need not exist.
+            name: Database to use; it need not exist.
             timeout_s: Seconds to wait for the server, now and in every later operation.
 
         Raises:
             UsageError: The URI or the database's name is malformed or not allowed.
-            DatabaseError: Nobody answers, the login is refused, or the server is too old.
+            DatabaseError: No server answers, the login is refused, or the server is too old.
         """
         from pymongo import MongoClient
         from pymongo.errors import InvalidURI, PyMongoError
@@ -128,7 +128,7 @@ class Database:
         try:
             parsed = parse_uri(uri, warn=False)
         except (InvalidURI, ValueError, TypeError) as error:
-            # Without the original text: pymongo quotes options, and those may be secret.
+            # Without the original text: pymongo quotes options, which may be secret.
             raise UsageError(
                 f"{address} is not a MongoDB connection string ({type(error).__name__}). Write "
                 f"mongodb://host:port/, and percent-encode user name, password and socket path."
@@ -168,7 +168,7 @@ class Database:
 
     @property
     def name(self) -> str:
-        """Name of the database in use."""
+        """Name of the database."""
         return self._database.name
 
     @property
@@ -188,15 +188,15 @@ class Database:
         self.close()
 
     def close(self) -> None:
-        """Close all connections. The object cannot be used any more."""
+        """Close all connections. The object is unusable afterwards."""
         from pymongo import timeout
 
-        # It tells the server which sessions are over, and would wait for one that has ended.
+        # Closing reports finished sessions to the server, and would wait for an ended server.
         with timeout(_GONE_S):
             self._client.close()
 
     def ping(self) -> bool:
-        """Whether the server answers within a second, however long others wait for it."""
+        """True if the server answers within a second, whatever the other timeouts are."""
         from pymongo import timeout
 
         try:
@@ -207,7 +207,7 @@ class Database:
         return True
 
     def ensure_collection(self, name: str) -> None:
-        """Make a clustered collection (`_id` is its only key) unless it is there."""
+        """Create a clustered collection (`_id` is its only key) unless it exists."""
         from pymongo.errors import OperationFailure
 
         with _mapped(self._address):
@@ -232,23 +232,23 @@ class Database:
     ) -> int:
         """Insert documents as they are.
 
-        A document whose `_id` is there already is passed over: documents are a pure
-        function of the segment, so it is the same one. After an error any part may
-        have been inserted, and inserting all again is right.
+        An existing `_id` is skipped: documents are a pure function of the segment, so the
+        document is the same. After an error any part may have been inserted, and inserting
+        all again is safe.
 
         Args:
-            collection: Where to; made by `ensure_collection`.
+            collection: The target, created by `ensure_collection`.
             documents: `count` BSON documents, one after the other.
             count: Their number.
-            lengths: int64[count], bytes of each document; saves walking over them.
+            lengths: int64[count], bytes of each document; avoids walking over them.
             journal: Return only when the documents are in the journal on disk (and, in a
                 replica set, with the majority).
 
         Returns:
-            How many were new.
+            Number of new documents.
 
         Raises:
-            ValueError: `documents` is not `count` documents of the lengths stated.
+            ValueError: `documents` does not hold `count` documents of the given lengths.
             DiskFullError: The server has no space left.
             DatabaseError: It refuses a document, or does not answer.
         """
@@ -257,7 +257,7 @@ class Database:
         inserted = 0
         for first, last in _batches(ends):
             start, end = int(ends[first]), int(ends[last])
-            # The whole goes without a copy, as pymongo before 4.18 takes bytes only.
+            # All documents are passed without a copy; pymongo before 4.18 takes bytes only.
             is_whole = isinstance(documents, bytes) and end - start == len(documents)
             part = documents if is_whole else whole[start:end]
             inserted += self._insert_batch(collection, bytes(part), journal=journal)
@@ -296,10 +296,10 @@ class Database:
         batch_size: int = 0,
         max_time_ms: int | None = None,
     ) -> Iterator[bytes]:
-        """Documents as bytes: each item is several BSON documents, one after the other.
+        """Find documents as bytes: each item is several concatenated BSON documents.
 
         Args:
-            collection: Where to look; one that does not exist is empty.
+            collection: The collection; one that does not exist is empty.
             filter: MongoDB's filter document.
             projection: MongoDB's projection document.
             sort: Order; None for the order of the collection, which is that of `_id`.
@@ -313,7 +313,7 @@ class Database:
                 None if projection is None else dict(projection),
                 sort=sort or None,
                 limit=limit,
-                # The server's first batch has 101 documents unless told otherwise.
+                # By default the server's first batch has 101 documents.
                 batch_size=batch_size or (1 << 30),
                 max_time_ms=max_time_ms,
             )
@@ -331,7 +331,7 @@ class Database:
         batch_size: int = 0,
         max_time_ms: int | None = None,
     ) -> Iterator[Document]:
-        """Documents one by one; for small answers. Arguments as in `find_raw`."""
+        """Find documents one by one; for small answers. Arguments as in `find_raw`."""
         with _mapped(self._address, question=True):
             cursor = self._collection(collection).find(
                 dict(filter or {}),
@@ -353,7 +353,7 @@ class Database:
         sort: Sort | None = None,
         max_time_ms: int | None = None,
     ) -> Document | None:
-        """The first document, None when there is none. Arguments as in `find_raw`."""
+        """Find the first document, None if no document matches. Arguments as in `find_raw`."""
         found = self.find(
             collection, filter, projection, sort=sort, limit=1, max_time_ms=max_time_ms
         )
@@ -369,14 +369,14 @@ class Database:
     ) -> int:
         """Number of documents that match.
 
-        Without a filter it is the collection's own count, which costs nothing, and is an
-        estimate since a server was killed.
+        Without a filter this is the collection's own count. It costs nothing, but is an
+        estimate after a server was killed.
 
         Args:
-            collection: Where to look; one that does not exist is empty.
+            collection: The collection; one that does not exist is empty.
             filter: MongoDB's filter document.
-            by_key: Find documents by `_id`, whatever other indexes there are. The
-                collection must be there.
+            by_key: Find documents by `_id`, whatever other indexes exist. The collection
+            must exist.
             max_time_ms: Most milliseconds on the server.
         """
         with _mapped(self._address, question=True):
@@ -389,10 +389,10 @@ class Database:
             return self._count(where, dict(filter), options)
 
     def _count(self, where: Collection[Document], query: Document, options: Document) -> int:
-        """With the command `count` where that is exact: it costs less than a pipeline."""
+        """Count with the command `count` where that is exact: it costs less than a pipeline."""
         from pymongo.errors import AutoReconnect, ServerSelectionTimeoutError
 
-        # A sharded cluster would count documents twice that are being moved.
+        # A sharded cluster would count documents twice while it moves them.
         if not self._client.is_mongos:
             try:
                 reply = self._database.command(
@@ -406,20 +406,20 @@ class Database:
             except ServerSelectionTimeoutError:
                 raise
             except AutoReconnect:
-                pass  # pipelines the driver tries again itself, commands it does not
+                pass  # the driver retries pipelines, but not commands
         return where.count_documents(query, **options)
 
     def count_each(
         self, questions: Sequence[tuple[str, Mapping[str, object]]], *, most: int = 0
     ) -> list[int]:
-        """Numbers of documents that match each of many questions, in few round trips.
+        """Count the documents that match each of many questions, in few round trips.
 
-        Meant for questions with a range of `_id`: MongoDB finds out by trial for each
-        whether that range or another index is the shorter way.
+        Meant for questions with a range of `_id`: MongoDB tries for each whether that range
+        or another index is faster.
 
         Args:
             questions: Collection and filter of each.
-            most: Stop counting there; 0 for never.
+            most: Count at most this many; 0 for no limit.
         """
         numbers = [0] * len(questions)
         for first, part in _together(questions):
@@ -442,13 +442,13 @@ class Database:
         order: int = 1,
         batch_size: int = 0,
     ) -> Iterator[bytes]:
-        """Documents of many questions, one after the other, as `find_raw` gives them.
+        """Find the documents of many questions, one after the other, as in `find_raw`.
 
         Args:
-            collection: Where to look.
+            collection: The collection.
             filters: The questions, each with a range of `_id`.
-            projection: MongoDB's projection document; names fields that are wanted.
-            order: Of `_id` within each answer: 1, or -1 for descending.
+            projection: MongoDB's projection document; names the fields to return.
+            order: Order of `_id` within each answer: 1, or -1 for descending.
             batch_size: Documents in one item; 0 for as many as fit 16 MiB.
         """
         shape: list[Document] = [] if projection is None else [{"$project": dict(projection)}]
@@ -469,7 +469,7 @@ class Database:
         *,
         max_time_ms: int | None = None,
     ) -> Iterator[Document]:
-        """Documents that come out of an aggregation pipeline, which may only read."""
+        """Run an aggregation pipeline that only reads."""
         for stage in pipeline:
             if not _WRITING_STAGES.isdisjoint(stage):
                 raise WhereError(f"A pipeline may only read: {', '.join(stage)} is not allowed.")
@@ -489,12 +489,12 @@ class Database:
         *,
         upsert: bool = True,
     ) -> None:
-        """Replace the first document that matches, or insert it when none does."""
+        """Replace the first matching document, or insert it if none matches."""
         with _mapped(self._address):
             self._collection(collection).replace_one(dict(filter), dict(document), upsert=upsert)
 
     def replace_all(self, collection: str, documents: Sequence[Mapping[str, object]]) -> None:
-        """Put each document in the place of the one with its `_id`, or insert it."""
+        """Replace or insert each document by its `_id`."""
         from pymongo import ReplaceOne
 
         if documents:
@@ -512,7 +512,7 @@ class Database:
         *,
         upsert: bool = False,
     ) -> int:
-        """Apply update operators to every document that matches; return how many matched."""
+        """Apply update operators to every matching document; return their number."""
         with _mapped(self._address):
             result = self._collection(collection).update_many(
                 dict(filter), dict(change), upsert=upsert
@@ -520,12 +520,12 @@ class Database:
             return result.matched_count
 
     def delete(self, collection: str, filter: Mapping[str, object]) -> int:  # noqa: A002
-        """Delete every document that matches; return how many. `{}` deletes all."""
+        """Delete every matching document; return their number. `{}` deletes all."""
         with _mapped(self._address):
             return self._collection(collection).delete_many(dict(filter)).deleted_count
 
     def drop(self, collection: str) -> None:
-        """Remove a collection; one that does not exist is no error."""
+        """Remove a collection if it exists."""
         with _mapped(self._address):
             self._collection(collection).drop()
 
@@ -548,7 +548,7 @@ class Database:
         unique: bool = False,
         sparse: bool = False,
     ) -> str:
-        """Make an index unless the same is there; return its name."""
+        """Create an index unless it exists; return its name."""
         with _mapped(self._address):
             options: dict[str, Any] = {"sparse": True} if sparse else {}
             return self._collection(collection).create_index(list(keys), unique=unique, **options)
@@ -561,7 +561,7 @@ class Database:
         return sorted(key for key in keys if [field for field, _ in key] != ["_id"])
 
     def drop_index(self, collection: str, keys: Sort) -> bool:
-        """Drop the index with these keys; whether there was one."""
+        """Drop the index with these keys; return whether it existed."""
         if list(keys) not in self.indexes(collection):
             return False
         with _mapped(self._address):
@@ -593,14 +593,14 @@ class Database:
 
 
 _IN_ORDER: Document = {"$sort": {"_id": 1}}
-"""Lets a pipeline's question be found by a range of `_id`: beside another index that fits,
-MongoDB thinks of that way only where it saves sorting."""
+"""Lets MongoDB consider a range of `_id` for a pipeline: with another matching index, it does
+so only if that saves sorting."""
 
 
 def _together(
     questions: Sequence[tuple[str, Mapping[str, object]]],
 ) -> Iterator[tuple[int, Sequence[tuple[str, Mapping[str, object]]]]]:
-    """Questions that fit into one command, and the number of the first of them."""
+    """Groups of questions that fit into one command, with the number of the first."""
     from bson import encode
 
     if not questions:
@@ -613,23 +613,23 @@ def _together(
 
 
 def _union(parts: Sequence[tuple[str, list[Document]]]) -> tuple[str, list[Document]]:
-    """One pipeline that gives what several give, one after the other."""
+    """One pipeline with the results of several, one after the other."""
     collection, pipeline = parts[0]
     others = [{"$unionWith": {"coll": where, "pipeline": stages}} for where, stages in parts[1:]]
     return collection, [*pipeline, *others]
 
 
 def without_secrets(uri: str) -> str:
-    """A connection string that may be shown: scheme, hosts and database only."""
+    """A connection string without secrets: scheme, hosts and database only."""
     scheme, found, rest = uri.partition("://")
     if not found:
         return "the given URI"
-    # From the last @, since a password that was not encoded may hold anything.
+    # From the last @, since an unencoded password may contain any character.
     return f"{scheme}://{rest.rpartition('@')[2].partition('?')[0]}"
 
 
 def shut_down(uri: str) -> None:
-    """Ask the server to end; says nothing when it cannot be asked."""
+    """Ask the server to end; ignore errors."""
     from pymongo import MongoClient
     from pymongo.errors import PyMongoError
 
@@ -642,7 +642,7 @@ def shut_down(uri: str) -> None:
 def _document_ends(
     documents: memoryview, count: int, lengths: NDArray[np.int64] | None
 ) -> NDArray[np.int64]:
-    """Where each document starts and ends: int64[count + 1], byte offsets.
+    """Start and end of each document: int64[count + 1], byte offsets.
 
     Raises:
         ValueError: The lengths do not add up, or differ from those in the documents.
@@ -705,8 +705,8 @@ def _pass_through(documents: bytes) -> Mapping[str, Any]:
 def _pass_through_type() -> Callable[[bytes], Mapping[str, Any]]:
     """A type of "document" that pymongo copies into the message as it is.
 
-    An insert's documents stand in an OP_MSG document sequence, where nothing comes
-    between them and nothing counts them; so any number of them may pose as one.
+    An insert sends documents in an OP_MSG document sequence, without separators and
+    without a count. So any number of documents can be passed as one.
     """
     from bson.raw_bson import RawBSONDocument
 
@@ -714,15 +714,15 @@ def _pass_through_type() -> Callable[[bytes], Mapping[str, Any]]:
         __slots__ = ("_documents",)
 
         def __init__(self, documents: bytes) -> None:
-            # Not super's, which insists on one document.
+            # Not super().__init__, which requires exactly one document.
             self._documents = documents
 
         @property
         def raw(self) -> bytes:
             return self._documents
 
-        # The driver's own logs and monitors look at commands as mappings. To them these
-        # documents are an empty one.
+        # The driver's logs and monitors read commands as mappings. They see an empty
+        # document here.
         def __getitem__(self, key: str) -> Any:
             raise KeyError(key)
 
@@ -743,11 +743,12 @@ def _pass_through_type() -> Callable[[bytes], Mapping[str, Any]]:
 
 @contextlib.contextmanager
 def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
-    """Map what pymongo and bson raise.
+    """Map errors of pymongo and bson.
 
     Args:
         address: The server, for the message.
-        question: The caller's filter is on the way, so some errors mean that it is wrong.
+        question: The command contains the caller's filter, so some errors mean that the
+        filter is invalid.
     """
     from bson.errors import BSONError
     from pymongo.errors import (
@@ -762,7 +763,7 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         yield
     except ExecutionTimeout as error:
         raise DatabaseError(
-            f"MongoDB at {address} gave up after the time allowed for the question; allow more, "
+            f"MongoDB at {address} exceeded the time allowed for the question; allow more time, "
             f"or ask for less."
         ) from error
     except OperationFailure as error:
@@ -773,7 +774,7 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         raise _refused(address, code, text) from error
     except ConnectionFailure as error:
         raise DatabaseError(
-            f"MongoDB at {address} does not answer: {_first_words(error)}. See that it runs and "
+            f"MongoDB at {address} does not answer: {_first_words(error)}. Check that it runs and "
             f"can be reached."
         ) from error
     except (DocumentTooLarge, BSONError, OverflowError, RecursionError, UnicodeError) as error:
@@ -800,7 +801,7 @@ def _is_wrong_question(code: int, details: Mapping[str, Any] | None) -> bool:
 
 
 def _server_words(details: Mapping[str, Any] | None) -> str:
-    """The server's message; pymongo's own adds the whole reply to it."""
+    """The server's message; pymongo's own adds the whole reply."""
     return str(details.get("errmsg", "")) if details else ""
 
 

@@ -1,14 +1,14 @@
-"""The store on disk: where things lie, and who may touch them.
+"""The store's directory: its layout and its locks.
 
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
   recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
-  catalog.sqlite        derived: which recordings, channels and chunks there are
+  catalog.sqlite        derived: recordings, channels and chunks
   mongod/               derived: data of the embedded MongoDB
 ```
 
-The label of a recording is for people. Which recording it is says the journal.
+The label of a recording is for people. The journal identifies the recording.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from hybridlog_storage.sharing import make_shared
 
 LOCK: Final = "writer.lock"
 REMOVED: Final = ".removed-"
-"""Beginning of the name of a recording that is being deleted."""
+"""Prefix of the directory of a recording that is being deleted."""
 IMPORTING: Final = ".importing-"
-"""Beginning of the name of a recording that is being copied in from another store."""
+"""Prefix of the directory of a recording that is being imported."""
 _RECORDINGS: Final = "recordings"
 
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """What lies in a recording's directory.
+    """Content of a recording's directory.
 
     Attributes:
-        journal: Whether there is a journal.
+        journal: Whether it has a journal.
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
-        print: Changes whenever a file that matters does.
+        print: A value that changes whenever a relevant file changes.
     """
 
     journal: bool
@@ -64,7 +64,7 @@ class StoreDirectory:
     """A store's directory.
 
     Raises:
-        StoreError: there is no store, it is of another format, or cannot be read.
+        StoreError: It is not a store, has another format, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,22 +75,22 @@ class StoreDirectory:
     def create(
         cls, path: Path, *, mongo: str | None = None, shared: bool = False
     ) -> StoreDirectory:
-        """Make a store, or open the one that is there.
+        """Create a store, or open an existing one.
 
         Args:
-            path: Where.
+            path: The directory.
             mongo: URI of the MongoDB to use instead of the embedded one; without a password.
-            shared: Whether a group may write it; of a new store only.
+            shared: Whether a group may write it; for a new store only.
 
         Raises:
-            StoreError: the directory holds something else, or cannot be written.
+            StoreError: The directory holds other files, or cannot be written.
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
         try:
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
-                # Of several processes one makes the store, and the others open it.
+                # Of several processes, one creates the store and the others open it.
                 with _alone(path, depth=0):
                     cls._make(path, mongo, shared=shared)
             store = cls(path)
@@ -109,10 +109,10 @@ class StoreDirectory:
         names = {entry.name for entry in path.iterdir()}
         if SETTINGS in names:
             return
-        # What a crash in here has left of the settings is no file of anybody's.
+        # A temporary settings file left by a crash here does not count.
         if any(not name.startswith(f".{SETTINGS}.") for name in names):
             raise StoreError(
-                f"{path} holds files and is no hybridlog store. "
+                f"{path} holds files and is not a hybridlog store. "
                 "Choose an empty or a new directory with --store."
             )
         write_settings(path, StoreSettings(secrets.token_hex(16), mongo=mongo, shared=shared))
@@ -121,16 +121,16 @@ class StoreDirectory:
 
     @property
     def is_writable(self) -> bool:
-        """Whether this user may change the store."""
+        """True if this user may change the store."""
         return os.access(self.path / _RECORDINGS, os.W_OK | os.X_OK) and os.access(
             self.path, os.W_OK | os.X_OK
         )
 
     def check_writable(self) -> None:
-        """Refuse a store that cannot be written, before anything is tried.
+        """Raise if the store cannot be written.
 
         Raises:
-            StoreError: it is read-only for this user.
+            StoreError: It is read-only for this user.
         """
         if not self.is_writable:
             raise StoreError(
@@ -152,7 +152,7 @@ class StoreDirectory:
         return [name for name in self._folders() if not name.startswith(".")]
 
     def has(self, label: str) -> bool:
-        """Whether there is something of this name below `recordings`."""
+        """True if this name exists below `recordings`."""
         try:
             files.status(self.recording(label), depth=files.IN_FOLDER)
         except FileNotFoundError:
@@ -162,7 +162,7 @@ class StoreDirectory:
         return True
 
     def hidden(self, beginning: str) -> list[str]:
-        """Names of directories of recordings that are being removed or copied in, sorted."""
+        """Directories of recordings that are being removed or imported, sorted."""
         return [name for name in self._folders() if name.startswith(beginning)]
 
     def _folders(self) -> list[str]:
@@ -175,7 +175,7 @@ class StoreDirectory:
         return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
 
     def listing(self, label: str) -> Listing:
-        """What lies in a recording's directory.
+        """Read the content of a recording's directory.
 
         Raises:
             StoreError: It cannot be read.
@@ -215,12 +215,12 @@ class StoreDirectory:
         )
 
     def segments(self, label: str) -> list[tuple[int, Path]]:
-        """Number and path of the sealed segments of a recording, in order."""
+        """Number and path of each sealed segment of a recording, in order."""
         path = self.recording(label)
         return [(number, path / name) for number, name in self.listing(label).sealed.items()]
 
     def open_segments(self, label: str) -> list[tuple[int, Path]]:
-        """Number and path of segments that were never sealed, in order."""
+        """Number and path of each unsealed segment, in order."""
         path = self.recording(label)
         return [(number, path / name) for number, name in self.listing(label).open.items()]
 
@@ -230,7 +230,7 @@ class StoreDirectory:
         return self.path / "mongod"
 
     def new_recording(self, name: str) -> str:
-        """Make a directory for a new recording; returns its label, made from the name."""
+        """Create a directory for a new recording; return its label, made from the name."""
         base = label_of(name)
         number = 1
         while True:
@@ -246,10 +246,10 @@ class StoreDirectory:
                 return label
 
     def is_beginning(self, label: str) -> bool:
-        """Whether an empty recording may be one that somebody is just about to lock.
+        """True if a process may be about to lock this empty recording.
 
-        Who begins one keeps all others from it until it is locked; so where nobody does, it
-        is what a crash has left.
+        A process that begins a recording locks `recordings` until the recording itself is
+        locked. Without that lock, an empty recording is left from a crash.
         """
         try:
             with _alone(self.recordings, depth=files.IN_STORE, wait=False):
@@ -258,7 +258,7 @@ class StoreDirectory:
             return True
 
     def free_label(self, name: str, *, but: str = "") -> str:
-        """A label made from a name that no recording has, but perhaps one."""
+        """A free label made from a name; the label of one recording may count as free."""
         base = label_of(name)
         taken = set(self._folders()) - {but}
         number = 1
@@ -267,7 +267,7 @@ class StoreDirectory:
         return label
 
     def move(self, old: str, new: str) -> None:
-        """Give a directory below `recordings` another name, durably."""
+        """Durably rename a directory below `recordings`."""
         try:
             files.rename(self.recording(old), self.recording(new), depth=files.IN_FOLDER)
             self._sync()
@@ -275,13 +275,13 @@ class StoreDirectory:
             raise durability.explain(error, self.recording(old), "renaming") from error
 
     def hide(self, label: str) -> str:
-        """Take a recording out of sight, durably; returns the name of what is to be swept."""
+        """Durably give a recording a hidden name, and return that name."""
         hidden = f"{REMOVED}{label}-{secrets.token_hex(4)}"
         self.move(label, hidden)
         return hidden
 
     def sweep(self, name: str) -> None:
-        """Delete a directory below `recordings` that is out of sight."""
+        """Delete a hidden directory below `recordings`."""
         path = self.recording(name)
         try:
             files.remove_tree(path, depth=files.IN_FOLDER)
@@ -294,7 +294,7 @@ class StoreDirectory:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep other processes from starting a recording meanwhile; for moments only."""
+        """Lock `recordings`, so that no other process starts a recording; for moments only."""
         try:
             with _alone(self.recordings, depth=files.IN_STORE):
                 yield
@@ -303,7 +303,7 @@ class StoreDirectory:
 
     @contextmanager
     def writing(self, label: str) -> Iterator[bool]:
-        """Hold a recording for writing; False when another process does."""
+        """Lock a recording for writing; False if another process holds the lock."""
         path = self.recording(label) / LOCK
         try:
             fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
@@ -320,7 +320,7 @@ class StoreDirectory:
             os.close(fd)
 
     def is_held(self, label: str) -> bool:
-        """Whether somebody holds a recording for writing at this moment."""
+        """True if a process holds a recording's lock at this moment."""
         try:
             fd = files.open_file(self.recording(label) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
         except OSError:
@@ -336,10 +336,10 @@ class StoreDirectory:
 
 @contextmanager
 def _alone(directory: Path, *, depth: int, wait: bool = True) -> Iterator[None]:
-    """Keep other processes that do the same out of a directory.
+    """Lock a directory.
 
     Raises:
-        BlockingIOError: Another process does, and `wait` is not set.
+        BlockingIOError: Another process holds the lock, and `wait` is not set.
     """
     with files.folder(directory, depth) as fd:
         fcntl.flock(fd, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -347,12 +347,12 @@ def _alone(directory: Path, *, depth: int, wait: bool = True) -> Iterator[None]:
 
 
 def label_of(name: str) -> str:
-    """A name as that of a directory."""
+    """Turn a name into a valid label."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:80] or "recording"
 
 
 def _numbered(name: str) -> tuple[int, str]:
-    """Number and suffix of a segment's file; no suffix for other files."""
+    """Number and suffix of a segment's file; an empty suffix for other files."""
     for suffix in (OPEN_SUFFIX, SEALED_SUFFIX):
         stem = name.removesuffix(suffix)
         if stem != name and stem.isascii() and stem.isdigit() and len(stem) <= 9:

@@ -1,4 +1,4 @@
-"""The different values of an array."""
+"""Distinct values of an array."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def distinct(values: NDArray[T]) -> NDArray[T]:
-    """Each value once, in order: T[n] to T[k].
+    """The distinct values in ascending order: T[n] to T[k].
 
-    `numpy.unique` finds them, too, but loads masked arrays when it is called for the first
-    time, which stops a recording for 15 milliseconds in the middle of its first messages.
+    Its first call to `numpy.unique` would load masked arrays, which stops a recording for
+    15 milliseconds during its first messages.
     """
     ordered = np.sort(values)
     is_first = np.ones(len(ordered), np.bool_)

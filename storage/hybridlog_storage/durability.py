@@ -1,4 +1,4 @@
-"""The one module that decides when bytes are safe, and what a failed write means.
+"""Durable writes, and the meaning of a failed write.
 
 Model: a file system may reorder writes of different files, and may lose everything
 since the last fsync when power fails; when only a process dies, what was written
@@ -22,7 +22,7 @@ from hybridlog_storage.messages import Buffer
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
-    """The error of our tree for an operating system error on a file of the store."""
+    """Map an operating system error on a file of the store to a hybridlog error."""
     if error.errno in NO_SPACE:
         return DiskFullError(
             f"No space left while {doing} {path}. Free some space and run the command again."
@@ -36,7 +36,7 @@ def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
 
 
 def write_all(fd: int, parts: Sequence[Buffer]) -> int:
-    """Write all parts at the file's position; returns the number of bytes.
+    """Write all parts at the file's position; return the number of bytes.
 
     Raises:
         OSError: when the system refuses; a part may have been written by then.
@@ -49,7 +49,7 @@ def write_all(fd: int, parts: Sequence[Buffer]) -> int:
 
 
 def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
-    """What remains of some views when their first bytes have been dealt with."""
+    """The views without their first bytes."""
     for index, view in enumerate(views):
         if done < len(view):
             return [view[done:], *views[index + 1 :]]
@@ -63,12 +63,12 @@ def sync_file(fd: int) -> None:
 
 
 def publish(temporary: Path, final: Path, *, depth: int) -> None:
-    """Give a synced file its final name, durably.
+    """Durably give a synced file its final name.
 
     Args:
         temporary: The file; in the folder of `final`.
-        final: Its name from now on; a file of that name is replaced.
-        depth: As for `files.open_file`; 1 for a file outside of any store.
+        final: Its new name; a file of that name is replaced.
+        depth: As for `files.open_file`; 1 for a file outside of stores.
 
     Raises:
         OSError: It cannot be renamed, or the folder cannot be synced.
@@ -79,16 +79,16 @@ def publish(temporary: Path, final: Path, *, depth: int) -> None:
 
 @contextmanager
 def new_file(final: Path, *, depth: int) -> Iterator[int]:
-    """A file descriptor of a temporary file that becomes `final` if the block succeeds.
+    """Descriptor of a temporary file that becomes `final` if the block succeeds.
 
-    Nothing is left behind when it does not. The umask decides who may read the file.
+    Otherwise the temporary file is removed. The umask decides who may read the file.
 
     Args:
-        final: Its name once it is complete.
+        final: Its name after the block.
         depth: As for `files.open_file`.
 
     Raises:
-        HybridlogError: It cannot be made or written.
+        HybridlogError: It cannot be created or written.
     """
     temporary = final.with_name(f".{final.name}.{secrets.token_hex(8)}")
     try:
@@ -111,11 +111,11 @@ def new_file(final: Path, *, depth: int) -> Iterator[int]:
 
 
 def write_new(final: Path, content: bytes, *, depth: int) -> None:
-    """Write a small file: all of it or nothing.
+    """Write a small file atomically.
 
     Args:
         final: The file.
-        content: All of it.
+        content: Its whole content.
         depth: As for `files.open_file`.
 
     Raises:

@@ -1,9 +1,9 @@
-"""Every error that hybridlog raises on purpose, in one tree.
+"""All errors that hybridlog raises on purpose, in one tree.
 
-Classes are grouped by what a caller can do about them, and each group has an exit
-code of its own, which the command line uses. A message names the thing that is
-wrong, the place, and what to do next. Errors of drivers (pymongo, sqlite3, mcap,
-zstandard, pyarrow, rosbags) are mapped to one of these where they are caught.
+Classes are grouped by what a caller can do about them. Each group has an exit code of the
+command line. A message names the cause, the place, and the cure. Errors of libraries
+(pymongo, sqlite3, mcap, zstandard, pyarrow, rosbags) are mapped to one of these where
+they are caught.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import errno
 from typing import ClassVar, Final
 
 NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Numbers of system errors that mean that nothing more can be written."""
+"""System errors that mean a full disk."""
 
 
 class HybridlogError(Exception):
@@ -22,13 +22,13 @@ class HybridlogError(Exception):
 
 
 class UsageError(HybridlogError):
-    """The question is wrong: a time, a predicate, an option. Ask it differently."""
+    """An invalid question: a time, a predicate, an option."""
 
     exit_code = 2
 
 
 class TimeError(UsageError):
-    """A time or a time range that cannot be understood."""
+    """An invalid time or time range."""
 
 
 class WhereError(UsageError):
@@ -36,59 +36,59 @@ class WhereError(UsageError):
 
 
 class TopicError(UsageError):
-    """A topic, recording or field that does not exist, or a name that is ambiguous."""
+    """An unknown topic, recording or field, or an ambiguous name."""
 
 
 class SourceError(HybridlogError):
-    """An input file that gives nothing: missing, unreadable, empty, of the wrong kind."""
+    """An input file of which nothing can be read: missing, unreadable, empty, of the wrong kind."""
 
     exit_code = 3
 
 
 class SourceDamagedError(HybridlogError):
-    """An input file of which only a part could be read; that part is stored."""
+    """A damaged input file; the readable part is stored."""
 
     exit_code = 4
 
 
 class StoreError(HybridlogError):
-    """The store itself: no store, read-only, of a newer format, damaged."""
+    """An unusable store: missing, read-only, of a newer format, damaged."""
 
     exit_code = 5
 
 
 class SegmentError(StoreError):
-    """A segment of the store that cannot be read where it should be."""
+    """A segment of the store that cannot be read."""
 
 
 class CatalogError(StoreError):
-    """The catalog is damaged, or has lost what it should have. It is made again from the files."""
+    """The catalog is damaged or incomplete. It is rebuilt from the files."""
 
 
 class IndexChangedError(StoreError):
-    """Another process changes the index that was asked; asking again helps."""
+    """Another process changed the index during the question. Ask again."""
 
 
 class DatabaseError(HybridlogError):
-    """MongoDB does not answer, refuses, or has died."""
+    """MongoDB does not answer, refuses, or has ended."""
 
     exit_code = 6
 
 
 class DiskFullError(HybridlogError):
-    """No space left where the store lies."""
+    """No space left on the store's disk."""
 
     exit_code = 7
 
 
 class AlreadyRecordedError(HybridlogError):
-    """The content of this file is in the store already."""
+    """The content of the file is in the store already."""
 
     exit_code = 8
 
 
 class MissingDependencyError(HybridlogError):
-    """An optional package is needed; the message says how to install it."""
+    """An optional package is missing; the message says how to install it."""
 
     exit_code = 9
 
@@ -96,8 +96,8 @@ class MissingDependencyError(HybridlogError):
 class DefinitionError(HybridlogError):
     """A message definition that is missing, malformed or hostile.
 
-    Messages of that type are stored and fetched exactly all the same; only their
-    fields stay out of the index.
+    Messages of that type are still stored and fetched byte for byte. Only their fields
+    are not indexed.
     """
 
     exit_code = 10

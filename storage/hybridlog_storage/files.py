@@ -1,15 +1,15 @@
-"""Files of a store, reached without following a symlink, through one seam.
+"""File operations on a store, without following symlinks.
 
-A store may come from somebody else. So whatever lies inside it is opened relative to the
-handle of its folder, part by part, and a symlink on the way is an error. The user's own
-path to the store may lead through symlinks: only the last parts of a path, those inside
-the store, are held to this. `depth` is the number of these parts.
+A store may come from another user. So everything inside it is opened part by part,
+relative to the handle of its folder, and a symlink on the way is an error. The path to the
+store itself may contain symlinks: only the last `depth` parts of a path lie inside the
+store.
 
-A folder that is setgid and group-writable is shared: what is made in it is group-writable
-too, whatever the umask says of the group.
+A folder that is setgid and group-writable is shared: new files in it are group-writable,
+too, whatever the umask is.
 
-Everything that changes a store on the disk goes through `system`, so that tests can
-record what happens in which order, fail at a step, or lose what was not synced.
+All changes of a store on the disk go through `system`. Tests replace it to record the
+order of steps, to fail at a step, or to lose unsynced data.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ _GROUP = stat.S_IRWXG
 
 
 class System:
-    """The calls that change a file system. Tests put another one in place of `system`."""
+    """The calls that change a file system. Tests replace `system`."""
 
     def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
-        """Open, and perhaps make, a file in a folder that is held open."""
+        """Open or create a file in an open folder."""
         return os.open(name, flags | os.O_CLOEXEC, mode, dir_fd=folder)
 
     def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
-        """Write at the file's position; may write less than all."""
+        """Write at the file's position; may write only a part."""
         return os.writev(fd, parts)
 
     def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
-        """Write at a position; may write less than all."""
+        """Write at a position; may write only a part."""
         return os.pwritev(fd, parts, position)
 
     def truncate(self, fd: int, length: int) -> None:
-        """Cut or extend a file."""
+        """Truncate or extend a file."""
         os.ftruncate(fd, length)
 
     def sync(self, fd: int) -> None:
-        """Return once a file, or the names in a folder, are on the disk."""
+        """Force a file, or the names in a folder, to the disk."""
         os.fsync(fd)
 
     def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
-        """Give a file another name; replaces what has that name."""
+        """Rename a file; replaces a file of the new name."""
         os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder)
 
     def unlink(self, name: str, *, folder: int) -> None:
@@ -66,7 +66,7 @@ class System:
         os.unlink(name, dir_fd=folder)
 
     def mkdir(self, name: str, mode: int, *, folder: int) -> None:
-        """Make a folder."""
+        """Create a folder."""
         os.mkdir(name, mode, dir_fd=folder)
 
     def rmdir(self, name: str, *, folder: int) -> None:
@@ -74,24 +74,24 @@ class System:
         os.rmdir(name, dir_fd=folder)
 
     def chmod(self, fd: int, mode: int) -> None:
-        """Change who may do what with a file."""
+        """Change the permissions of a file."""
         os.fchmod(fd, mode)
 
 
 system: System = System()
-"""What all functions here call; looked up anew each time."""
+"""The calls used by all functions here; looked up on each use."""
 
 
 @contextmanager
 def folder(path: Path, depth: int) -> Iterator[int]:
-    """The handle of a folder, of which the last `depth` parts are no symlinks.
+    """The handle of a folder; the last `depth` parts of its path must not be symlinks.
 
     Args:
         path: The folder.
         depth: Parts of the path that lie inside the store; 0 for the store's own folder.
 
     Raises:
-        OSError: It is not there, is no folder, or a symlink stands in its place.
+        OSError: It does not exist, is not a folder, or is a symlink.
     """
     outer, inner = _split(path, depth)
     fd = os.open(outer, _FOLDER)
@@ -106,13 +106,13 @@ def folder(path: Path, depth: int) -> Iterator[int]:
 
 
 def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECORDING) -> int:
-    """Open a file of a store; no symlink on the way is followed.
+    """Open a file of a store without following symlinks.
 
     Args:
         path: The file.
         flags: As of `os.open`.
-        mode: For a file that is made; the umask applies.
-        depth: Parts of the path that lie inside the store, the file's name among them.
+        mode: Permissions of a new file; the umask applies.
+        depth: Parts of the path that lie inside the store, including the file's name.
 
     Raises:
         OSError: As `os.open`; ELOOP or ENOTDIR for a symlink.
@@ -129,20 +129,20 @@ def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECO
 
 
 def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
-    """The content of a small ordinary file.
+    """Read a small ordinary file.
 
     Args:
         path: The file.
-        most: Bytes that are read at most, and one more.
+        most: Largest expected size; one more byte is read to notice larger files.
         depth: As for `open_file`.
 
     Raises:
-        OSError: It cannot be read, or is no ordinary file.
+        OSError: It cannot be read, or is not an ordinary file.
     """
     fd = open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
-            raise OSError(0, "it is no ordinary file", str(path))
+            raise OSError(0, "it is not an ordinary file", str(path))
         parts: list[bytes] = []
         left = most + 1
         while left > 0 and (part := os.read(fd, min(left, 1 << 20))):
@@ -156,17 +156,17 @@ def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
 def write_file(
     path: Path, content: bytes, mode: int = 0o666, *, depth: int = IN_RECORDING, sync: bool = True
 ) -> None:
-    """Write a small file: all of it or nothing. What has its name is replaced, also a symlink.
+    """Write a small file atomically. It replaces a file or symlink of its name.
 
     Args:
         path: The file.
-        content: All of it.
-        mode: Who may do what with it; the umask applies.
+        content: Its whole content.
+        mode: Its permissions; the umask applies.
         depth: As for `open_file`.
-        sync: Whether to return only once it is on the disk.
+        sync: Whether to force it to the disk.
 
     Raises:
-        OSError: It cannot be written; nothing is left of it.
+        OSError: It cannot be written; no part of it remains.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode, depth=depth)
@@ -189,17 +189,17 @@ def write_file(
 
 
 def status(path: Path, *, depth: int = IN_RECORDING) -> os.stat_result:
-    """What is known of a file or folder; of a symlink, of the link itself.
+    """The status of a file or folder; of a symlink, that of the link itself.
 
     Raises:
-        OSError: It is not there.
+        OSError: It does not exist.
     """
     with folder(path.parent, depth - 1) as fd:
         return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
 
 
 def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
-    """What lies in a folder, by name, with what is known of each.
+    """The status of each entry of a folder, by name.
 
     Raises:
         OSError: It cannot be read.
@@ -213,10 +213,10 @@ def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
 
 
 def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:
-    """Make a folder; the umask applies.
+    """Create a folder; the umask applies.
 
     Raises:
-        OSError: It is there, or cannot be made.
+        OSError: It exists, or cannot be created.
     """
     with folder(path.parent, depth - 1) as fd:
         system.mkdir(path.name, mode, folder=fd)
@@ -239,7 +239,7 @@ def rename(
         new_depth: The same of `new`.
 
     Raises:
-        OSError: It is not there, or cannot be renamed.
+        OSError: It does not exist, or cannot be renamed.
     """
     with folder(old.parent, depth - 1) as fd:
         if new_depth is None:
@@ -253,14 +253,14 @@ def unlink(path: Path, *, depth: int = IN_RECORDING) -> None:
     """Remove a file.
 
     Raises:
-        OSError: It is not there, or cannot be removed.
+        OSError: It does not exist, or cannot be removed.
     """
     with folder(path.parent, depth - 1) as fd:
         system.unlink(path.name, folder=fd)
 
 
 def sync_folder(path: Path, *, depth: int = IN_FOLDER) -> None:
-    """Return once renames, new names and removals in a folder are on the disk."""
+    """Force renames, new names and removals in a folder to the disk."""
     with folder(path, depth) as fd:
         system.sync(fd)
 
@@ -278,7 +278,7 @@ def make_folders(path: Path, *, depth: int) -> None:
 
 
 def remove_tree(path: Path, *, depth: int) -> None:
-    """Remove a folder and all in it; what is gone already is no error.
+    """Remove a folder and its content; ignore what does not exist.
 
     Raises:
         OSError: Something cannot be removed.
@@ -288,7 +288,7 @@ def remove_tree(path: Path, *, depth: int) -> None:
 
 
 def _let_group_in(parent: int, fd: int, mode: int) -> None:
-    """Give the group what was asked for it, in a shared folder, of what is this user's."""
+    """In a shared folder, give the group the requested permissions of this user's file."""
     if os.fstat(parent).st_mode & _SHARED != _SHARED:
         return
     about = os.fstat(fd)
@@ -302,7 +302,7 @@ def _remove(parent: int, name: str) -> None:
         fd = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
     except FileNotFoundError:
         return
-    except OSError:  # a file, or a symlink
+    except OSError:  # a file or a symlink
         with suppress(FileNotFoundError):
             system.unlink(name, folder=parent)
         return
@@ -316,7 +316,7 @@ def _remove(parent: int, name: str) -> None:
 
 
 def _split(path: Path, depth: int) -> tuple[Path, tuple[str, ...]]:
-    """The part of a path outside of the store, and the names inside it."""
+    """Split a path into the part outside of the store and the names inside."""
     if depth <= 0:
         return path, ()
     return Path(*path.parts[:-depth]), path.parts[-depth:]

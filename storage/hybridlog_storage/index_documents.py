@@ -1,8 +1,8 @@
-"""Index documents as bytes: what stands around the fields of a message.
+"""Assembles index documents as bytes around the fields of messages.
 
-A document is `_id`, the message's fields, and `_meta` (see the design note "The hybrid
-store"). The fields come ready made as BSON elements; here thousands of documents are
-put together at once: a template row is tiled, and each value that differs is a column.
+A document is `_id`, the message's fields, and `_meta` (see `docs/format.md`). The fields
+are given as BSON elements. Thousands of documents are assembled at once: a template row is
+tiled, and each value that differs is a column.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ def key_bound(log_time: int) -> bytes:
 
 
 def recording_key(document: bytes) -> str:
-    """Key of the recording that an index document belongs to, 16 hexadecimal digits."""
+    """Key of the recording of an index document, 16 hexadecimal digits."""
     return document[_KEY_AT + 8 : _KEY_AT + 16].hex()
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What all documents of one channel of one recording share.
+    """Values shared by all documents of one channel of one recording.
 
     Attributes:
         key: The first 64 bits of the recording's id, 16 hexadecimal digits.
-        topic: As the source spells it.
+        topic: The topic, as the source spells it.
         has_publish_time: Whether `_meta.pub` is written.
     """
 
@@ -55,15 +55,15 @@ class Origin:
 
 
 class Placed(NamedTuple):
-    """The messages of some chunks, and where they lie.
+    """The messages of some chunks, and their positions.
 
     Attributes:
-        batch: n messages, those of each chunk together; its offsets are into its buffer.
+        batch: n messages, grouped by chunk; its offsets refer to its buffer.
         seq: int64[n], arrival numbers.
-        number: intp[n], which of the chunks each is from.
-        segment: int32[n], of that chunk.
-        chunk: int64[n], the chunk's number in the segment.
-        offset: int64[n], the payload's place in the chunk's content.
+        number: intp[n], index of the chunk of each message.
+        segment: int32[n], segment of that chunk.
+        chunk: int64[n], number of the chunk in the segment.
+        offset: int64[n], position of the payload in the chunk's content.
     """
 
     batch: Batch
@@ -75,7 +75,7 @@ class Placed(NamedTuple):
 
     @classmethod
     def of(cls, chunks: Sequence[StoredChunk]) -> Self:
-        """All messages of one chunk or more; of several the contents are copied together."""
+        """All messages of one or more chunks; the contents of several are copied together."""
         batches = [chunk.batch for chunk in chunks]
         number = np.arange(len(chunks)).repeat([len(batch) for batch in batches])
         return cls(
@@ -89,7 +89,7 @@ class Placed(NamedTuple):
 
 
 class DocumentAssembler:
-    """Puts together the index documents of one channel."""
+    """Assembles the index documents of one channel."""
 
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
@@ -102,13 +102,13 @@ class DocumentAssembler:
         body: NDArray[np.uint8],
         error: str | None = None,
     ) -> NDArray[np.uint8]:
-        """Documents of some messages.
+        """Assemble the documents of some messages.
 
         Args:
-            placed: The messages, and others.
-            rows: intp[k], which of them.
+            placed: Messages of some chunks.
+            rows: intp[k], the rows to use.
             body: uint8[k, w], BSON elements of each message's fields.
-            error: Why there are no fields, for `_meta.error`.
+            error: The reason for missing fields, for `_meta.error`.
 
         Returns:
             uint8[k, width]: one whole BSON document a row.
@@ -146,7 +146,7 @@ class DocumentAssembler:
 
 
 class _Tail:
-    """The `_meta` element and the document's end, and where its values stand in it."""
+    """The `_meta` element and the document's end, and the positions of their values."""
 
     def __init__(self, origin: Origin, error: str | None) -> None:
         self.at: dict[str, int] = {}
@@ -194,5 +194,5 @@ class _Tail:
 
 
 def _column(out: NDArray[np.uint8], offset: int, dtype: str) -> NDArray[np.int64]:
-    """One value a row, at a fixed place of the row."""
+    """A column view of one value at a fixed position in each row."""
     return np.ndarray((len(out),), dtype, buffer=out, offset=offset, strides=(out.shape[1],))

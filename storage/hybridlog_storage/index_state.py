@@ -1,10 +1,10 @@
-"""Tracks in MongoDB which recordings are indexed, and how far.
+"""Stores in MongoDB the indexing progress of each recording.
 
-`hybridlog.recordings` mirrors the catalog for other programs, and says of each recording
-whether all of its index documents are there and from which segments they were made. A
-recording is believed only when both fit. `hybridlog.chunks` lists the chunks whose
-documents are in, while a recording is being indexed; it is written after them, so a
-server that was killed has not lost documents that it lists.
+`hybridlog.recordings` mirrors the catalog for other programs. It also states for each
+recording whether its index is complete, and from which segments it was made. The index is
+used only if both match. `hybridlog.chunks` lists indexed chunks while a recording is being
+indexed. A row is written after the documents of its chunk, so a killed server has not lost
+documents that it lists.
 """
 
 from __future__ import annotations
@@ -24,34 +24,33 @@ from hybridlog_storage.index_documents import key_bound
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
 STORE: Final = f"{CATALOG_PREFIX}store"
-"""Collection that says which store a database belongs to."""
-_AT_ONCE: Final = 500  # entries decoded at once; as dictionaries they take some kilobytes each
+"""Collection that names the store that owns a database."""
+_AT_ONCE: Final = 500  # entries decoded at once; each takes some kilobytes as a dictionary
 _STATS: Final = tuple(of.name for of in fields(ChannelStats))
 
 State = Literal["open", "clearing", "indexing", "complete", "removing"]
-"""Of a recording in the index: being recorded, documents being removed so that they can be made
-anew, being indexed, all there, being removed for good."""
+"""State of a recording's index: being recorded, documents being removed for a rebuild, being
+indexed, complete, being removed for good."""
 _DESTROYS: Final = frozenset({"clearing", "removing"})
 _KEY: Final = re.compile("[0-9a-f]{16}")
 _TURN: Final = {"_id": "turn"}
 _SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
-"""What of an entry may change while its segments stay."""
+"""Values of an entry that may change while its segments stay."""
 
 
 @dataclass(frozen=True, slots=True)
 class Indexed:
-    """What the index says of a recording.
+    """The state of a recording's index.
 
     Attributes:
         id: The recording.
-        state: How far it is.
-        segments: Digest of each segment of which all documents are there, by its number as text.
-        turn: Counts how often its documents were begun anew or removed.
-        collections: Where its documents are, as far as that was known.
-        has_list: Whether the list of its chunks may still be there although it is complete.
-        shown: What people write about it, as the mirror has it.
-        damage: Chunks that could not be read when their documents were to be made, by segment
-            and number, and why.
+        state: Progress of the index.
+        segments: Digest of each completely indexed segment, by its number as text.
+        turn: Counts how often its documents were removed or rebuilt.
+        collections: Collections of its documents, as far as known.
+        has_list: Whether the list of its chunks may still exist although it is complete.
+        shown: Name, tags, notes and marks in the mirror.
+        damage: Chunks that could not be read for indexing: reason by segment and number.
     """
 
     id: str
@@ -64,17 +63,17 @@ class Indexed:
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
 
     def mirrors(self, entry: RecordingEntry) -> bool:
-        """Whether the mirror shows a recording, whose segments are the same, as it is now."""
+        """True if the mirror of a recording with the same segments is current."""
         document = _mirrored(entry)
         return all(self.shown.get(name) == document[name] for name in _SHOWN)
 
     def is_whole(self, entry: RecordingEntry) -> bool:
-        """Whether all index documents of a recording are there, as it is now."""
+        """True if the index of a recording is complete and current."""
         return self.state == "complete" and dict(self.segments) == entry.digests
 
 
 class Progressed(NamedTuple):
-    """How far a recording is in the index: its turn, and digests of the segments in it."""
+    """Progress of a recording: its turn, and digests of the indexed segments."""
 
     turn: int
     segments: Mapping[str, str]
@@ -82,7 +81,7 @@ class Progressed(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class IndexedChunk:
-    """A chunk whose index documents are there."""
+    """An indexed chunk."""
 
     segment: int
     number: int
@@ -91,17 +90,17 @@ class IndexedChunk:
 
 
 class IndexState:
-    """Which recordings are in the index of a database."""
+    """The recordings indexed in a database."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
 
     def one(self, key: str) -> Indexed | None:
-        """What the index says of a recording, by its key; None when it does not know it."""
+        """The index state of a recording by its key; None if it is unknown."""
         return self.of([key]).get(key)
 
     def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
-        """By key of the recording: what the index says of these, or of all."""
+        """The index states of these recordings, or of all, by key."""
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
         wanted = {"id": 1, "index": 1, "channels.topic": 1, **dict.fromkeys(_SHOWN, 1)}
@@ -121,12 +120,12 @@ class IndexState:
         return found
 
     def turn(self) -> int:
-        """Counts how often documents of any recording were about to be removed."""
+        """The number of removals of documents of any recording so far."""
         found = self._db.find_one(STORE, _TURN)
         return int(found["turn"]) if found is not None else 0
 
     def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
-        """How far recordings are, by key; those that are not in the index are left out."""
+        """Progress of recordings by key, without unknown ones."""
         asked, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
         said = {
             found["_id"]: found.get("index") or {}
@@ -147,15 +146,15 @@ class IndexState:
         has_list: bool = False,
         damage: Mapping[tuple[int, int], str] | None = None,
     ) -> None:
-        """Mirror a recording, and say how far its index is.
+        """Mirror a recording and store the progress of its index.
 
         Args:
             entry: The recording.
-            state: How far the index is.
-            turn: Greater than before where documents are about to be removed.
-            segments: Digest of each segment that is in the index, by its number as text.
+            state: Progress of the index.
+            turn: Greater than before if documents are about to be removed.
+            segments: Digest of each indexed segment, by its number as text.
             has_list: Whether the list of its chunks is about to be dropped.
-            damage: Chunks that could not be read, by segment and number, and why.
+            damage: Chunks that could not be read: reason by segment and number.
         """
         unreadable = [
             {"seg": segment, "chunk": chunk, "reason": reason}
@@ -174,15 +173,15 @@ class IndexState:
         }
         self._db.replace(RECORDINGS, {"_id": entry.key}, document)
         if state in _DESTROYS:
-            # Whoever asks at this moment looks here before and after.
+            # Concurrent questions compare this number before and after.
             self._db.update(STORE, _TURN, {"$inc": {"turn": 1}}, upsert=True)
 
     def show(self, entry: RecordingEntry) -> None:
-        """Mirror a recording as it is now; what is said of its index stays as it is."""
+        """Mirror a recording; leave the state of its index unchanged."""
         self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": _mirrored(entry)})
 
     def is_mirrored(self, entry: RecordingEntry) -> bool:
-        """Whether the mirror says of a recording what the catalog says, and nothing else."""
+        """True if the mirror of a recording equals its catalog entry."""
         found = self._db.find_one(RECORDINGS, {"_id": entry.key})
         if found is None:
             return False
@@ -193,12 +192,12 @@ class IndexState:
             return False
 
     def drop_list(self, key: str) -> None:
-        """Drop the list of chunks of a recording that is complete."""
+        """Drop the list of chunks of a complete recording."""
         self.forget_chunks(key)
         self._db.update(RECORDINGS, {"_id": key}, {"$unset": {"index.has_list": 1}})
 
     def put_chunks(self, chunks: Sequence[ChunkEntry]) -> None:
-        """Note that the messages of chunks are in the index."""
+        """Add indexed chunks to the list."""
         self._db.replace_all(
             CHUNKS,
             [
@@ -218,7 +217,7 @@ class IndexState:
         )
 
     def chunks(self, key: str) -> Iterator[IndexedChunk]:
-        """The chunks of a recording whose messages are in the index, in order."""
+        """The indexed chunks of a recording, in order."""
         asked = {"_id": _all_of(key)}
         found = self._db.find(CHUNKS, asked, sort=[("_id", 1)], batch_size=_AT_ONCE)
         for document in found:
@@ -230,13 +229,13 @@ class IndexState:
             yield IndexedChunk(document["seg"], document["chunk"], document["offset"], stats)
 
     def places(self, key: str) -> dict[tuple[int, int], int]:
-        """Offset of each chunk whose messages are in the index, by segment and number."""
+        """Offset of each indexed chunk, by segment and number."""
         asked = {"_id": _all_of(key)}
         found = self._db.find(CHUNKS, asked, {"seg": 1, "chunk": 1, "offset": 1})
         return {(d["seg"], d["chunk"]): d["offset"] for d in found}
 
     def forget_chunks(self, key: str) -> None:
-        """Drop the list of chunks: the recording is complete, or gone."""
+        """Drop the list of chunks of a complete or removed recording."""
         self._db.delete(CHUNKS, {"_id": _all_of(key)})
 
     def clear(
@@ -249,9 +248,9 @@ class IndexState:
         """Remove the index documents of a recording, and the list of its chunks.
 
         Args:
-            key: Of the recording; what documents of none may have in its place.
-            collections: Where they may be.
-            span: First and last log time that they may have, ns; None for any.
+            key: Key of the recording, or another value of `_meta.rec` in foreign documents.
+            collections: Collections that may hold its documents.
+            span: First and last log time of its documents, ns; None for any.
             but: Segments whose documents stay.
         """
         asked: dict[str, object] = {"_meta.rec": key}
@@ -265,24 +264,24 @@ class IndexState:
             self._db.delete(collection, asked)
 
     def remove(self, key: str) -> None:
-        """Remove a recording from the mirror; the last step of its removal."""
+        """Remove a recording from the mirror, as the last step of its removal."""
         self._db.delete(RECORDINGS, {"_id": key})
 
     def topic_collections(self) -> list[str]:
-        """The collections of topics."""
+        """Names of the collections of topics."""
         return [c for c in self._db.list_collections() if not c.startswith(CATALOG_PREFIX)]
 
     def mark(self) -> Mapping[str, Any] | None:
-        """Which store the database belongs to, and where that lies; None for nobody's."""
+        """The store that owns the database, and its place; None without an owner."""
         return self._db.find_one(STORE, {"_id": "store"})
 
     def claim(self, values: Mapping[str, Any]) -> None:
-        """Say which store the database belongs to."""
+        """Register the store that owns the database."""
         self._db.replace(STORE, {"_id": "store"}, {"_id": "store", **values})
 
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
-    """An entry as MongoDB takes it: the name of a directory need not be UTF-8."""
+    """An entry as MongoDB accepts it: a directory's name may not be UTF-8."""
     return {**entry.to_document(), "label": _label(entry)}
 
 
@@ -295,5 +294,5 @@ def _place(key: str, segment: int, chunk: int) -> bytes:
 
 
 def _all_of(key: str) -> dict[str, bytes]:
-    """The ids of all chunks of a recording; MongoDB orders binary values by length first."""
+    """A filter for all chunks of a recording; MongoDB orders binary values by length first."""
     return {"$gte": _place(key, 0, 0), "$lte": _place(key, 0xFFFFFFFF, 0xFFFFFFFF)}

@@ -1,14 +1,14 @@
-"""The journal of a recording: what must lie beside it, and what was done with it.
+"""The journal of a recording: a list of its segments and events.
 
-Segments alone cannot say that one of them is missing, and they never change once they are
+Segments cannot show that one of them is missing, and they never change once they are
 sealed. So each recording has a journal: a text file that only grows. Each line is one
-event, with a checksum. A line is on the disk before the step that it announces: a segment
-is listed before it gets its final name, a removal before the first file goes. Segments and
-journal together are the truth; all else is made from them.
+event with a checksum. A line is on the disk before the step that it announces: a segment
+is listed before it gets its final name, a removal before the first file is deleted.
+Segments and journal are the truth; everything else is derived from them.
 
 A line is the CRC-32 of its JSON text in 8 hexadecimal digits, a space, the text, and a line
-feed. What stands behind the last line feed is a line that a crash has cut short; the step
-that it would have announced never began.
+feed. Bytes behind the last line feed are a line cut short by a crash; the step that it
+would have announced never began.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hybridlog_storage.errors import StoreError
 JOURNAL: Final = "journal"
 """Name of the file in a recording's directory."""
 MAX_JOURNAL: Final = 1 << 30
-"""Bytes of a journal that are read at most."""
+"""Largest journal that is read, bytes."""
 
 BEGUN: Final = "begun"
 SEALED: Final = "sealed"
@@ -42,29 +42,29 @@ ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
 RESERVED: Final = ("compacted", "expired", "signature")
-"""Events of later versions; a reader of this one keeps them and passes over them."""
+"""Events of later versions; this version preserves and ignores them."""
 
 Event = Mapping[str, Any]
-"""What a line says: `event`, `at` (ns since the epoch), and values of the event's own."""
+"""The content of a line: `event`, `at` (ns since the epoch), and values of the event."""
 
 
 def event(kind: str, /, **values: Any) -> dict[str, Any]:
-    """An event that happens now."""
+    """An event with the present time."""
     return {"event": kind, "at": time.time_ns(), **values}
 
 
 def encode(line: Event) -> bytes:
-    """An event as a line of the journal.
+    """Encode an event as a line of the journal.
 
     Raises:
-        ValueError: It holds what JSON cannot say.
+        ValueError: It is not representable in JSON.
     """
     text = json.dumps(line, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
     return b"%08x %b\n" % (crc32(text), text)
 
 
 def decode(line: bytes) -> dict[str, Any] | None:
-    """The event that a line holds, without its line feed; None when it is damaged."""
+    """The event of a line without its line feed; None if the line is damaged."""
     if line[:9] != b"%08x " % crc32(line[9:]):
         return None
     try:
@@ -77,13 +77,13 @@ def decode(line: bytes) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, slots=True)
 class SealedSegment:
-    """What a journal says of a segment.
+    """A segment as the journal lists it.
 
     Attributes:
         segment: Its number.
         file: Its name in the recording's directory.
         bytes: Its size.
-        digest: Of its summary: `sha256:` and hexadecimal digits.
+        digest: Digest of its summary: `sha256:` and hexadecimal digits.
         channels: `id`, `topic`, `messages`, `payload_bytes`, `first`, `last` (log time, ns) of
             each channel in it.
     """
@@ -96,30 +96,28 @@ class SealedSegment:
 
     @property
     def messages(self) -> int:
-        """Messages in it."""
+        """Number of messages in it."""
         return sum(int(c["messages"]) for c in self.channels)
 
 
 @dataclass(slots=True)
 class JournalState:
-    """What a whole journal says of its recording.
+    """The state of a recording after all events of its journal.
 
     Attributes:
-        id: The recording's, 32 hexadecimal digits; empty when no line says it.
+        id: The recording's id, 32 hexadecimal digits; empty if no line states it.
         store: Id of the store that it belongs to.
-        begun: The first event; empty when it is lost.
-        name: As the user calls it now.
-        tags: As they are now.
-        notes: In the order in which they were written: `at` and `text`.
-        marks: Those that were set after the end: `time`, `text`, `tags`, `segment`.
-        sealed: By number of the segment.
-        replaced: Segments that came out of a crash with less than was listed before: what was
-            listed, and what is.
-        end: How the recording ended; None while it goes on.
-        moving: The label that its directory had when it was renamed, and the one that it was
-            to get; None once it has got it.
-        removing: Whether somebody began to remove it.
-        rebuilt: Why the journal was written again; None for one that was there all the time.
+        begun: The first event; empty if it is lost.
+        name: The present name.
+        tags: The present tags.
+        notes: Notes in the order of writing: `at` and `text`.
+        marks: Marks set after the end: `time`, `text`, `tags`, `segment`.
+        sealed: Segments by number.
+        replaced: Segments that a crash shortened: as listed before, and as they are.
+        end: The end of the recording; None while it is running.
+        moving: Old and new label of a rename that is not finished, else None.
+        removing: Whether a removal began.
+        rebuilt: The reason why the journal was rebuilt; None for an original one.
         damaged: Numbers of lines, from 1, that cannot be read.
         lines: Number of whole lines.
         length: Bytes of whole lines.
@@ -146,14 +144,14 @@ class JournalState:
 
     @property
     def is_proof(self) -> bool:
-        """Whether it lists all that there was: no line of it was lost."""
+        """True if it is a complete list: no line of it was lost."""
         return bool(self.begun) and not self.damaged and self.rebuilt is None
 
     def take(self, line: Event) -> None:
-        """Take in the next event.
+        """Apply the next event.
 
         Raises:
-            KeyError, TypeError, ValueError: It lacks what such an event has.
+            KeyError, TypeError, ValueError: A value of the event is missing or invalid.
         """
         name = line["event"]
         if name == BEGUN:
@@ -179,7 +177,7 @@ class JournalState:
                 "tags": _tags(line["tags"]),
                 "segment": int(line["segment"]),
             }
-            # One that a crash has cut short before its segment was listed was told in vain.
+            # A mark whose segment a crash kept from being listed does not exist.
             self.marks = [m for m in self.marks if m["segment"] in self.sealed]
             self.marks.append(mark)
         elif name == ADOPTED:
@@ -223,14 +221,14 @@ class JournalState:
 
 
 def read_lines(data: bytes) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Number, from 1, and event of each whole line; None for one that is damaged."""
+    """Number, from 1, and event of each whole line; None for a damaged line."""
     end = data.rfind(b"\n") + 1
     for number, line in enumerate(data[:end].split(b"\n")[:-1], 1):
         yield number, decode(line)
 
 
 def parse(data: bytes) -> JournalState:
-    """What the bytes of a journal say. Lines that cannot be read are listed in `damaged`."""
+    """Parse the bytes of a journal. Unreadable lines are listed in `damaged`."""
     state = JournalState()
     state.length = data.rfind(b"\n") + 1
     state.torn = len(data) - state.length
@@ -249,7 +247,7 @@ def parse(data: bytes) -> JournalState:
 
 
 def read(recording: Path) -> JournalState | None:
-    """What the journal of a recording says; None when there is none.
+    """Read the journal of a recording; None if it does not exist.
 
     Args:
         recording: Its directory.
@@ -270,7 +268,7 @@ def read(recording: Path) -> JournalState | None:
 
 
 class Journal:
-    """The journal of one recording, open for appending; whoever has it holds the recording.
+    """The journal of one recording, open for appending. The user holds the recording's lock.
 
     Args:
         recording: The recording's directory.
@@ -282,9 +280,9 @@ class Journal:
         self._sync = sync
 
     def append(self, *lines: Event) -> None:
-        """Add lines; they are on the disk when this returns.
+        """Append lines; they are on the disk when this returns.
 
-        What a crash has left of a line is cut off first.
+        An incomplete line left by a crash is cut off first.
 
         Raises:
             DiskFullError: There is no room; the journal is as it was.
@@ -305,7 +303,7 @@ class Journal:
                     if self._sync:
                         files.system.sync(fd)
                 except OSError:
-                    # What was announced is not begun, so it must not stand there.
+                    # The announced step has not begun, so its line must not remain.
                     files.system.truncate(fd, whole)
                     raise
             finally:
@@ -316,7 +314,7 @@ class Journal:
             raise durability.explain(error, self.path, "writing") from error
 
     def replace(self, lines: Sequence[Event]) -> None:
-        """Write the journal again; the one that was there is kept as `journal.old`.
+        """Rewrite the journal; the previous one stays as `journal.old`.
 
         Raises:
             DiskFullError: There is no room; the journal is as it was.
@@ -336,7 +334,7 @@ class Journal:
 
 
 def _whole(fd: int, size: int) -> int:
-    """Where the last whole line ends."""
+    """End of the last whole line."""
     at = size
     while at > 0:
         start = max(at - 65536, 0)

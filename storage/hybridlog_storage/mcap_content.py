@@ -1,7 +1,7 @@
-"""The records inside an MCAP chunk, and rare records anywhere, from untrusted bytes.
+"""Parses records of MCAP chunks, and rare records anywhere, from untrusted bytes.
 
-Messages are never looked at one by one beyond finding where each starts: their heads
-are gathered by numpy. Records of every other kind are rare and become objects.
+A Python loop only finds the start of each message; numpy gathers the heads. Records of
+other kinds are rare and become objects.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
-CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # as far as its map of message indexes,
-INDEX_PLACE = struct.Struct("<HQ")  # of which this is an entry
+CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # fields before its map of message indexes,
+INDEX_PLACE = struct.Struct("<HQ")  # an entry of that map
 
 MESSAGE_HEAD = np.dtype(
     [
@@ -66,14 +66,14 @@ Record: TypeAlias = (
     | records.Statistics
     | records.SummaryOffset
 )
-"""Every MCAP record that is read into an object."""
+"""An MCAP record that is parsed into an object."""
 
 
 class Definition(NamedTuple):
-    """A schema or channel, and from which message on it holds.
+    """A schema or channel, and the first message that it applies to.
 
     Attributes:
-        row: Row of the batch from which on it holds, 0 to n.
+        row: First row of the batch that it applies to, 0 to n.
         record: The definition.
     """
 
@@ -88,11 +88,11 @@ class ScanDamage:
     Attributes:
         offset: Byte where it starts, in the file, or in the buffer for damage inside a
             chunk.
-        length: Bytes that could not be read, None when not known.
-        reason: What is wrong, for people to read.
-        messages: Messages that lie there, None when not known.
-        torn: What there is of a chunk whose end is missing.
-        opcode: Kind of the damaged record, None when not known.
+        length: Bytes that could not be read, None if unknown.
+        reason: Description of the damage.
+        messages: Number of messages in it, None if unknown.
+        torn: The beginning of a chunk whose end is missing.
+        opcode: Kind of the damaged record, None if unknown.
     """
 
     offset: int
@@ -105,12 +105,12 @@ class ScanDamage:
 
 @dataclass(slots=True)
 class TornChunk:
-    """A chunk whose end is missing: its beginning, compressed.
+    """The compressed beginning of a chunk whose end is missing.
 
     Attributes:
         compression: MCAP name of the codec.
-        uncompressed_size: Bytes that the whole chunk would give.
-        data: The compressed bytes that are there.
+        uncompressed_size: Bytes of the whole chunk, uncompressed.
+        data: The available compressed bytes.
         limit: Most bytes to decompress.
     """
 
@@ -120,7 +120,7 @@ class TornChunk:
     limit: int
 
     def content(self) -> ChunkContent:
-        """The records that are whole. No checksum covers them."""
+        """The whole records. No checksum covers them."""
         found = decompress_prefix(
             self.compression, self.data, self.uncompressed_size, limit=self.limit
         )
@@ -133,11 +133,11 @@ class ChunkContent(NamedTuple):
     Attributes:
         batch: Its messages, in order; `channel` is the MCAP channel id, payload offsets
             are into the buffer that was parsed.
-        schemas: Schemas that are defined inside, the last of each id.
-        channels: Channels that are defined inside, the last of each id.
-        definitions: All of them in order, with the row from which on each holds.
-        invalid: int64, offset in the buffer of each message record that is left out:
-            too short, or with a time beyond 2^63 - 1 ns.
+        schemas: Schemas defined inside, the last of each id.
+        channels: Channels defined inside, the last of each id.
+        definitions: All of them in order, each with the first row that it applies to.
+        invalid: int64, offset in the buffer of each omitted message record: too short, or
+            with a time beyond 2^63 - 1 ns.
         damage: Definitions that could not be read; offsets are into the buffer.
         end: Byte of the buffer behind the last record.
     """
@@ -157,14 +157,14 @@ def parse_content(
     """Read the records of an uncompressed chunk.
 
     Args:
-        buffer: Holds the records.
+        buffer: The bytes with the records.
         base: Byte of `buffer` where the first record starts.
-        torn: The end of the records is missing: leave out what is not whole.
-        messages_only: Stop, without error, at the first record that is no message or
-            is not whole.
+        torn: The end of the records is missing: omit an incomplete record.
+        messages_only: Stop, without error, at the first record that is not a whole
+            message.
 
     Returns:
-        Messages and definitions. Records of other kinds are skipped, as MCAP demands.
+        Messages and definitions. Records of other kinds are skipped, as MCAP requires.
 
     Raises:
         SegmentError: A record runs over the end; the message names its offset.
@@ -176,7 +176,7 @@ def parse_content(
             f"the record at byte {walk.end} of its content runs over the end at {len(buffer)}"
         )
     batch, good = _batch(buffer, starts)
-    # Rows are counted among the messages that are kept.
+    # Rows count valid messages only.
     kept = None if good is None else np.concatenate(([0], np.cumsum(good)))
     definitions: list[Definition] = []
     damage: list[ScanDamage] = []
@@ -201,7 +201,7 @@ def parse_content(
 
 
 class _Walk:
-    """Goes from record to record; afterwards knows where it stopped and what else it met."""
+    """Walks from record to record; collects the other records and the end position."""
 
     def __init__(self, buffer: Buffer, start: int, *, messages_only: bool) -> None:
         self.end = start
@@ -210,7 +210,7 @@ class _Walk:
         self._messages_only = messages_only
 
     def messages(self) -> Iterator[int]:
-        """Yields where each message record starts. The one loop over single messages."""
+        """Yield the start of each message record. The only loop over single messages."""
         buffer, at, others = self._buffer, self.end, self.others
         head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
         size = len(buffer)
@@ -233,16 +233,16 @@ class _Walk:
 
 
 def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_] | None]:
-    """The messages that start there, and which of `starts` are good (None: all)."""
+    """The messages at `starts`, and a mask of the valid ones (None: all)."""
     size = len(buffer)
     good: NDArray[np.bool_] | None = None
-    # A last record shorter than a head would make the gather below read over the end.
+    # With a last record shorter than a head, the gather below would read over the end.
     short = starts + _PAYLOAD > size
     if len(starts) and short[-3:].any():
         good = ~short
     chosen = starts if good is None else starts[good]
     if len(chosen):
-        # A view of a head at every byte of the buffer, of which the wanted ones are copied.
+        # A view of a head at every byte of the buffer; only the needed ones are copied.
         every = np.ndarray((size - _PAYLOAD + 1,), MESSAGE_HEAD, buffer=buffer, strides=(1,))
         heads = every[chosen]
     else:
@@ -271,7 +271,7 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
 
 
 class _Fields(ReadDataStream):
-    """Reads the fields of one record and never beyond it."""
+    """Reads the fields of one record, within its bounds."""
 
     def __init__(self, content: Buffer) -> None:
         super().__init__(BytesIO(content))
@@ -293,7 +293,7 @@ def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
 
 
 def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
-    """As the mcap package does, which takes five times as long; a summary has thousands."""
+    """Parse a chunk index, five times as fast as the mcap package; a summary has thousands."""
     first, last, start, length, offsets_size = CHUNK_INDEX_HEAD.unpack_from(content)
     at = CHUNK_INDEX_HEAD.size + offsets_size
     offsets = content[CHUNK_INDEX_HEAD.size : at]
@@ -330,19 +330,18 @@ _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
 
 
 def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
-    """Read one record that is neither a message nor a chunk.
+    """Parse one record that is neither a message nor a chunk.
 
     Args:
-        opcode: What it is.
-        content: Its bytes, without the head. More bytes than its fields are ignored.
+        opcode: Its kind.
+        content: Its bytes, without the head. Bytes behind its fields are ignored.
 
     Returns:
-        The record, None for an opcode of no such record; and how many of its bytes its
-        fields take (0 for None).
+        The record, None for another opcode; and the size of its fields in bytes (0 for
+        None).
 
     Raises:
-        SegmentError: Its fields do not fit into it, are no UTF-8, or its checksum
-            differs.
+        SegmentError: Its fields exceed it, are not UTF-8, or its checksum differs.
     """
     try:
         if opcode == Opcode.MESSAGE_INDEX:
@@ -355,10 +354,10 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         stream = _Fields(content)
         record = reader(stream)
     except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
-        name = Opcode(opcode).name.replace("_", " ").lower()  # one that is read has a name
+        name = Opcode(opcode).name.replace("_", " ").lower()  # every parsed kind has a name
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
     if isinstance(record, records.Attachment):
-        # The mcap package steps over the checksum, which is the last field.
+        # The mcap package skips the checksum, the last field.
         _check_attachment(content, stream.count)
     return record, stream.count
 

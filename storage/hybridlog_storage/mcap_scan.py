@@ -1,9 +1,8 @@
-"""Reading an MCAP file forward, whatever state it is in.
+"""Reads an MCAP file forward, also a damaged one.
 
-`scan` gives the records of a file in order, with bounded memory, and goes on behind
-damage: where the summary says that the next chunk starts, or else where records that
-make sense follow one another again. It serves foreign files and, for recovery and
-checking, the store's own segments.
+`scan` yields the records of a file in order, with bounded memory. Behind damage it
+continues at the next chunk of the summary, or else where plausible records follow one
+another again. It reads foreign files and, for recovery and checks, the store's segments.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ _CHUNK_FIELDS = struct.Struct("<QQQII")  # start, end, size, checksum, length of
 _CODECS = frozenset({"", "zstd", "lz4"})
 _FIRST_PRIVATE = 0x80
 _WINDOW = 1 << 20
-_MAX_PLAIN = 1 << 26  # a record that is neither chunk, message nor attachment
+_MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
 
 _DATA_OPCODES = frozenset(
@@ -76,8 +75,8 @@ _DATA_OPCODES = frozenset(
         Opcode.DATA_END,
     }
 )
-# Records that stand between chunks. Those inside an uncompressed chunk are none of them,
-# so a search for these cannot end up inside one.
+# Records between chunks. None of them occurs inside an uncompressed chunk, so a search
+# for them cannot end inside one.
 _CHUNKED_OPCODES = _DATA_OPCODES - {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _SUMMARY_OPCODES = frozenset(
     {
@@ -106,18 +105,18 @@ _LEAST = {
 
 @dataclass(slots=True)
 class ScannedChunk:
-    """A chunk record, still compressed.
+    """A compressed chunk record.
 
     Attributes:
         offset: Byte of the record in the file.
         length: Bytes of the whole record, its head included.
         compression: MCAP name of the codec.
-        message_start: Smallest log time inside, ns, as the chunk says.
-        message_end: Largest log time inside, ns, as the chunk says.
-        uncompressed_size: Bytes of the content, as the chunk says.
-        uncompressed_crc: CRC-32 of the content, 0 when there is none.
+        message_start: Smallest log time, ns, as stated by the chunk.
+        message_end: Largest log time, ns, as stated by the chunk.
+        uncompressed_size: Bytes of the content, as stated by the chunk.
+        uncompressed_crc: CRC-32 of the content, 0 for none.
         data: The compressed content.
-        limit: Most bytes of content that are allocated.
+        limit: Most bytes of content to allocate.
     """
 
     offset: int
@@ -134,7 +133,7 @@ class ScannedChunk:
         """The uncompressed content, for `parse_content`.
 
         Args:
-            check_crc: Compare the checksum, when the chunk has one.
+            check_crc: Compare the checksum, if the chunk has one.
 
         Raises:
             SegmentError: It does not decompress, or its checksum differs.
@@ -150,7 +149,7 @@ class PrivateRecord:
     """A record of the application range, opcode 0x80 and above.
 
     Attributes:
-        opcode: Which.
+        opcode: Its opcode.
         offset: Byte of the record in the file.
         data: Its content, without the head.
     """
@@ -162,11 +161,11 @@ class PrivateRecord:
 
 @dataclass(slots=True)
 class Loose:
-    """Messages one after the other outside of any chunk.
+    """Consecutive messages outside of chunks.
 
     Attributes:
         content: The messages; payload offsets are into a buffer of their own.
-        offset: Byte of the first of their records in the file.
+        offset: Byte of their first record in the file.
     """
 
     content: ChunkContent
@@ -174,11 +173,11 @@ class Loose:
 
 
 class End(NamedTuple):
-    """The scan has come to the end.
+    """The end of the scan.
 
     Attributes:
         offset: Size of the file.
-        clean: The file was closed: footer and closing magic are there.
+        clean: Whether the file was closed: it has a footer and the closing magic.
     """
 
     offset: int
@@ -186,7 +185,7 @@ class End(NamedTuple):
 
 
 Item: TypeAlias = Record | ScannedChunk | PrivateRecord | Loose | ScanDamage | End
-"""What `scan` gives."""
+"""An item of `scan`."""
 
 
 def scan(
@@ -199,21 +198,21 @@ def scan(
 ) -> Iterator[tuple[int, Item]]:
     """Read a file forward, record by record.
 
-    Memory is bounded by the largest record up to `limit`; no length field allocates
-    more than the file holds. Records of kinds that MCAP reserves are skipped.
+    Memory is bounded by the largest record up to `limit`; a length field never allocates
+    more than the file holds. Records of reserved kinds are skipped.
 
     Args:
         file: Seekable; its position is moved.
         size: Bytes of the file.
         start: Byte of the first record.
-        limit: Largest record, and largest chunk uncompressed, in bytes; larger ones are
-            damage and skipped.
-        summary: From `read_summary`, which is asked when this is None. It tells where to
-            go on behind damage.
+        limit: Largest record, and largest chunk uncompressed, in bytes; larger ones count
+            as damage and are skipped.
+        summary: From `read_summary`, which is called if this is None. It gives the
+            position of the next chunk behind damage.
 
     Yields:
-        Byte in the file and the item that starts there, in the order of the file. The
-        last item is an `End`.
+        Byte in the file and the item that starts there, in file order. The last item is an
+        `End`.
 
     Raises:
         OSError: The file cannot be read.
@@ -231,7 +230,7 @@ def read_summary(file: BinaryIO, size: int) -> Summary | None:
         size: Bytes of the file.
 
     Returns:
-        None when there is none, or when it is damaged anywhere.
+        None if it is missing or damaged.
 
     Raises:
         OSError: The file cannot be read.
@@ -295,7 +294,7 @@ def _add_to_summary(summary: Summary, record: Record | None) -> None:
 
 
 class _Window:
-    """A part of the file in memory, moved forward as it is asked for bytes."""
+    """A part of the file in memory, moved forward on demand."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self.size = size
@@ -312,17 +311,17 @@ class _Window:
             wanted = min(max(length, _WINDOW), self.size - offset)
             self._data = memoryview(self._file.read(wanted))
             self._start, begin = offset, 0
-            if len(self._data) < wanted:  # the file has become shorter meanwhile
+            if len(self._data) < wanted:  # the file was truncated meanwhile
                 self.size = offset + len(self._data)
         return self._data[begin : begin + length]
 
     def rest(self, offset: int) -> memoryview:
-        """What is in memory from `offset` on; at least a record's head, if there is one."""
+        """Bytes in memory from `offset` on; at least a record's head, if it exists."""
         self.at(offset, _HEAD)
         return self._data[offset - self._start :]
 
     def peek(self, offset: int, length: int) -> bytes:
-        """A few bytes from anywhere, fewer or none at the end, without moving the window."""
+        """A few bytes at any position, fewer at the end, without moving the window."""
         if not 0 <= offset < self.size:
             return b""
         begin = offset - self._start
@@ -345,7 +344,7 @@ class _ChunkHead(NamedTuple):
 
 
 def _chunk_head(window: _Window, offset: int) -> _ChunkHead | None:
-    """The fields before a chunk's data, None when they make no sense."""
+    """The fields before a chunk's data, None if they are implausible."""
     raw = window.peek(offset + _HEAD, _CHUNK_FIELDS.size + 4 + 8)
     if len(raw) < _CHUNK_FIELDS.size + 8:
         return None
@@ -362,11 +361,11 @@ def _chunk_head(window: _Window, offset: int) -> _ChunkHead | None:
 
 
 class _Places:
-    """Where the summary says that chunks start, and whether to believe it.
+    """Positions of chunks by the summary, and whether they are reliable.
 
-    A summary that a careless writer got wrong must not spoil a file that is fine, so at
-    the first contradiction the records themselves are asked: the summary wins when half
-    of its entries or more point at chunk records of the length they say.
+    A wrong summary must not spoil an intact file. So at the first contradiction its entries
+    are checked: the summary counts if at least half of them point at chunk records of the
+    stated length.
     """
 
     def __init__(self, window: _Window, summary: Summary | None) -> None:
@@ -377,20 +376,20 @@ class _Places:
         self._believed: bool | None = None
 
     def length(self, offset: int) -> int | None:
-        """Length of the chunk record that starts at `offset`, None if none does."""
+        """Length of the chunk record at `offset`, None without one."""
         return self._lengths.get(offset)
 
     def next(self, offset: int) -> int | None:
-        """Where the first chunk behind `offset` starts."""
+        """Start of the first chunk behind `offset`."""
         i = bisect.bisect_right(self._starts, offset)
         return self._starts[i] if i < len(self._starts) else None
 
     def denies(self, offset: int) -> bool:
-        """Whether no chunk starts at `offset`, as far as can be known."""
+        """True if the summary rules out a chunk at `offset`."""
         return bool(self._starts) and offset not in self._lengths and self.believed()
 
     def believed(self) -> bool:
-        """Whether enough entries are right."""
+        """True if enough entries are correct."""
         if self._believed is None:
             right = sum(self._is_right(offset) for offset in self._starts)
             self._believed = self._single() if right == 0 else right * 2 >= len(self._starts)
@@ -403,7 +402,7 @@ class _Places:
         return RECORD_HEAD.unpack(head) == (Opcode.CHUNK, self._lengths[offset] - _HEAD)
 
     def _single(self) -> bool:
-        """With one chunk there is no majority; its own fields then decide."""
+        """Check a single chunk by its own fields, since it has no majority."""
         if len(self._starts) != 1:
             return False
         (offset,) = self._starts
@@ -412,10 +411,10 @@ class _Places:
 
 
 def _is_other_record(content: memoryview) -> bool:
-    """Whether the content of a message record is, to the last byte, that of another kind.
+    """True if the content of a message record is exactly that of another kind.
 
-    Where chunks are, messages outside of them are rare, but one wrong byte can turn any
-    record between two chunks into one; no checksum covers those.
+    In files with chunks, messages outside of them are rare. But one wrong byte can turn
+    any record between two chunks into a message, and no checksum covers those.
     """
     for opcode in (Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT):
         try:
@@ -439,8 +438,8 @@ class _Scanner:
         self._at = start
         self._places = _Places(self._window, summary)
         self._footer = _read_footer(file, size)
-        # Where the fields of the last record end. When the length of that record was wrong,
-        # the next one is to be searched from here on, not from where the length led.
+        # End of the fields of the last record. If the length of that record was wrong, the
+        # search for the next one starts here, not where the length points.
         self._behind = start
         self._summary_start = self._footer.summary_start if self._footer and summary else None
         self._chunked = bool(summary and summary.chunk_indexes)
@@ -450,7 +449,7 @@ class _Scanner:
             self._crc = crc32(MAGIC)
 
     def _data_crc(self) -> int | None:
-        """The checksum that the file's end has for the data section, if it has one."""
+        """The checksum of the data section, if the file has one."""
         footer = self._footer
         if footer is None:
             return None
@@ -461,7 +460,7 @@ class _Scanner:
         return int.from_bytes(raw[_HEAD:], "little")
 
     def items(self) -> Iterator[tuple[int, Item]]:
-        """Everything from the start to the end of the file."""
+        """All items from the start to the end of the file."""
         footer = False
         while self._at < self._window.size:
             if footer and self._window.at(self._at, len(MAGIC)) == MAGIC:
@@ -478,7 +477,7 @@ class _Scanner:
         yield self._window.size, End(self._window.size, clean)
 
     def _step(self) -> Iterator[tuple[int, Item]]:
-        """One record, one run of messages, or one place of damage."""
+        """Read one record, one run of messages, or one place of damage."""
         at = self._at
         head = self._window.peek(at, _HEAD)
         if len(head) < _HEAD:
@@ -508,17 +507,17 @@ class _Scanner:
             yield from self._plain(at, opcode, length)
 
     def _contradicts_index(self, at: int, opcode: int, length: int) -> bool:
-        """Whether a chunk is known to be here, which the record's head denies."""
+        """True if the summary lists a chunk here, but the record's head is not that of a chunk."""
         indexed = self._places.length(at) if self._in_data else None
         if indexed is None or (opcode, length + _HEAD) == (Opcode.CHUNK, indexed):
             return False
         return _HEAD < indexed <= self._window.size - at and self._places.believed()
 
     def _hides_chunk(self, at: int, opcode: int, length: int) -> bool:
-        """Whether only the opcode is what keeps a record from being a chunk.
+        """True if only a wrong opcode keeps a record from being a chunk.
 
-        Message indexes are no suspects, there are too many; private records may look as
-        they like.
+        Message indexes are not checked, since they are too many; private records have any
+        content.
         """
         if not self._in_data or opcode in {Opcode.CHUNK, Opcode.MESSAGE_INDEX}:
             return False
@@ -555,13 +554,13 @@ class _Scanner:
             yield from self._lost(at, f"a chunk record claims {length} bytes", Opcode.CHUNK)
 
     def _chunk(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
-        """The chunk that fills `[at, end)`; its own fields may still be wrong."""
+        """The chunk in `[at, end)`; its own fields may still be wrong."""
         self._chunked = True
         self._at = self._behind = end
         fields = _chunk_head(self._window, at)
         if fields is None or fields.data > end:
             reason = "the fields of a chunk are damaged"
-            # Too short, or unknown to the summary: the opcode is what is wrong.
+            # Too short, or unknown to the summary: the opcode is wrong.
             real = end - at >= _HEAD + _LEAST[Opcode.CHUNK] and not self._places.denies(at)
             yield at, ScanDamage(at, end - at, reason, opcode=Opcode.CHUNK if real else None)
         elif end - at > self._limit:
@@ -654,7 +653,7 @@ class _Scanner:
         yield at, record
 
     def _ends_data(self, end: int) -> bool:
-        """Whether the summary, or the end of the file, is what follows."""
+        """True if the summary, or the end of the file, follows."""
         if self._summary_start is not None:
             return end == self._summary_start
         raw = self._window.peek(end, _HEAD)
@@ -668,7 +667,7 @@ class _Scanner:
         end = at + _HEAD + length
         wrong = opcode != Opcode.FOOTER and not _is_in_summary(opcode)
         if wrong or end > self._window.size or length > _MAX_PLAIN:
-            # Everything that this could tell, the data has told already.
+            # The data has already given everything that the summary holds.
             yield at, ScanDamage(at, self._window.size - at, "the summary is damaged", 0)
             self._at = self._window.size
             return
@@ -690,7 +689,7 @@ class _Scanner:
         yield at, ScanDamage(at, self._window.size - at, reason, messages, torn)
 
     def _lost(self, at: int, reason: str, opcode: int | None = None) -> Iterator[tuple[int, Item]]:
-        """Skip to where records make sense again."""
+        """Skip to the next plausible records."""
         self._crc = None
         found = self._resume(at)
         if found is None:
@@ -713,7 +712,7 @@ class _Scanner:
         return self._search(self._behind if self._behind < at else at + 1, stop)
 
     def _end_of_data(self) -> int | None:
-        """Where the DataEnd record must be, when the file has its footer."""
+        """Position of the DataEnd record, if the file has a footer."""
         if self._footer is None:
             return None
         size = self._window.size
@@ -725,7 +724,7 @@ class _Scanner:
         return at
 
     def _search(self, start: int, stop: int) -> int | None:
-        """The first byte of `[start, stop)` from which on records follow one another."""
+        """The first byte in `[start, stop)` at which a chain of records starts."""
         wanted = np.zeros(256, np.bool_)
         wanted[list(_CHUNKED_OPCODES if self._chunked else _DATA_OPCODES)] = True
         least = np.zeros(256, np.int64)
@@ -736,7 +735,7 @@ class _Scanner:
                 return None
             data = np.frombuffer(raw, np.uint8)
             opcodes = data[: 1 - _HEAD]
-            # No length reaches 2^40, so three bytes of zeros sieve nearly everything.
+            # No length reaches 2^40, so a test for three zero bytes excludes nearly all positions.
             sieve = wanted[opcodes] & (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
             places = np.flatnonzero(sieve)
             lengths = np.ndarray((len(opcodes),), "<u8", raw, 1, (1,))[places].astype(np.int64)
@@ -749,7 +748,7 @@ class _Scanner:
         return None
 
     def _is_chain(self, at: int) -> bool:
-        """Whether records start here one after the other, up to an end or long enough."""
+        """True if a chain of records starts here, up to an end or long enough."""
         weight = 0
         while weight < 3:
             if at == self._window.size:
@@ -762,7 +761,7 @@ class _Scanner:
         return True
 
     def _weight(self, at: int) -> tuple[int, int] | None:
-        """How strongly the bytes at `at` look like a record, and where it ends."""
+        """A plausibility score of a record at `at`, and its end."""
         raw = self._window.peek(at, _HEAD + 6)
         if len(raw) < _HEAD:
             return None
@@ -770,7 +769,7 @@ class _Scanner:
         end = at + _HEAD + length
         weight = 1 if opcode >= _FIRST_PRIVATE or length >= _LEAST.get(opcode, 1 << 64) else 0
         if opcode == Opcode.CHUNK and weight:
-            # The one record that may run over the end of the file: it can be told to be real.
+            # The only record that may run over the end of the file, since it is recognizable.
             fields = _chunk_head(self._window, at)
             if fields is None or fields.end > end:
                 return None
@@ -794,11 +793,11 @@ class _Scanner:
         return opcode >= _FIRST_PRIVATE or self._goes_on(end)
 
     def _goes_on(self, at: int) -> bool:
-        """Whether a record starts at `at`, or the file ends there."""
+        """True if `at` is the start of a record or the end of the file."""
         return at == self._window.size or self._weight(at) is not None
 
     def _swallows(self, at: int, end: int) -> bool:
-        """Whether a record would cover the start of a chunk, or of the summary."""
+        """True if a record would overlap the start of a chunk or of the summary."""
         if self._summary_start is not None and at < self._summary_start < end:
             return True
         known = self._places.next(at)

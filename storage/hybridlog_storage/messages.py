@@ -1,9 +1,9 @@
-"""The values that flow through hybridlog: schemas, channels and batches of messages.
+"""Schemas, channels and batches of messages.
 
-Messages never travel one by one. A `Batch` is a buffer and a table of numpy columns
-that say where each message's payload lies in it, so that copying, indexing and
-decoding are a few array operations for thousands of messages. Those that have just come
-are a `LooseBatch` until they lie in a chunk.
+Messages are handled in batches. A `Batch` is a buffer and a table of numpy columns with
+the position of each payload. So copying, indexing and decoding thousands of messages take
+a few array operations. Newly arrived messages are a `LooseBatch` until they are copied
+into a chunk.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ Buffer = bytes | bytearray | memoryview
 """Contiguous bytes. A memoryview has itemsize 1."""
 
 REDUCED = "hybridlog.reduced"
-"""Message encoding of a channel that carries what is left of messages without payload."""
+"""Message encoding of a channel with reduced messages, whose payload was dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """A message definition as it came.
+    """A message definition, unchanged from its source.
 
     Attributes:
         name: Type name as the source spells it (`sensor_msgs/LaserScan` in ROS 1,
             `sensor_msgs/msg/LaserScan` in ROS 2, `foxglove.Log` in protobuf).
         encoding: MCAP schema encoding: `ros1msg`, `ros2msg`, `ros2idl`, `jsonschema`,
-            `protobuf`, ... or empty when there is no definition.
+            `protobuf`, ... or empty without a definition.
         data: The definition; text encodings are UTF-8.
     """
 
@@ -48,13 +48,13 @@ class Channel:
     A topic may have several channels (several ROS 1 connections, a type that changes).
 
     Attributes:
-        topic: Name as the source spells it.
+        topic: Its name, as the source spells it.
         message_encoding: MCAP message encoding: `ros1`, `cdr`, `json`, `protobuf`, ...
         schema: The definition, None for a channel without one.
-        metadata: MCAP channel metadata of the source, as it came (ROS 1 connection
+        metadata: MCAP channel metadata of the source, unchanged (ROS 1 connection
             header fields such as `callerid`, `latching`, `md5sum`; ROS 2
             `offered_qos_profiles`).
-        has_publish_time: False when the source knows no publish time; `publish_time`
+        has_publish_time: False if the source has no publish times; `publish_time`
             then repeats `log_time`.
     """
 
@@ -72,13 +72,13 @@ class Batch:
     Rows are in arrival order. `buffer` must not change while the batch is in use.
 
     Attributes:
-        buffer: Holds every payload.
+        buffer: The bytes with all payloads.
         offset: int64[n], byte where each payload starts in `buffer`.
         length: int64[n], bytes of each payload.
         channel: int32[n], index of each message's channel in the owner's channel list.
         log_time: int64[n], nanoseconds since the epoch.
         publish_time: int64[n], nanoseconds since the epoch.
-        sequence: uint32[n], the sender's sequence number, 0 when there is none.
+        sequence: uint32[n], the sender's sequence number, 0 without one.
     """
 
     buffer: Buffer
@@ -94,7 +94,7 @@ class Batch:
         return len(self.offset)
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Batch:
-        """The chosen rows, over the same buffer."""
+        """Select rows, over the same buffer."""
         return Batch(
             self.buffer,
             self.offset[rows],
@@ -118,13 +118,13 @@ class Batch:
 
 @dataclass(slots=True)
 class LooseBatch:
-    """Messages that lie each where it came from, to be copied once. All columns have length n.
+    """Messages with a separate buffer each, to be copied once. All columns have length n.
 
     Rows are in arrival order.
 
     Attributes:
         payloads: object[n], the buffer of each payload.
-        length: As of a `Batch`, and so are the others.
+        length: As in `Batch`, like the other columns.
     """
 
     payloads: NDArray[np.object_]
@@ -139,7 +139,7 @@ class LooseBatch:
         return len(self.length)
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> LooseBatch:
-        """The chosen rows."""
+        """Select rows."""
         return LooseBatch(
             self.payloads[rows],
             self.length[rows],

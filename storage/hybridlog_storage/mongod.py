@@ -1,22 +1,22 @@
-"""The embedded MongoDB: one mongod for all processes that have a store open.
+"""The embedded MongoDB: one mongod for all processes on a store.
 
 It listens on a unix socket that only its owner can reach and on no TCP port. The first
-process that needs it starts a keeper (`mongod_keeper.py`), which starts mongod and ends
-it when the last process has gone. Three locked files in the directory carry all of the
-state, so whatever is killed, the kernel tells the others:
+process that needs it starts a keeper (`mongod_keeper.py`). The keeper starts mongod and
+ends it after the last process has ended. Locks on three files in the directory hold all
+state, and the kernel releases the locks of killed processes:
 
-* `users.lock`, shared: held by every process that uses mongod. The keeper ends mongod
-  only while it has it alone.
-* `keeper.lock`: held by whoever starts a keeper and handed on to it. The owner of this
-  lock owns the socket's directory and the record of where mongod listens.
-* `alive.lock`: handed on to mongod as well, so it is free only when mongod, too, has ended.
+* `users.lock`, shared: held by every process that uses mongod. The keeper ends mongod only
+  while it holds this lock exclusively.
+* `keeper.lock`: held by the process that starts a keeper, and inherited by the keeper. Its
+  holder owns the socket's directory and the record of the socket.
+* `alive.lock`: also inherited by mongod, so it is free only when mongod has ended, too.
 
-A user takes its share of `users.lock` before it looks for a mongod: what it then finds
-alive cannot be ended under it.
+A process locks `users.lock` before it looks for a mongod, so the mongod that it finds
+cannot be ended under it.
 
-The directory belongs to one user of the system. Where somebody else's stands in its place,
-another one beside it is used, which has the user's number in its name. No symlink in it is
-followed. mongod itself would follow them, so it is not started where there are any.
+The directory belongs to one user of the system. If it belongs to another user, a directory
+beside it with the uid in its name is used. No symlink in it is followed. mongod itself
+would follow them, so it is not started on a directory with symlinks.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 MIN_CACHE_MB = 256
-"""The least that WiredTiger accepts, in MiB."""
+"""The smallest cache that WiredTiger accepts, in MiB."""
 DEFAULT_LINGER_S = 5.0
 SILENCE_LIMIT_S = 30.0
-"""Seconds in which mongod, while it starts, has to answer or at least to log something."""
+"""Seconds in which a starting mongod must answer or write to its log."""
 START_LIMIT_S = 600.0
-"""Seconds after which a start is given up even if mongod still logs (a long recovery)."""
+"""Seconds after which a start fails even if mongod still logs (a long recovery)."""
 _HELLO_LIMIT_S = 1.0
 _SLOW_OPERATION_MS = 5000
-_JOURNAL_MS = 500  # between two looks, the most there can be
+_JOURNAL_MS = 500  # longest time between two checks
 _RECORD_LIMIT = 64 << 10
 _LOG_TAIL = 64 << 10
-_MAX_DEPTH = 8  # of folders in the directory
+_MAX_DEPTH = 8  # most folders in the directory
 _MAX_FILES = 1 << 20
 _IN_STORE, _IN_HERE = files.IN_STORE, files.IN_FOLDER
 
@@ -79,10 +79,10 @@ _OTHER_WAYS = (
 
 
 def find_mongod() -> Path:
-    """The mongod to run: HYBRIDLOG_MONGOD, else the wheel's, else the one on the PATH.
+    """Path of the mongod to run: HYBRIDLOG_MONGOD, the wheel's, or the one on the PATH.
 
     Raises:
-        MissingDependencyError: There is none; the message says how to get one.
+        MissingDependencyError: None exists; the message says how to get one.
     """
     named = os.environ.get("HYBRIDLOG_MONGOD")
     if named:
@@ -93,7 +93,7 @@ def find_mongod() -> Path:
                 f"Correct or unset it. {_OTHER_WAYS}"
             )
         return Path(found).absolute()
-    # The wheel shares its top package with a very large one, so nothing is imported.
+    # The wheel shares its top package with a very large one, so it is not imported.
     try:
         spec = importlib.util.find_spec("fiftyone")
     except (ImportError, ValueError):
@@ -110,28 +110,28 @@ def find_mongod() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """Where the keeper says mongod listens."""
+    """The keeper's record of the socket of mongod."""
 
     socket: str
     mongod: int
 
 
 class EmbeddedMongod:
-    """This process's part in the mongod of a store. A context manager.
+    """This process's use of the mongod of a store. A context manager.
 
-    Several may be open in one process, and threads may share one. A process that dies
-    leaves by dying; `stop` is for leaving earlier.
+    A process may have several, and threads may share one. The end of the process ends its
+    use; `stop` ends it earlier.
 
     Args:
-        directory: Where mongod's data, log and lock files lie; made when missing, in a
-            parent that exists. Where it belongs to another user, `<name>-<uid>` beside it.
-        cache_mb: Bound of mongod's cache in MiB; less than 256 counts as 256. Of several
-            processes the one that starts mongod decides.
-        linger_s: Seconds for which mongod stays after the last process has left; None
-            takes HYBRIDLOG_MONGOD_LINGER_S, or 5. The starter decides here, too.
+        directory: Directory of mongod's data, log and lock files; created if missing, in an
+            existing parent. If it belongs to another user, `<name>-<uid>` beside it is used.
+        cache_mb: Limit of mongod's cache in MiB; less than 256 counts as 256. The process
+            that starts mongod decides.
+        linger_s: Seconds for which mongod runs after its last use; None takes
+            HYBRIDLOG_MONGOD_LINGER_S, or 5. The process that starts mongod decides.
 
     Raises:
-        UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is no number of seconds.
+        UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is not a number of seconds.
     """
 
     def __init__(
@@ -153,26 +153,26 @@ class EmbeddedMongod:
 
     @property
     def data(self) -> Path:
-        """The directory of mongod's data files; rebuilt by a reindex when it is removed."""
+        """The directory of mongod's data files; a reindex rebuilds it after a removal."""
         return self._directory / "data"
 
     def start(self) -> str:
-        """The URI of a mongod that answers now, after starting one if there was none.
+        """Return the URI of a running mongod; start one if necessary.
 
-        May be called again at any time, above all after a `DatabaseError`: it looks
-        again, and brings up a mongod that has died.
+        May be called again at any time, for example after a `DatabaseError`: it checks again,
+        and restarts a mongod that has ended.
 
         Raises:
-            MissingDependencyError: There is no mongod to run.
+            MissingDependencyError: No mongod is installed.
             StoreError: The directory cannot be written.
             DiskFullError: There is no space for mongod's files.
-            DatabaseError: mongod does not come up; the message has what it logged.
+            DatabaseError: mongod does not start; the message quotes its log.
         """
         with self._mutex:
             entered = self._users is None
             try:
                 if self._users is not None and os.fstat(self._users).st_nlink == 0:
-                    self._leave()  # the store was removed, and may have been made anew
+                    self._leave()  # the store was removed, and may have been created again
                 if self._users is None:
                     self._users = self._enter()
                 return _uri(self._find_or_launch())
@@ -182,7 +182,7 @@ class EmbeddedMongod:
                 raise
 
     def stop(self) -> None:
-        """Leave: this object needs mongod no more. Does nothing when it was not started."""
+        """End the use of mongod by this object. Does nothing if it was not started."""
         with self._mutex:
             self._leave()
 
@@ -200,12 +200,12 @@ class EmbeddedMongod:
 
     def _leave(self) -> None:
         if self._users is not None:
-            # Closed, not unlocked: a forked child may share the lock and still need it.
+            # Closed, not unlocked: a forked child may share and still need the lock.
             os.close(self._users)
             self._users = None
 
     def _enter(self) -> int:
-        """Take a share of `users.lock`; waits for a mongod that is just being ended."""
+        """Lock `users.lock`; wait for a mongod that is being ended."""
         try:
             self._directory = _own_directory(self._given)
             with contextlib.suppress(FileExistsError):
@@ -218,8 +218,8 @@ class EmbeddedMongod:
             if time.monotonic() > deadline:
                 os.close(descriptor)
                 raise DatabaseError(
-                    f"The mongod of {self._directory} is being ended and does not come to an "
-                    f"end. See {self.log}, and end its processes by hand."
+                    f"The mongod of {self._directory} is being ended, but keeps running. "
+                    f"See {self.log}, and end its processes by hand."
                 )
             time.sleep(0.01)
         return descriptor
@@ -232,7 +232,7 @@ class EmbeddedMongod:
             raise _directory_error(self._directory, error) from error
 
     def _find_or_launch(self) -> str:
-        """Path of the socket of a mongod that answers. Needs the share of `users.lock`."""
+        """Path of the socket of a running mongod. Needs `users.lock`."""
         patience = _Patience(self.log)
         log_start: int | None = None
         while True:
@@ -259,19 +259,19 @@ class EmbeddedMongod:
             raise DatabaseError(f"mongod cannot be reached: {error}") from error
 
     def _launch(self, keeper: int) -> int | None:
-        """Start a keeper and with it mongod.
+        """Start a keeper, which starts mongod.
 
         Args:
-            keeper: Open `keeper.lock`, locked; the new keeper inherits the lock.
+            keeper: The open and locked `keeper.lock`; the new keeper inherits the lock.
 
         Returns:
-            Size of the log before the start; None when an earlier mongod still has to end.
+            Size of the log before the start; None if an earlier mongod still has to end.
         """
         alive = self._open("alive.lock")
         try:
             if not _try_lock(alive, fcntl.LOCK_EX):
-                # Its keeper was killed, and so it was told to end. Where the system does
-                # not tell (not Linux), it is told now.
+                # Its keeper was killed, so the kernel asked it to end. Other systems than Linux
+                # do not, so it is asked here.
                 self._end_orphan()
                 return None
             program = find_mongod()
@@ -285,7 +285,7 @@ class EmbeddedMongod:
                 with contextlib.suppress(OSError):
                     path.parent.rmdir()
                 raise
-            # A log that is put aside at the start begins anew.
+            # A log moved aside at the start begins at 0.
             return min(before, _size_of(self.log))
         except OSError as error:
             raise _directory_error(self._directory, error) from error
@@ -293,10 +293,10 @@ class EmbeddedMongod:
             os.close(alive)
 
     def _remove_stale(self) -> None:
-        """Remove what a killed keeper left. Needs `keeper.lock` and `alive.lock`."""
+        """Remove the files of a killed keeper. Needs `keeper.lock` and `alive.lock`."""
         record = self._read_record()
-        # A record came with the store, wherever that is from; it names a directory to
-        # remove only where one for this store may be.
+        # The record may come from another user with the store. So a directory that it names
+        # is removed only if it can be one of this store.
         if record and is_socket_of(record.socket, self._directory):
             with contextlib.suppress(OSError):
                 Path(record.socket).unlink()
@@ -333,7 +333,7 @@ class EmbeddedMongod:
                     stderr=log,
                     cwd="/",
                     pass_fds=(keeper, alive, folder, log),
-                    start_new_session=True,  # Ctrl-C in a terminal is for one user, not for all
+                    start_new_session=True,  # Ctrl-C in a terminal must end one user, not all
                     check=True,
                     timeout=SILENCE_LIMIT_S,
                 )
@@ -348,7 +348,7 @@ class EmbeddedMongod:
         return [
             str(program),
             *("--dbpath", str(self.data)),
-            # A path as address and no socket of its own making: no TCP port is opened.
+            # A path as address, and no default socket: no TCP port is opened.
             *("--bind_ip", str(path)),
             "--nounixsocket",
             *("--filePermissions", "0700"),
@@ -356,11 +356,11 @@ class EmbeddedMongod:
             "--quiet",
             *("--slowms", str(_SLOW_OPERATION_MS)),
             *("--wiredTigerCacheSizeGB", f"{self._cache_mb / 1024:g}"),
-            # An empty database takes 11 MB this way, and 300 MB by default.
+            # An empty database then takes 11 MB instead of 300 MB.
             *("--wiredTigerEngineConfigString", "log=(prealloc=false,file_max=10MB)"),
             *("--setParameter", "diagnosticDataCollectionEnabled=false"),
-            # To look ten times a second whether there is something for the journal takes half
-            # of what a server costs that nobody asks; what it loses lies in the segments.
+            # Checking the journal ten times a second takes half of an idle server's processor
+            # time. Documents lost by checking less often are rebuilt from the segments.
             *("--journalCommitInterval", str(_JOURNAL_MS)),
         ]
 
@@ -396,7 +396,7 @@ class EmbeddedMongod:
         )
 
     def _failure(self, log_start: int) -> HybridlogError:
-        """What to raise after mongod came and went.
+        """The error to raise after mongod started and ended.
 
         Args:
             log_start: Size of the log before the start, in bytes.
@@ -451,7 +451,7 @@ _CURES: tuple[tuple[tuple[str, ...], str], ...] = (
 
 
 class _Patience:
-    """How long to wait for a mongod that starts: longer while it logs what it does."""
+    """The time to wait for a starting mongod: longer while it writes to its log."""
 
     def __init__(self, log: Path) -> None:
         self._log = log
@@ -501,11 +501,11 @@ def _try_lock(descriptor: int, kind: int) -> bool:
 
 
 def _own_directory(given: Path) -> Path:
-    """The directory to use: the given one, or this user's own beside it; made when missing.
+    """The directory to use: the given one, or this user's own beside it; created if missing.
 
     Raises:
-        StoreError: A symlink or a file stands in its place, or it belongs to somebody else.
-        OSError: It cannot be made.
+        StoreError: It is a symlink or a file, or belongs to another user.
+        OSError: It cannot be created.
     """
     user = os.geteuid()
     for directory in (given, given.with_name(f"{given.name}-{user}")):
@@ -518,15 +518,15 @@ def _own_directory(given: Path) -> Path:
             return directory
     raise StoreError(
         f"{directory} belongs to another user, although its name has this user's number. Remove "
-        f"it: the index is made anew from the segments."
+        f"it: the index is rebuilt from the segments."
     )
 
 
 def _refuse_odd_files(directory: Path) -> None:
-    """Refuse what mongod would write through or into: whatever is no plain file or folder.
+    """Refuse a directory with anything but plain files and folders, which mongod would follow.
 
     Raises:
-        StoreError: There is something like that, or more than an index has.
+        StoreError: It holds something else, or more files than an index has.
         OSError: It cannot be read.
     """
     left = [(directory, 0)]
@@ -557,14 +557,14 @@ def _odd_file(path: Path, directory: Path, mode: int) -> StoreError:
 
 
 def _remove_it(directory: Path) -> str:
-    return f"Remove {directory}: it holds the index only, which is made anew from the segments."
+    return f"Remove {directory}: it holds only the index, which is rebuilt from the segments."
 
 
 def _size_of(path: Path) -> int:
-    """Bytes of a file in the directory; 0 when it is not there.
+    """Bytes of a file in the directory; 0 if it does not exist.
 
     Raises:
-        OSError: It cannot be looked at.
+        OSError: Its status cannot be read.
     """
     try:
         return files.status(path, depth=_IN_HERE).st_size
@@ -599,9 +599,9 @@ _HELLO += _HELLO_DOCUMENT + b"\0"
 
 
 def _answers(path: str) -> bool:
-    """Whether a mongod behind this socket answers a hello, which it does once it is ready.
+    """True if a mongod at this socket answers a hello, that is, is ready.
 
-    Spoken by hand: a driver takes a hundred times as long, and would retry.
+    The message is sent without a driver, which takes a hundred times as long and retries.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(_HELLO_LIMIT_S)
@@ -615,7 +615,7 @@ def _answers(path: str) -> bool:
 
 
 def _read_from(path: Path, start: int) -> str:
-    """The end of a file, at most `_LOG_TAIL` bytes and not before `start`."""
+    """The end of a file: at most `_LOG_TAIL` bytes, not before `start`."""
     try:
         flags = os.O_RDONLY | os.O_NONBLOCK
         with os.fdopen(files.open_file(path, flags, depth=_IN_HERE), "rb") as file:
@@ -627,7 +627,7 @@ def _read_from(path: Path, start: int) -> str:
 
 
 def _telling_lines(log: str) -> list[str]:
-    """The lines that say why mongod ended: its errors, or else the last ones; at most four."""
+    """Log lines that explain why mongod ended: its errors, or else the last lines; at most four."""
     errors: list[str] = []
     others: list[str] = []
     for line in filter(None, map(str.strip, log.splitlines())):
@@ -637,7 +637,7 @@ def _telling_lines(log: str) -> list[str]:
             text = f"{entry['msg']} {attributes}".strip()
             severity = str(entry.get("s", ""))
         except (ValueError, KeyError, TypeError, AttributeError):
-            text, severity = line, "E"  # not mongod's log format: a loader's or the keeper's word
+            text, severity = line, "E"  # not mongod's format: the loader or the keeper
         (errors if severity in {"E", "F"} else others).append(text[:300])
     return (errors or others)[-4:]
 

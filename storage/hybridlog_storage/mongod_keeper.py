@@ -1,16 +1,16 @@
-"""The process that keeps one embedded mongod: starts it, waits, and ends it.
+"""The process that starts one embedded mongod, waits, and ends it.
 
-Run as a script by `hybridlog_storage.mongod`, never imported by it, with nothing but
-the standard library, so that it starts fast and stays small. It outlives the process
-that started it: mongod belongs to all processes on a store, not to the first one.
+`hybridlog_storage.mongod` runs it as a script and never imports it. It uses only the
+standard library, so it starts fast and stays small. It outlives the process that started
+it: mongod belongs to all processes on a store, not to the first one.
 
     python -I -S mongod_keeper.py '{"command": [...], ...}'
 
-It inherits two open, locked files. The lock on the first says "a keeper is here" and
-goes with this process. The second is handed on to mongod, so its lock says "this
-mongod has not quite ended" even after a keeper that was killed. It also inherits the open
-folder that all of this lies in, and the open log. It names files only relative to that
-folder, and follows no symlink there.
+It inherits two open, locked files. The lock on the first means that a keeper is running;
+it ends with this process. mongod inherits the second, so its lock means that mongod has
+not ended, even after its keeper was killed. The keeper also inherits the open folder of
+these files, and the open log. It opens files only relative to that folder, and follows no
+symlink there.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from pathlib import Path
 from typing import TypedDict
 
 LOG_LIMIT = 10 << 20
-"""Bytes of log after which it is put aside; one older log is kept."""
+"""Bytes of log after which it is rotated; one older log is kept."""
 OPEN_FILES = 64_000
-"""Open files mongod may want: two or so for each collection."""
+"""Limit of mongod's open files: about two for each collection."""
 END_LIMIT_S = 30.0
-"""Seconds mongod has for an orderly end."""
+"""Seconds for an orderly end of mongod."""
 POLL_S = 0.25
 POLL_AT_START_S = 0.05
 YOUNG_S = 3.0
@@ -44,17 +44,17 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Job(TypedDict):
-    """What the starter asks for. Files are names in the folder.
+    """The starter's request. Files are names in the folder.
 
     Attributes:
         command: mongod and its arguments.
-        socket: Path of the unix socket that mongod will listen on; alone in its directory.
-        record: File that says where mongod listens while this keeper lives.
+        socket: Path of mongod's unix socket, the only file in its directory.
+        record: File that names the socket while this keeper runs.
         users_lock: File on which every process that uses mongod holds a shared lock.
         log: Name of the log.
-        linger_s: Seconds for which mongod is kept after the last user has gone.
+        linger_s: Seconds for which mongod runs after its last use.
         folder_fd: Descriptor of the folder.
-        log_fd: Descriptor of the log, where mongod's output goes: for reading and appending.
+        log_fd: Descriptor of the log for mongod's output, for reading and appending.
         alive_fd: Descriptor whose lock mongod shares.
     """
 
@@ -70,7 +70,7 @@ class Job(TypedDict):
 
 
 def main(job: Job) -> int:
-    """Run mongod until nobody uses it; return the exit status of this process."""
+    """Run mongod until it is unused; return the exit status of this process."""
     os.umask(0o077)
     asked_to_end: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -86,7 +86,7 @@ def main(job: Job) -> int:
         users = _open(job, job["users_lock"], os.O_RDWR)
         _write_record(job, mongod.pid)
         is_removed = _wait(job, mongod, users, asked_to_end)
-    except OSError as error:  # a disk that is full cannot take the record
+    except OSError as error:  # the record cannot be written on a full disk
         _say(job, f"the keeper of mongod failed: {error}")
     finally:
         status = mongod.poll()
@@ -99,15 +99,15 @@ def main(job: Job) -> int:
 
 
 def describe_status(status: int) -> str:
-    """A process's return code in words."""
+    """Describe a process's return code."""
     return f"killed by signal {-status}" if status < 0 else f"with exit status {status}"
 
 
 def _start(job: Job) -> subprocess.Popen[bytes]:
     _raise_open_files()
     _put_log_aside(job)
-    # C, since mongod refuses to start under a locale that is not installed, which is
-    # what ssh brings along from the other side.
+    # C, since mongod does not start under a locale that is not installed, and ssh passes
+    # on the locale of the other side.
     environment = {**os.environ, "LC_ALL": "C"}
     return subprocess.Popen(  # noqa: S603 - the starter's own command
         job["command"],
@@ -127,7 +127,7 @@ def _open(job: Job, name: str, flags: int) -> int:
 
 
 def _new_file(job: Job, name: str) -> int:
-    """A new file in the folder, for writing; what has its name goes, also a symlink."""
+    """Create a file in the folder for writing; replace a file or symlink of its name."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(name, dir_fd=job["folder_fd"])
     return _open(job, name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -139,14 +139,14 @@ def _write(fd: int, content: bytes) -> None:
 
 
 def _die_with(keeper: int) -> Callable[[], None] | None:
-    """What mongod's process does before it becomes mongod: tie its life to the keeper's."""
+    """Runs in mongod's process before exec: ends it when the keeper ends."""
     if not sys.platform.startswith("linux"):
         return None
     prctl = ctypes.CDLL(None, use_errno=True).prctl
 
     def tie() -> None:
         prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
-        if os.getppid() != keeper:  # died before the line above
+        if os.getppid() != keeper:  # the keeper died before the line above
             os._exit(1)
 
     return tie
@@ -162,7 +162,7 @@ def _raise_open_files() -> None:
 
 
 def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: list[int]) -> bool:
-    """Return when mongod has ended, when told to end, or, with `users` locked, when idle.
+    """Wait until mongod has ended, a signal asks to end, or it is idle (`users` is then locked).
 
     Returns:
         Whether the store was removed, and mongod's data with it.
@@ -177,8 +177,8 @@ def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: l
         if _lock(users):
             idle_since = now if idle_since is None else idle_since
             if now - idle_since >= job["linger_s"]:
-                # Kept locked: whoever comes now waits until mongod has ended and this
-                # process with it, and then starts anew.
+                # It stays locked: new users wait until mongod and this process have ended,
+                # and then start a new one.
                 return False
             fcntl.flock(users, fcntl.LOCK_UN)
         else:
@@ -205,7 +205,7 @@ def _end(mongod: subprocess.Popen[bytes], *, at_once: bool) -> None:
     try:
         mongod.wait(END_LIMIT_S)
     except subprocess.TimeoutExpired:
-        mongod.kill()  # its journal brings everything back
+        mongod.kill()  # its journal restores everything
         mongod.wait()
 
 
@@ -223,7 +223,7 @@ def _write_record(job: Job, pid: int) -> None:
 
 def _clean(job: Job) -> None:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        # The starter may have had another record written since.
+        # Another keeper may have written a record since.
         fd = _open(job, job["record"], os.O_RDONLY)
         try:
             keeper = json.loads(os.read(fd, RECORD_LIMIT))["keeper"]
@@ -239,7 +239,7 @@ def _clean(job: Job) -> None:
 
 
 def _put_log_aside(job: Job) -> None:
-    """Start the log anew when it is long. mongod appends, so it may keep its descriptor."""
+    """Rotate a long log. mongod appends, so its descriptor stays valid."""
     log = job["log_fd"]
     with contextlib.suppress(OSError):
         if os.fstat(log).st_size <= LOG_LIMIT:
@@ -261,8 +261,8 @@ def _say(job: Job, text: str) -> None:
 
 
 if __name__ == "__main__":
-    # The starter waits for this first process only; the child belongs to init, so that
-    # no starter has to bury it.
+    # The starter waits for this first process only. init adopts the child, so no starter
+    # has to reap it.
     if os.fork():
         os._exit(0)
     sys.exit(main(json.loads(sys.argv[1])))

@@ -1,10 +1,8 @@
-"""Sealing what a crash left open.
+"""Recovers and seals segments that a crash left open.
 
-A segment that was being written when its recorder died ends somewhere, perhaps in the
-middle of a record. Everything before that is kept: the file is cut behind its last
-whole record, what is missing of the last chunk's indexes is written again from the
-chunk itself, and the segment is sealed like any other. A segment that was complete, and
-only had no final name yet, gets that name and nothing else.
+Such a segment may end in the middle of a record. Recovery cuts the file behind its last
+whole record, rebuilds missing indexes of the last chunk from its content, and seals the
+segment. A complete segment without its final name only gets that name.
 """
 
 from __future__ import annotations
@@ -73,18 +71,18 @@ from hybridlog_storage.segment_reader import (
 if TYPE_CHECKING:
     from hybridlog_storage.segment_reader import SegmentSummary
 
-_PIECE = 1 << 20  # bytes that are read at once to sum them up
+_PIECE = 1 << 20  # bytes read at once for a checksum
 
 
 @dataclass(slots=True)
 class Recovered:
-    """What became of an open segment.
+    """The result of recovering an open segment.
 
     Attributes:
-        path: The sealed file, None when nothing at all was in it (it is removed then).
-        messages: Messages kept.
-        cut_bytes: Bytes of records cut from the end; a torn summary is not counted.
-        damage: What inside the file could not be read, in words.
+        path: The sealed file, None for an empty one, which is removed.
+        messages: Recovered messages.
+        cut_bytes: Bytes of records cut from the end, without an incomplete summary.
+        damage: Descriptions of unreadable parts.
     """
 
     path: Path | None
@@ -106,13 +104,13 @@ _RECORDS = (
 
 @dataclass(slots=True)
 class _Whole:
-    """A chunk whose content is right.
+    """A chunk with valid content.
 
     Attributes:
         scanned: The record.
         batch: Its messages.
-        head: What the record must start with.
-        indexes: Its message indexes as they must be, by channel id.
+        head: The correct head of the record.
+        indexes: The correct message indexes, by channel id.
     """
 
     scanned: ScannedChunk
@@ -130,22 +128,22 @@ class _Whole:
 
 
 class _DamagedError(SegmentError):
-    """What a record says cannot be right."""
+    """A record contradicts its content."""
 
 
 class _Rebuilder:
-    """Follows the records of an open segment and remembers what a writer would have."""
+    """Reads the records of an open segment and rebuilds its writer's state."""
 
     def __init__(self, segment: SegmentFile, fd: int, damage: list[str]) -> None:
         self.segment = segment
         self.good_end = 0
         self.messages = 0
         self.has_recording = False
-        self.has_end = False  # the recorder had written all, and only the summary is missing
-        self.is_empty = True  # no chunk or attachment was met, whole or not
-        self.resume: int | None = None  # where the record behind the last chunk must start
+        self.has_end = False  # the recorder had written everything, and only the summary is missing
+        self.is_empty = True  # no chunk or attachment was found, whole or not
+        self.resume: int | None = None  # start of the record behind the last chunk
         self._next_seq = 0
-        self._torn: _Whole | None = None  # the last chunk, while only its trailer may be torn
+        self._torn: _Whole | None = None  # the last chunk, while only its trailer may be incomplete
         self._why_torn = ""
         self._fd = fd
         self._size = segment.position
@@ -164,9 +162,9 @@ class _Rebuilder:
         self.good_end = len(MAGIC)
 
     def take(self, offset: int, item: Item) -> None:
-        """Take note of the next item of a scan."""
+        """Process the next item of a scan."""
         if offset < self.segment.table.end:
-            return  # it lies in the trailer of a chunk, which has been looked at as a whole
+            return  # it lies in the trailer of a chunk, which was checked as a whole
         if isinstance(item, ScanDamage):
             self._damage.append(f"byte {item.offset}: {item.reason}")
         elif isinstance(item, ScannedChunk):
@@ -186,7 +184,7 @@ class _Rebuilder:
             self.good_end = end
 
     def _forget_torn(self) -> None:
-        """Something whole follows a chunk whose arrival numbers are lost."""
+        """Drop a chunk without arrival numbers that is followed by a whole record."""
         if self._torn is not None:
             self._damage.append(f"{self._torn.place}: {self._why_torn}")
             self._torn = None
@@ -195,7 +193,7 @@ class _Rebuilder:
         length = end - offset
         if isinstance(item, SchemaRecord):
             self._schemas[item.id] = item
-            # The crash may have come before the channel that it was written for.
+            # The crash may have come before its channel was written.
             schema = Schema(item.name, item.encoding, bytes(item.data))
             self.segment.schemas.setdefault(item.id, schema)
         elif isinstance(item, ChannelRecord):
@@ -231,7 +229,7 @@ class _Rebuilder:
         self.has_end |= item.name == END_METADATA
 
     def _cover(self, end: int) -> None:
-        """List bytes up to `end` that no record explains."""
+        """Add bytes up to `end` that belong to no record."""
         start = self.segment.table.end
         if end > start:
             self.segment.table.stretch(end - start, _crc_of(self._fd, start, end - start))
@@ -278,7 +276,7 @@ class _Rebuilder:
             self.segment.rewrite(chunk.scanned.offset, chunk.head)
 
     def _trailer(self, start: int, indexes: int) -> bytes:
-        """What stands where the trailer of a chunk must be; nothing if it cannot be whole."""
+        """Bytes at the position of a chunk's trailer; empty if it cannot be complete."""
         head = os.pread(self._fd, ARRIVAL_HEAD.size, start + indexes)
         if len(head) < ARRIVAL_HEAD.size:
             return b""
@@ -289,7 +287,7 @@ class _Rebuilder:
         return os.pread(self._fd, size, start)
 
     def finish(self) -> None:
-        """Cut what is torn; complete the last chunk when only its trailer is."""
+        """Cut incomplete records; rebuild the last chunk's trailer if only that is incomplete."""
         chunk, self._torn = self._torn, None
         if chunk is None:
             self.segment.cut(self.good_end)
@@ -338,14 +336,14 @@ def recover_segment(
     """Cut, complete and seal one open segment.
 
     Args:
-        path: A file whose name ends in `.mcap.open`, which nobody is writing.
-        on_sealing: Told of the segment when it is complete and on the disk, before it gets
-            its final name. When it fails, the file stays, and this can be called again.
+        path: A file whose name ends in `.mcap.open`, without a writer.
+        on_sealing: Called when the segment is complete and on the disk, before it gets its
+            final name. If it fails, the file stays, and this can be called again.
         recording: Catalog entry of the recording, for a segment whose own is damaged.
 
     Raises:
-        StoreError: It cannot be written, is of another format, or is sealed already under
-            its final name. The file stays as it was.
+        StoreError: It cannot be written, has another format, or is sealed already under its
+            final name. The file is unchanged.
         DiskFullError: No room for the summary; all whole records stay.
     """
     tell = on_sealing or (lambda _: None)
@@ -368,10 +366,10 @@ def recover_segment(
 
 
 def _complete(path: Path, number: int) -> Sealed | None:
-    """A segment that lacks nothing but its final name, once it is forced to the disk.
+    """Check a segment that may lack only its final name, and force it to the disk.
 
     Returns:
-        None when something is missing or damaged.
+        None if a part is missing or damaged.
     """
     file = AppendFile.reopen(path)
     try:
@@ -388,9 +386,9 @@ def _complete(path: Path, number: int) -> Sealed | None:
 
 
 def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
-    """The summary of an open segment, if there is one and every byte is as it says."""
+    """The summary of an open segment, if every byte matches its checksums."""
     with SegmentReader(path, number) as reader:
-        # The zeros that fill the last block of a direct write are no part of the segment.
+        # Zeros that fill the last block of a direct write do not belong to the segment.
         last = min(reader.size, BLOCK)
         reader.size -= last - len(bytes(reader.read(reader.size - last, last)).rstrip(b"\0"))
         try:
@@ -403,7 +401,7 @@ def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
 def _rebuild(
     path: Path, number: int, tell: OnSealing, recording: Mapping[str, object] | None
 ) -> Recovered:
-    """Seal a segment by what can be read of it."""
+    """Seal a segment with its readable records."""
     damage: list[str] = []
     segment = SegmentFile(path, number, AppendFile.reopen(path))
     try:
@@ -434,21 +432,21 @@ def _rebuild(
 
 
 def rebuild_summary(path: Path, digest: str) -> bool:
-    """Make the damaged end of a sealed segment again, if it comes out as it was.
+    """Rebuild the damaged summary of a sealed segment, if its digest comes out unchanged.
 
-    The summary follows from what lies before it. It is made in a copy, which takes the
-    segment's place only when its digest is the one that the segment had.
+    The summary is a function of the data before it. It is rebuilt in a copy, which replaces
+    the segment only if it has the original digest.
 
     Args:
         path: The sealed segment.
-        digest: Of the summary that it was sealed with.
+        digest: Digest of its original summary.
 
     Returns:
-        Whether the segment is whole again; if not, it is as before.
+        Whether the segment was repaired; otherwise it is unchanged.
 
     Raises:
         StoreError: It cannot be read, or the copy cannot be written.
-        DiskFullError: There is no room for the copy.
+        DiskFullError: No room for the copy.
     """
     number = int(path.name.removesuffix(SEALED_SUFFIX))
     copy = path.with_name(f".{path.name}.rebuilt")
@@ -467,7 +465,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
 
 
 def _is_rebuilt(path: Path, number: int, digest: str) -> bool:
-    """Cut off the end of a copy of a segment, make it again, and say whether it is right."""
+    """Rebuild the end of a copy of a segment; return whether its digest is right."""
     damage: list[str] = []
     segment = SegmentFile(path, number, AppendFile.reopen(path))
     try:
@@ -500,10 +498,10 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _follow(file: BinaryIO, size: int, rebuilder: _Rebuilder) -> int:
-    """Show every record to a rebuilder; returns the byte where the data ends.
+    """Pass every record to a rebuilder; return the byte where the data ends.
 
-    Where a damaged record behind a chunk has led the scan astray, it starts again at the
-    byte where the next record must be.
+    If a damaged record behind a chunk misleads the scan, it restarts at the position of
+    the next record.
     """
     start: int | None = len(MAGIC)
     while start is not None:
@@ -517,25 +515,25 @@ def _follow(file: BinaryIO, size: int, rebuilder: _Rebuilder) -> int:
             if isinstance(item, ScanDamage) and _is_padding(file.fileno(), item.offset, size):
                 size = item.offset
             elif isinstance(item, DataEnd):
-                return offset  # behind it is a summary, whole or not, which is made anew
+                return offset  # a summary follows, whole or not, which is rebuilt
             else:
                 rebuilder.take(offset, item)
     return size
 
 
 def _is_of_chunk(item: Item) -> bool:
-    """Whether a record belongs to the chunk before it."""
+    """True if a record belongs to the chunk before it."""
     is_arrivals = isinstance(item, PrivateRecord) and item.opcode == ARRIVAL_OPCODE
     return is_arrivals or isinstance(item, MessageIndex)
 
 
 def _is_padding(fd: int, offset: int, size: int) -> bool:
-    """Whether nothing follows but what fills the last block of an `AppendFile`."""
+    """True if only the zeros that fill the last block of an `AppendFile` follow."""
     return size - offset < BLOCK and not any(os.pread(fd, size - offset, offset))
 
 
 def _record_end(fd: int, offset: int) -> int:
-    """Where the record that starts at `offset` ends, by its own length field."""
+    """End of the record at `offset`, by its length field."""
     head = os.pread(fd, RECORD_HEAD.size, offset)
     if len(head) < RECORD_HEAD.size:
         return offset
@@ -543,7 +541,7 @@ def _record_end(fd: int, offset: int) -> int:
 
 
 def _crc_of(fd: int, offset: int, length: int) -> int:
-    """CRC-32 of some bytes of a file."""
+    """CRC-32 of a range of bytes of a file."""
     crc = 0
     while length > 0:
         piece = os.pread(fd, min(length, _PIECE), offset)

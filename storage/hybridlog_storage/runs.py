@@ -1,4 +1,4 @@
-"""Runs of equal values, which for the few messages of a small chunk must cost little."""
+"""Runs of equal values, fast for the few messages of a small chunk."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 
 def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
-    """Where runs of equal values begin.
+    """Start of each run of equal values.
 
-    `np.diff` would do, in five times the time where there are few.
+    For few values this takes a fifth of the time of `np.diff`.
 
     Args:
         values: [n], n > 0.
 
     Returns:
-        intp[k], the first is 0.
+            intp[k], the first is 0.
     """
     changes = (values[1:] != values[:-1]).nonzero()[0]
     starts = np.zeros(len(changes) + 1, np.intp)
@@ -28,11 +28,11 @@ def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
 
 
 def run_lengths(starts: NDArray[np.intp], total: int) -> NDArray[np.intp]:
-    """Lengths of runs.
+    """Length of each run.
 
     Args:
-        starts: intp[k], where each begins.
-        total: Where the last one ends.
+        starts: intp[k], start of each run.
+        total: End of the last run.
 
     Returns:
         intp[k].

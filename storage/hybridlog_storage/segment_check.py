@@ -1,4 +1,4 @@
-"""Every byte of a sealed segment, held against the checksums in its summary."""
+"""Checks every byte of a sealed segment against the checksums in its summary."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SegmentCheck:
 
     def __init__(self, path: Path) -> None:
         self.summary: SegmentSummary | None = None
-        """What the segment says of itself; None when that is damaged anywhere."""
+        """The segment's summary; None if it is damaged."""
         self._reader = SegmentReader(path, 0)
         self._table: ChunkTable | None = None
         self._problem = ""
@@ -39,7 +39,7 @@ class SegmentCheck:
             self._problem = str(error)
 
     def __enter__(self) -> Self:
-        """The check itself."""
+        """Return this object."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -47,16 +47,15 @@ class SegmentCheck:
         self._reader.close()
 
     def problems(self, progress: Callable[[int], None] | None = None) -> Iterator[tuple[int, str]]:
-        """All that is wrong.
+        """Find all damage.
 
-        Without a summary only what has a checksum of its own can be checked: the content of
-        chunks and attachments.
+        Without a summary only chunks and attachments can be checked, by their own checksums.
 
         Args:
-            progress: Called with the byte up to which the segment has been read.
+            progress: Called with the number of bytes read so far.
 
         Yields:
-            Byte and description, in file order; a damaged summary comes first.
+                Byte and description, in file order; a damaged summary comes first.
         """
         if self._table is not None:
             problems = list(damaged_pieces(self._reader, self._table, progress))
@@ -81,11 +80,11 @@ class SegmentCheck:
 def damaged_pieces(
     reader: SegmentReader, table: ChunkTable, progress: Callable[[int], None] | None = None
 ) -> Iterator[tuple[int, str]]:
-    """The parts of a segment that differ from their checksums.
+    """Find the parts of a segment that differ from their checksums.
 
     Args:
         reader: The segment.
-        table: Of its summary.
+        table: The chunk table of its summary.
         progress: Called with the byte up to which the segment has been read.
 
     Yields:
@@ -102,7 +101,7 @@ def damaged_pieces(
 
 
 def _pieces(table: ChunkTable) -> list[tuple[int, int, int, str]]:
-    """Start, bytes, checksum and description of every part that a table lists."""
+    """Start, length, checksum and description of every part in a table."""
     found: list[tuple[int, int, int, str]] = []
     names = ("offset", "length", "trailer", "crc", "trailer_crc")
     columns = (table.chunks[name].tolist() for name in names)
@@ -112,5 +111,5 @@ def _pieces(table: ChunkTable) -> list[tuple[int, int, int, str]]:
         what = f"the message indexes or arrival numbers of chunk {number}"
         found.append((offset + length, trailer, trailer_crc, what))
     for offset, length, crc in table.others.tolist():
-        found.append((offset, length, crc, "what stands between chunks"))
+        found.append((offset, length, crc, "bytes between chunks"))
     return sorted(found)

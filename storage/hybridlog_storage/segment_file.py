@@ -1,4 +1,4 @@
-"""One segment as a file: whole records are appended, a summary seals it."""
+"""A segment file: records are appended, and a summary seals it."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ SEALED_SUFFIX = ".mcap"
 
 @dataclass(frozen=True, slots=True)
 class SealedChannel:
-    """What a sealed segment holds of one channel.
+    """Statistics of one channel in a sealed segment.
 
     Attributes:
         id: The channel's id in the recording.
         topic: Its topic.
-        messages: Number of its messages, one at least.
+        messages: Number of its messages, at least 1.
         payload_bytes: Bytes of their payloads.
         first: Smallest log time, ns.
         last: Largest log time, ns.
@@ -88,7 +88,7 @@ class Sealed:
         bytes: Its size.
         digest: `sha256:` and the hex digest of its bytes from the start of the summary on.
             The summary has checksums of all bytes before, so this proves the whole file.
-        channels: By channel id; only those with messages.
+        channels: Channels with messages, by channel id.
     """
 
     segment: int
@@ -115,7 +115,7 @@ def sealed_name(number: int) -> str:
 def sealed_channels(
     table: ChunkTable, channels: Mapping[int, Channel]
 ) -> tuple[SealedChannel, ...]:
-    """What a segment holds of each channel that has messages in it."""
+    """Statistics of each channel with messages in a segment."""
     rows = table.by_channel()
     names = ("channel", "messages", "payload_bytes", "first", "last")
     columns = (rows[name].tolist() for name in names)
@@ -126,12 +126,12 @@ def sealed_channels(
 
 
 class SegmentFile:
-    """One open segment: appends whole records, keeps what the summary will say.
+    """An open segment: appends whole records and collects the summary.
 
     Args:
         path: The file; its name ends in `.mcap.open`.
         number: Number of the segment.
-        file: The open file; a new one, or one whose records are about to be noted.
+        file: The open file; a new one, or one whose records will be noted.
     """
 
     def __init__(self, path: Path, number: int, file: AppendFile) -> None:
@@ -140,16 +140,16 @@ class SegmentFile:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, tuple[int, Channel]] = {}
         self.table = TableBuilder()
-        """What lies in the file, with checksums."""
+        """The chunk table of the file."""
         self._file = file
-        self._chunk_indexes = bytearray()  # as records: of a long segment there are many
+        self._chunk_indexes = bytearray()  # as records: a long segment has many
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._first: int | None = None
         self._last = 0
         self._sealed: Sealed | None = None  # once the file is complete
-        self._finished = False  # and closed
+        self._finished = False  # once it is closed
 
     @classmethod
     def create(
@@ -166,13 +166,13 @@ class SegmentFile:
         Args:
             directory: The recording's directory.
             number: Segment number, also the file's name.
-            recording: Catalog entry of the recording, kept in the file.
-            next_seq: No message of the segments before has this arrival number or a later one.
+            recording: Catalog entry of the recording, stored in the file.
+            next_seq: One more than the greatest arrival number in the segments before.
             sync: Return once the file's name is on the disk.
 
         Raises:
-            StoreError: The file cannot be made.
-            DiskFullError: There is no room for it; nothing is left behind.
+            StoreError: The file cannot be created.
+            DiskFullError: No room for it; no file remains.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
         try:
@@ -189,18 +189,18 @@ class SegmentFile:
         except BaseException:
             file.close()
             with suppress(OSError):
-                files.unlink(path)  # or the next try would find it there
+                files.unlink(path)  # or the next attempt would find it
             raise
         return segment
 
     @property
     def chunks(self) -> int:
-        """Chunks in the file: the number of the next one."""
+        """Number of chunks in the file, which is the number of the next one."""
         return self.table.chunks
 
     @property
     def is_complete(self) -> bool:
-        """Whether the summary is written; nothing can be added any more."""
+        """True if the summary is written, so nothing can be added."""
         return self._sealed is not None
 
     @property
@@ -210,13 +210,13 @@ class SegmentFile:
 
     @property
     def direct(self) -> bool:
-        """Whether what was written is on the disk already, but for the file's length."""
+        """True if written bytes are on the disk already, except for the file's length."""
         return self._file.direct
 
     def define(
         self, channel_id: int, schema_id: int, channel: Channel, *, write: bool = True
     ) -> None:
-        """Make a channel known; its schema first if this is the first use in the file."""
+        """Write a channel; before it its schema, on its first use in the file."""
         parts: list[bytes] = []
         if schema_id and channel.schema is not None and schema_id not in self.schemas:
             parts.append(record_bytes(schema_record(schema_id, channel.schema)))
@@ -228,7 +228,7 @@ class SegmentFile:
         self.channels[channel_id] = (schema_id, channel)
 
     def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
-        """Append what the segment says of its recording and of itself."""
+        """Append the metadata of the recording and of the segment."""
         about = {"segment": self.number, "format": FORMAT_VERSION, "next_seq": next_seq}
         self.add_metadata(json_metadata(RECORDING_METADATA, {**recording, **about}))
 
@@ -241,7 +241,7 @@ class SegmentFile:
         self.note_metadata(record.name, offset, len(data))
 
     def note_metadata(self, name: str, offset: int, length: int) -> None:
-        """List a metadata record that is in the file already."""
+        """Note a metadata record that is in the file already."""
         self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
 
     def add_attachment(self, record: Attachment) -> None:
@@ -252,7 +252,7 @@ class SegmentFile:
         self.note_attachment(record, offset, len(data))
 
     def note_attachment(self, record: Attachment, offset: int, length: int) -> None:
-        """List an attachment that is in the file already."""
+        """Note an attachment that is in the file already."""
         self._attachment_indexes.append(
             AttachmentIndex(
                 offset=offset,
@@ -266,14 +266,14 @@ class SegmentFile:
         )
 
     def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
-        """Append chunks, each with its message indexes and arrival numbers, in one go.
+        """Append chunks with their message indexes and arrival numbers in one write.
 
         Args:
-            chunks: One at least.
-            end: Byte of the file from which no chunk begins, but for the first.
+            chunks: At least one.
+            end: Byte of the file at or behind which only the first chunk may begin.
 
         Returns:
-            Those that were appended: the first ones.
+                The appended chunks, a prefix of `chunks`.
         """
         parts: list[Buffer] = []
         stored: list[StoredChunk] = []
@@ -326,7 +326,7 @@ class SegmentFile:
         return stored
 
     def append_trailer(self, trailer: bytes) -> None:
-        """Give a chunk the indexes and arrival numbers that a crash has cost it."""
+        """Append indexes and arrival numbers of a chunk that a crash cut off."""
         self._append([trailer])
 
     def note_chunk(
@@ -338,11 +338,11 @@ class SegmentFile:
         crc: int,
         trailer_crc: int,
     ) -> None:
-        """List a chunk that is in the file.
+        """Note a chunk that is in the file already.
 
         Args:
-            chunk: What the summary says of it.
-            parts: `PART`[c], what it holds of each channel.
+            chunk: Its entry in the summary.
+            parts: `PART`[c], statistics of each channel in it.
             trailer: Bytes of message indexes and arrival record behind it.
             crc: CRC-32 of the chunk record.
             trailer_crc: CRC-32 of the trailer.
@@ -365,21 +365,21 @@ class SegmentFile:
         self._last = max(self._last, chunk.last)
 
     def rewrite(self, position: int, data: Buffer) -> None:
-        """Write over bytes that a crash or the disk has damaged."""
+        """Overwrite bytes damaged by a crash or the disk."""
         try:
             self._file.rewrite(position, data)
         except OSError as error:
             raise durability.explain(error, self.path, "recovering") from error
 
     def cut(self, position: int) -> None:
-        """Drop everything from a position on; the next record is written there."""
+        """Truncate the file at a position; the next record is written there."""
         try:
             self._file.cut(position)
         except OSError as error:
             raise durability.explain(error, self.path, "cutting") from error
 
     def sync(self) -> None:
-        """Force what was written to the disk."""
+        """Force the written bytes to the disk."""
         try:
             self._file.sync()
         except OSError as error:
@@ -388,19 +388,19 @@ class SegmentFile:
     def seal(self, *, sync: bool, on_sealing: OnSealing) -> Path:
         """Write the summary, close, and give the file its final name.
 
-        What was done already is not done again when this is called once more after
-        `on_sealing` or the rename has failed.
+        After `on_sealing` or the rename has failed, a second call repeats only the missing
+        steps.
 
         Args:
             sync: Force the file to the disk before `on_sealing` is called.
-            on_sealing: Told of the complete file, before it gets its name.
+            on_sealing: Called with the complete file, before it gets its final name.
 
         Returns:
             The sealed file.
 
         Raises:
-            StoreError: It cannot be written, or a sealed segment of this number is there.
-            DiskFullError: There is no room for the summary; the file is as before.
+            StoreError: It cannot be written, or a sealed segment of this number exists.
+            DiskFullError: No room for the summary; the file is unchanged.
         """
         final = self.path.with_name(sealed_name(self.number))
         try:
@@ -423,8 +423,8 @@ class SegmentFile:
         return final
 
     def complete(self) -> Sealed:
-        """Write the summary; the file keeps its name, and is not forced to the disk."""
-        # In one go: where there is no room, the file is as before, and can be sealed again.
+        """Write the summary, without renaming the file or forcing it to the disk."""
+        # In one write: without room the file is unchanged, and can be sealed again.
         end = record_bytes(DataEnd(data_section_crc=0))
         table = self.table.build(end)
         assert table.end == self.position + len(end)
@@ -446,14 +446,14 @@ class SegmentFile:
             self._file.finish(sync=False)
 
     def _padding(self, content: Buffer, at: int, head: int) -> bytes:
-        """What must stand before a chunk record at a byte for its content to start at a block."""
+        """Padding before a chunk record so that its content starts at a block."""
         if not self._file.room_before(content, at + head):
             return b""
         least = RECORD_HEAD.size
         return padding_record(least + self._file.room_before(content, at + least + head))
 
     def _write(self, records: Sequence[bytes]) -> None:
-        """Append records that belong to no chunk."""
+        """Append records outside of chunks."""
         self._append(records)
         for record in records:
             self.table.other(record)

@@ -1,10 +1,10 @@
-"""What a segment is made of: the parts of MCAP we write, and the one record we add.
+"""The bytes of a segment: MCAP records and the private ones of hybridlog.
 
-Pure functions from values to bytes and back. Rare records are built with the classes
-of the `mcap` package; the records written once a chunk are packed here, so that a
-payload is copied once on its way to the disk.
+Pure functions from values to bytes and back. Rare records are built with the classes of
+the `mcap` package. The records written for each chunk are packed here, so that a payload
+is copied once on its way to the disk.
 
-Names in channel metadata and metadata records that start with `hybridlog.` are ours.
+Names in channel metadata and of metadata records that start with `hybridlog.` are reserved.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def schema_record(schema_id: int, schema: Schema) -> SchemaRecord:
 
 
 def channel_record(channel_id: int, schema_id: int, channel: Channel) -> ChannelRecord:
-    """The MCAP record of a channel, with what MCAP cannot say in our metadata keys."""
+    """The MCAP record of a channel; private metadata keys hold what MCAP has no field for."""
     metadata = dict(channel.metadata)
     metadata.pop(NO_PUBLISH_TIME, None)
     if not channel.has_publish_time:
@@ -96,10 +96,10 @@ def channel_record(channel_id: int, schema_id: int, channel: Channel) -> Channel
 
 
 def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Channel:
-    """The channel that a record of one of our segments describes.
+    """The channel described by a record of a segment.
 
     Raises:
-        SegmentError: its schema was never defined.
+        SegmentError: Its schema is not defined.
     """
     schema: Schema | None = None
     if record.schema_id:
@@ -115,13 +115,13 @@ def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Ch
 
 
 def json_metadata(name: str, value: object) -> Metadata:
-    """A metadata record that carries one JSON value."""
+    """A metadata record with one JSON value."""
     text = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
     return Metadata(name=name, metadata={"json": text})
 
 
 def json_of(record: Metadata) -> dict[str, object]:
-    """The value of a metadata record made by `json_metadata`.
+    """The value of a metadata record from `json_metadata`.
 
     Raises:
         SegmentError: it is not one.
@@ -131,7 +131,7 @@ def json_of(record: Metadata) -> dict[str, object]:
     except (KeyError, ValueError) as error:
         raise SegmentError(f"metadata record {record.name!r} cannot be read: {error}") from error
     if not isinstance(value, dict):
-        raise SegmentError(f"metadata record {record.name!r} is no JSON object")
+        raise SegmentError(f"metadata record {record.name!r} is not a JSON object")
     return value
 
 
@@ -144,7 +144,7 @@ def chunk_head(
     compression: str,
     compressed_size: int,
 ) -> bytes:
-    """All of a chunk record that stands before the compressed data."""
+    """The head of a chunk record: all bytes before the compressed data."""
     name = compression.encode()
     body = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + compressed_size
     return b"".join(
@@ -158,12 +158,12 @@ def chunk_head(
 
 
 class ChunkSummary(NamedTuple):
-    """What the summary of a segment says of a chunk, whose message indexes follow it at once.
+    """The entry of a chunk in the summary; its message indexes directly follow the chunk.
 
     Attributes:
-        first: Log time of its first message, ns.
-        last: Of its last.
-        offset: Byte of the file at which it starts.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+        offset: Byte of the file where it starts.
         length: Bytes of the chunk record.
         indexes: Bytes of each channel's message index record, in their order in the file.
         compression: MCAP name of the codec.
@@ -182,7 +182,7 @@ class ChunkSummary(NamedTuple):
 
 
 def chunk_index_record(chunk: ChunkSummary) -> bytes:
-    """The record that says so."""
+    """The chunk index record of this entry."""
     name = chunk.compression.encode()
     places = index_offsets(chunk.indexes, chunk.offset + chunk.length)
     table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
@@ -200,7 +200,7 @@ def chunk_index_record(chunk: ChunkSummary) -> bytes:
 
 
 def padding_record(size: int) -> bytes:
-    """A record of zeros, of so many bytes with its head."""
+    """A padding record of `size` bytes, including its head."""
     length = size - RECORD_HEAD.size
     return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
 
@@ -242,17 +242,17 @@ def message_indexes(
 
 
 def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
-    """Where the message index of each channel begins, by channel id.
+    """Start of the message index of each channel, by channel id.
 
     Args:
-        sizes: Bytes of each, in their order in the file.
-        start: Byte at which the first begins.
+        sizes: Bytes of each, in file order.
+        start: Byte where the first begins.
     """
     return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
 
 
 def entries_of(index: bytes) -> int:
-    """Number of messages that a message index record lists."""
+    """Number of messages in a message index record."""
     return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
 
 
@@ -267,22 +267,22 @@ def checked_frame(data: Buffer) -> bytes:
 
 
 def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
-    """Arrival numbers of a chunk's messages, in chunk order, with a checksum."""
+    """Pack the arrival numbers of a chunk's messages, in chunk order, with a checksum."""
     steps = seq.astype("<i8")
     steps[1:] -= seq[:-1]
     return checked_frame(steps.tobytes())
 
 
 def arrival_record(chunk_offset: int, packed: bytes) -> bytes:
-    """The record that keeps packed arrival numbers of the chunk at an offset."""
+    """The record with the packed arrival numbers of the chunk at an offset."""
     return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, 8 + len(packed), chunk_offset) + packed
 
 
 def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
-    """Chunk offset and arrival numbers from the body of an arrival record.
+    """Parse the body of an arrival record into chunk offset and arrival numbers.
 
     Raises:
-        SegmentError: the record is damaged or does not hold `count` numbers.
+        SegmentError: The record is damaged or does not hold `count` numbers.
     """
     if len(body) < 8 or count > _MAX_ARRIVALS:
         raise SegmentError("the record of arrival numbers is damaged")
@@ -295,7 +295,7 @@ def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
 
 
 def message_starts(trailer: Buffer) -> NDArray[np.int64]:
-    """Where the message records of a chunk start in it, ascending, by its message indexes.
+    """Start of each message record in a chunk, ascending, from its message indexes.
 
     Args:
         trailer: The message index records, and the record of arrival numbers.
@@ -308,12 +308,12 @@ def message_starts(trailer: Buffer) -> NDArray[np.int64]:
     """
     indexes, _ = split_trailer(trailer)
     found = [entries["offset"].astype(np.int64) for _, entries in indexes]
-    # Each channel's are in order already: sorted runs are merged, which is ten times as fast.
+    # Each channel's starts are sorted already; merging sorted runs is ten times as fast.
     return np.sort(np.concatenate(found), kind="stable") if found else np.empty(0, np.int64)
 
 
 def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
-    """Log times of the messages of a chunk, by channel, by its message indexes.
+    """Log times of the messages of a chunk by channel, from its message indexes.
 
     Args:
         trailer: The message index records, and the record of arrival numbers.
@@ -329,17 +329,17 @@ def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
 
 
 def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], memoryview]:
-    """The records behind a chunk.
+    """Parse the records behind a chunk.
 
     Args:
-        trailer: The message index records, and the record of arrival numbers, no byte more.
+        trailer: Exactly the message index records and the record of arrival numbers.
 
     Returns:
         Channel id and entries (`log_time`, `offset`) of each message index; the body of the
         record of arrival numbers.
 
     Raises:
-        SegmentError: It holds something else.
+        SegmentError: It holds other bytes.
     """
     view = memoryview(trailer)
     found: list[tuple[int, NDArray[np.void]]] = []
@@ -362,15 +362,15 @@ def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], 
 
 
 def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
-    """The messages of a chunk of ours, given where their records start.
+    """The messages of a chunk, given the starts of their records.
 
     Args:
         content: The uncompressed chunk.
         starts: int64[n], ascending.
 
     Returns:
-        None when the records do not follow one another from the first byte of the
-        content to the last, that is, when `starts` cannot be right.
+        None if `starts` is wrong, that is, if the records do not cover the content from the
+        first byte to the last.
     """
     if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
         return None

@@ -1,7 +1,7 @@
-"""Reading segments: their summary, and chunks one at a time.
+"""Reads segments: their summary, and chunks one at a time.
 
-A sealed segment never changes, so a reader may be used by several threads: every read
-names its place.
+A sealed segment never changes and every read names its position, so several threads may
+share a reader.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ if TYPE_CHECKING:
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
-_PIECE = 4 << 20  # bytes that are read at once to sum them up
+_PIECE = 4 << 20  # bytes read at once for a checksum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkPlace:
-    """Where a chunk lies in its segment.
+    """Position of a chunk in its segment.
 
     Attributes:
         number: Number of the chunk in its segment, from 0, in file order.
@@ -76,8 +76,8 @@ class ChunkPlace:
         first: Smallest log time in it, ns.
         last: Largest log time in it, ns.
         channels: Ids of the channels in it.
-        crc: CRC-32 of the chunk record, its head included; None when not known.
-        trailer_crc: CRC-32 of the trailer; None when not known.
+        crc: CRC-32 of the chunk record, including its head; None if unknown.
+        trailer_crc: CRC-32 of the trailer; None if unknown.
     """
 
     number: int
@@ -93,18 +93,18 @@ class ChunkPlace:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentSummary:
-    """What a sealed segment says of itself. All of it has been checked.
+    """The checked summary of a sealed segment.
 
     Attributes:
-        recording: Catalog entry of the recording, as when the segment was started.
-        end: How the recording ended; None in all but a recording's last segment.
-        channels: By channel id.
+        recording: Catalog entry of the recording at the start of the segment.
+        end: The end of the recording; None except in its last segment.
+        channels: Channels by id.
         schema_ids: Id of each channel's schema, 0 without one, by channel id.
-        chunks: In file order.
-        counts: Messages by channel id.
-        losses: Rows of the loss ledger that were written with its messages.
-        table: Where everything lies, with checksums.
-        digest: Of the bytes from the start of the summary on, as in `Sealed`.
+        chunks: Chunks in file order.
+        counts: Number of messages by channel id.
+        losses: Rows of the loss ledger written with its messages.
+        table: The chunk table.
+        digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
     """
 
@@ -122,7 +122,7 @@ class SegmentSummary:
 
 @dataclass(slots=True)
 class _Records:
-    """The records of a summary that a reader of segments needs."""
+    """The needed records of a summary."""
 
     schemas: dict[int, SchemaRecord]
     channels: dict[int, ChannelRecord]
@@ -137,11 +137,11 @@ class SegmentReader:
     Args:
         path: The file.
         number: Its number in the recording.
-        direct: Read past the page cache, if the file system allows it: for what was just
-            written that way, and will not be read again soon.
+        direct: Read past the page cache, if the file system allows it: for data that was
+            just written that way and will not be read again soon.
 
     Raises:
-        SegmentError: the file is missing or cannot be opened.
+            SegmentError: The file is missing or cannot be opened.
     """
 
     def __init__(self, path: Path, number: int, *, direct: bool = False) -> None:
@@ -150,7 +150,7 @@ class SegmentReader:
         self._direct = direct and bool(DIRECT)
         cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
-            # Whatever lies there, opening it must not wait.
+            # Opening must not block, for example on a named pipe.
             self._fd = self._open(path)
         except OSError as error:
             problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
@@ -158,7 +158,7 @@ class SegmentReader:
         about = os.fstat(self._fd)
         if not stat.S_ISREG(about.st_mode):
             self.close()
-            raise SegmentError(f"Segment {path} is no ordinary file. {cure}")
+            raise SegmentError(f"Segment {path} is not an ordinary file. {cure}")
         self.size = about.st_size
         self.bytes_read = 0
 
@@ -171,7 +171,7 @@ class SegmentReader:
         return files.open_file(path, flags)
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -181,7 +181,7 @@ class SegmentReader:
             self.close()
 
     def __enter__(self) -> Self:
-        """The reader itself."""
+        """Return this reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -189,7 +189,7 @@ class SegmentReader:
         self.close()
 
     def stream(self) -> BinaryIO:
-        """Another handle of the file, for `scan`; the caller closes it.
+        """A new handle of the file for `scan`; the caller closes it.
 
         Raises:
             SegmentError: It cannot be opened.
@@ -200,14 +200,14 @@ class SegmentReader:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
 
     def grow(self) -> None:
-        """Take note of what was appended since the file was opened."""
+        """Update the file's size after an append."""
         self.size = os.fstat(self._fd).st_size
 
     def summary(self) -> SegmentSummary:
         """Channels, chunks and metadata, from the summary at the end of the file.
 
         Raises:
-            SegmentError: There is none, it is damaged, or it is of another format.
+            SegmentError: It is missing, damaged, or has another format.
         """
         with self._explained():
             start, tail = self._tail()
@@ -215,7 +215,7 @@ class SegmentReader:
             return self._summary(records, self._table(records, start), digest_of(tail))
 
     def table(self) -> ChunkTable:
-        """The chunk table of the summary; metadata is not read for it.
+        """The chunk table of the summary, without reading metadata.
 
         Raises:
             SegmentError: As `summary`.
@@ -235,7 +235,7 @@ class SegmentReader:
             ) from error
 
     def _tail(self) -> tuple[int, memoryview]:
-        """Where the summary starts, and all bytes from there on, checked."""
+        """Start of the summary, and the checked bytes from there on."""
         if self.size < len(MAGIC) + _TAIL:
             raise _NoSummaryError("it is too short")
         tail = self.read(self.size - _TAIL, _TAIL)
@@ -266,7 +266,7 @@ class SegmentReader:
         return table
 
     def _refuse_other_format(self, records: _Records) -> None:
-        """Tell a format that is not ours; what it says of itself is not checked."""
+        """Raise if the unchecked header names another format."""
         for index in records.metadata:
             if index.name == RECORDING_METADATA:
                 record = _metadata(self.read(index.offset, index.length), index.offset, self.path)
@@ -305,7 +305,7 @@ class SegmentReader:
         )
 
     def _checked_metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
-        """A metadata record, after the checksum of the stretch that holds it."""
+        """A metadata record, after checking the stretch that holds it."""
         stretch = table.stretch(index.offset, index.length)
         if stretch is None:
             raise _NoSummaryError(f"no metadata record lies at byte {index.offset}")
@@ -323,13 +323,13 @@ class SegmentReader:
         """Read, decompress and check one chunk.
 
         Args:
-            place: Where it lies. Its checksums, where they are known, are compared before a
-                byte of the chunk is believed. Without them everything is held against the
-                checksum of the content. Message indexes that are damaged are not needed: the
-                messages and the arrival numbers have checksums of their own.
+            place: Its position. Known checksums are compared before any byte of the chunk is
+                used. Without them everything is compared with the checked content. Damaged
+                message indexes are ignored: messages and arrival numbers have checksums of
+                their own.
 
         Raises:
-            SegmentError: it is not there, or it is damaged; names file and offset.
+                SegmentError: It is missing or damaged; the message names file and offset.
         """
         data = self.read(place.offset, place.length + place.trailer)
         record, trailer = data[: place.length], data[place.length :]
@@ -369,13 +369,13 @@ class SegmentReader:
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, from its message indexes alone.
 
-        Where these are damaged, or their checksum is not known, the chunk is read instead.
+        If these are damaged, or their checksum is unknown, the chunk is read instead.
 
         Returns:
             int64[n], ns, ascending, by channel id.
 
         Raises:
-            SegmentError: they are not there, or damaged; names file and offset.
+            SegmentError: They are missing or damaged; the message names file and offset.
         """
         trailer = self.read(place.offset + place.length, place.trailer)
         if crc32(trailer) == place.trailer_crc:
@@ -388,14 +388,14 @@ class SegmentReader:
         """Arrival numbers of a chunk's messages, without reading the chunk.
 
         Args:
-            place: Where it lies, with the checksum of what is behind it.
-            count: Messages in it.
+            place: Its position, with the checksum of the trailer.
+            count: Number of its messages.
 
         Returns:
-            int64[count].
+                int64[count].
 
         Raises:
-            SegmentError: they are not there, or damaged; names file and offset.
+                SegmentError: They are missing or damaged; the message names file and offset.
         """
         trailer = self.read(place.offset + place.length, place.trailer)
         try:
@@ -406,7 +406,7 @@ class SegmentReader:
             raise self._damaged(place, error) from error
 
     def checksum(self, offset: int, length: int) -> int:
-        """CRC-32 of some bytes of the file.
+        """CRC-32 of a range of bytes of the file.
 
         Raises:
             SegmentError: They cannot be read.
@@ -417,7 +417,7 @@ class SegmentReader:
         return crc
 
     def read(self, offset: int, length: int) -> memoryview:
-        """Bytes of the file; nothing about them is checked.
+        """Unchecked bytes of the file.
 
         Raises:
             SegmentError: The file is too short, or cannot be read.
@@ -443,11 +443,11 @@ class SegmentReader:
 
 
 class _NoSummaryError(SegmentError):
-    """Why a summary cannot be believed."""
+    """A summary that is missing or damaged."""
 
 
 def _records(summary: memoryview) -> _Records:
-    """The records of a summary whose checksum is right."""
+    """Parse a checked summary."""
     found = _Records({}, {}, [], None, None)
     at = 0
     while at < len(summary):
@@ -462,7 +462,7 @@ def _records(summary: memoryview) -> _Records:
         if opcode == CHUNK_TABLE_OPCODE:
             found.table = body
         if opcode not in _WANTED:
-            continue  # the chunk indexes above all: the table says more, and is read sooner
+            continue  # such as chunk indexes: the chunk table holds more and is faster to read
         try:
             record, _ = read_record(opcode, body)
         except SegmentError as error:
@@ -494,7 +494,7 @@ def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
-    """Where each chunk of a table lies, in file order."""
+    """Position of each chunk of a table, in file order."""
     channels = table.parts["channel"].tolist()
     bounds = table.part_bounds().tolist()
     names = ("offset", "length", "trailer", "first", "last", "crc", "trailer_crc")
@@ -521,7 +521,7 @@ def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
     """Rows of the loss ledger, from the value of its metadata record.
 
     Raises:
-        SegmentError: They are no rows.
+        SegmentError: The value is damaged.
     """
     found = value.get("rows")
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
@@ -530,10 +530,10 @@ def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:
-    """Refuse a segment of another format.
+    """Raise if a segment has another format.
 
     Raises:
-        SegmentError: It is of a newer one, or of one that is not read any more.
+        SegmentError: Its format is newer, or no longer supported.
     """
     version = recording.get("format")
     if version == FORMAT_VERSION:
@@ -550,15 +550,15 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
 
 
 def open_chunk(record: memoryview, *, is_checked: bool = False) -> tuple[Buffer, int]:
-    """The content of a whole chunk record, and its compressed size.
+    """Content and compressed size of a whole chunk record.
 
     Args:
-        record: The chunk record, its head included.
-        is_checked: Whether a checksum of the record has been compared. Content that is not
-            compressed is then not summed up a second time.
+        record: The chunk record, including its head.
+        is_checked: Whether a checksum of the record was compared. The checksum of
+            uncompressed content is then not computed again.
 
     Raises:
-        SegmentError: It is no chunk record, or damaged.
+            SegmentError: It is not a chunk record, or damaged.
     """
     if len(record) < CHUNK_HEAD.size + 4:
         raise SegmentError("the record is too short")
@@ -583,7 +583,7 @@ def open_chunk(record: memoryview, *, is_checked: bool = False) -> tuple[Buffer,
 
 
 def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: int) -> bytes:
-    """What a chunk record must start with.
+    """The correct head of a chunk record.
 
     Args:
         batch: The messages of its content.
@@ -603,17 +603,17 @@ def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: 
 
 
 def indexes_of(batch: Batch) -> dict[int, bytes]:
-    """The message index records of a chunk as they must be, by channel id."""
+    """The correct message index records of a chunk, by channel id."""
     order = index_order(batch.channel, batch.log_time)
     starts = batch.offset - MESSAGE_HEAD.itemsize
     return message_indexes(batch.channel, batch.log_time, starts, order)
 
 
 def _check_around(record: memoryview, trailer: memoryview, batch: Batch) -> None:
-    """Hold the head of a chunk and its message indexes against its content.
+    """Compare the head of a chunk and its message indexes with its content.
 
     Raises:
-        SegmentError: They say something else.
+        SegmentError: They differ.
     """
     if not len(batch):
         raise SegmentError("it holds no message")
@@ -626,18 +626,18 @@ def _check_around(record: memoryview, trailer: memoryview, batch: Batch) -> None
 
 
 def check_arrivals(trailer: Buffer, chunk_offset: int, count: int) -> NDArray[np.int64]:
-    """Arrival numbers of a chunk's messages.
+    """Parse and check the arrival numbers of a chunk's messages.
 
     Args:
         trailer: The message indexes and the record of arrival numbers.
         chunk_offset: Byte of the file where the chunk starts.
-        count: Its messages.
+        count: Number of its messages.
 
     Returns:
         int64[count], in chunk order.
 
     Raises:
-        SegmentError: They are missing, damaged, or another chunk's.
+        SegmentError: They are missing, damaged, or belong to another chunk.
     """
     _, body = split_trailer(trailer)
     owner, seq = arrivals_of(body, count)

@@ -1,10 +1,10 @@
-"""Writing a recording: which messages share a chunk, and how chunks reach its segments.
+"""Writes a recording: groups messages into chunks, and chunks into segments.
 
-Chunks hold like with like. A channel whose payloads are large has chunks of its own,
-bounded in bytes and in log time, so that a slice of a scan reads next to nothing else;
-the channels with small payloads share one. Worker threads compress, another writes: chunks
-reach the file in the order in which they were closed, each with its indexes in one
-go, and only then their owner hears of them: **log first, index second**.
+A channel with large payloads has chunks of its own, bounded in bytes and in log time, so
+that a slice of a scan reads little else. Channels with small payloads share chunks. Worker
+threads compress, another thread writes. Chunks reach the file in the order in which they
+were closed, each with its indexes in one write. Only then the indexer gets them: **log
+first, index second**.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     _Count = TypeVar("_Count", int, NDArray[np.int64])
 from hybridlog_storage.threads import Threads
 
-_MOST_CHUNKS = 1 << 14  # of a segment: whoever reads its summary has a kilobyte of each in memory
-_MOST_PARTS = 1 << 20  # channels of all chunks of a segment, which its summary lists, too
+_MOST_CHUNKS = 1 << 14  # chunks of a segment: its reader needs a kilobyte of memory for each
+_MOST_PARTS = 1 << 20  # sum over a segment's chunks of their channels, which the summary lists
 PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
-"""Closed chunks that may be on their way to the file without anything being late."""
-_TURN_S = 0.1  # that a chunk waits for its turn to be packed, at most
+"""Closed chunks that may be in work before the writer counts as late."""
+_TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
@@ -55,11 +55,11 @@ _WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
 @dataclass(frozen=True, slots=True)
 class SegmentSettings:
-    """How segments are cut and packed.
+    """Settings for the division and compression of segments.
 
     Attributes:
-        chunk_size: Bytes of uncompressed content at which a chunk closes, if its writer is not
-            told otherwise, as it is where very much comes.
+        chunk_size: Bytes of uncompressed content at which a chunk closes; a live recording
+            uses larger chunks at high rates.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
         span_size: Bytes of content below which such a chunk may span 64 times as much: small
             chunks compress badly, and reading one whole costs little.
@@ -69,8 +69,8 @@ class SegmentSettings:
         segment_size: Bytes of file at which the next segment starts, if it has not after
             16,384 chunks.
         segment_span_s: Seconds after which the next segment starts; None for no such bound.
-        sync: When to force data to the disk: at every chunk, when a segment is sealed,
-            or never (the operating system decides).
+        sync: Forces data to the disk at every chunk, when a segment is sealed, or never
+            (the operating system decides).
     """
 
     chunk_size: int = 2 << 20
@@ -96,7 +96,7 @@ class SegmentSettings:
 
 @dataclass(slots=True)
 class RecordingTotals:
-    """What a recording's writer has done so far."""
+    """Progress of a recording's writer."""
 
     messages: int = 0
     payload_bytes: int = 0
@@ -113,26 +113,25 @@ class _Known:
 
 
 class RecordingWriter:
-    """Takes the batches of one recording, writes its segments.
+    """Writes the batches of one recording into segments.
 
     Args:
         directory: The recording's directory; it exists and is empty.
-        recording: Catalog entry kept in every segment.
-        on_chunk: Called, on a thread of the writer's and in file order, with every chunk
-            that is in the file.
-        settings: How to cut and pack.
-        hurry: Says whether there is no time to compress what does not shrink to little; None
-            when there always is.
-        next_chunk_size: Gives the bytes at which a chunk closes that is opened now; without,
-            as the settings say.
-        spare: As many as there are processors for what can wait. One is taken to pack a
-            chunk where there is no hurry, unless none can be had for a tenth of a second.
-        on_written: Called, on a thread of the writer's, when there is less that waits. With
-            it nothing that is appended waits for the disk: whoever appends looks at
-            `waiting`. Without it `append` waits while the disk is slow.
-        on_sealing: Called when a segment is complete and, unless the settings say never, on
-            the disk; only then it gets its final name. A thread of the writer's calls it, or
-            the one that calls `give_up`. What it raises stops the writer like a failed write.
+        recording: Catalog entry stored in every segment.
+        on_chunk: Called on a writer thread, in file order, with every chunk in the file.
+        settings: How to divide and compress.
+        hurry: Returns whether to compress only chunks that shrink to a fifth or less; None
+            for never.
+        next_chunk_size: Returns the size in bytes of the next chunk; None for the size in
+            the settings.
+        spare: Semaphore of the processors for work that can wait. Packing a chunk takes one
+            if there is no hurry, and waits for it a tenth of a second at most.
+        on_written: Called on a writer thread when less content is waiting. With it `append`
+            never waits for the disk, and the caller watches `waiting`. Without it `append`
+            waits for a slow disk.
+        on_sealing: Called when a segment is complete and, unless `sync` is never, on the
+            disk, before it gets its final name. Called on a writer thread or by `give_up`.
+            An exception stops the writer like a failed write.
     """
 
     def __init__(
@@ -152,9 +151,9 @@ class RecordingWriter:
         self.totals = RecordingTotals()
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
-        """Messages that are in the files, by channel id."""
+        """Number of messages in the files, by channel id."""
         self.last_log_time = 0
-        """Log time of the latest message in the files, ns; 0 without any."""
+        """Greatest log time in the files, ns; 0 without messages."""
         self._directory = directory
         self._recording = recording
         self._on_chunk = on_chunk
@@ -172,7 +171,7 @@ class RecordingWriter:
         self._on_sealing: OnSealing = on_sealing or (lambda _: None)
         self._closed_bytes = 0
         self._stored_bytes = 0
-        self._packed: deque[Future[PackedChunk]] = deque()  # in the order of the file
+        self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._broken: BaseException | None = None
         self._next_seq = 0
@@ -186,14 +185,14 @@ class RecordingWriter:
 
     @property
     def waiting(self) -> int:
-        """Bytes of content of closed chunks that are not in the file yet."""
+        """Bytes of content in closed chunks that are not in the file yet."""
         return self._closed_bytes - self._stored_bytes
 
     def append(self, batch: Batch | LooseBatch, channels: Sequence[Channel]) -> None:
-        """Take a batch; `batch.channel` indexes `channels`.
+        """Append a batch; `batch.channel` indexes `channels`.
 
         Raises:
-            DiskFullError: no space; what was flushed before stays.
+            DiskFullError: No space; flushed chunks stay.
         """
         if not len(batch):
             return
@@ -223,15 +222,15 @@ class RecordingWriter:
     def place_one(
         self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
     ) -> Callable[[], None]:
-        """Take one message; for large payloads this costs less than a batch.
+        """Append one message; for large payloads this costs less than a batch.
 
         Returns:
-            What copies the payload, unless that was done at once (one below
-            `COPIED_AT_ONCE`). It must be called once, on any thread, also while others
-            append; the message's chunk is not written before.
+            A function that copies the payload, unless it was copied at once (below
+            `COPIED_AT_ONCE`). Call it once, on any thread, also while others append; the
+            message's chunk is not written before.
 
         Raises:
-            DiskFullError: no space; what was flushed before stays.
+                DiskFullError: No space; flushed chunks stay.
         """
         known = self._known.get(channel) or self._meet(channel, len(payload))
         key = known.cluster
@@ -258,28 +257,28 @@ class RecordingWriter:
             try:
                 self._close_chunk(key)
             except BaseException:
-                copy()  # or who packs the chunk would wait for ever
+                copy()  # or packing the chunk would wait for ever
                 raise
         return copy
 
     def count_chunks(self, channels: Iterable[Channel]) -> int:
-        """In how many open chunks messages of some channels lie; of new ones each in its own."""
+        """Number of open chunks with messages of some channels; a new channel counts as one."""
         known = self._known
         return len({known[c].cluster if c in known else c for c in channels})
 
     def add_extra(self, record: Metadata | Attachment) -> None:
-        """Keep an attachment or a metadata record of the source."""
+        """Store an attachment or a metadata record of the source."""
         self._storing.append(self._disk.submit(self._add, record))
         self._keep_pace(limit=0)
 
     def flush(self) -> None:
-        """Close every open chunk and see it written."""
+        """Close and write every open chunk."""
         for key in list(self._clusters):
             self._close_chunk(key)
         self._drain(limit=0)
 
     def flush_older(self, seconds: float) -> None:
-        """Close the chunks that were opened so long ago, and write what is packed."""
+        """Close chunks of at least this age, and write packed chunks."""
         limit = time.monotonic() - seconds
         for key, builder in self._clusters.items():
             if builder.opened <= limit:
@@ -287,10 +286,10 @@ class RecordingWriter:
         self._keep_pace(limit=4)
 
     def close(self, end: Metadata | None = None) -> list[Path]:
-        """Flush, seal the last segment; returns the paths of all segments.
+        """Flush and seal the last segment; return the paths of all segments.
 
         Args:
-            end: A last metadata record, which says how the recording ended.
+            end: The last metadata record, with the end of the recording.
         """
         try:
             self.flush()
@@ -303,13 +302,13 @@ class RecordingWriter:
         return self._closed
 
     def give_up(self, extras: Sequence[Metadata]) -> None:
-        """When nothing more can be written: seal what is in the file, drop what is not.
+        """Seal the chunks in the file and drop the others, after a failed write.
 
         Args:
-            extras: Last records, for which there may be room.
+            extras: Last records, written if they fit.
 
         Raises:
-            DiskFullError: There is not; the next opening of the store seals the segment.
+            DiskFullError: No room; the next opening of the store seals the segment.
         """
         self._syncing = None
         self._shut_down()
@@ -321,12 +320,12 @@ class RecordingWriter:
         self._seal()
 
     def written_of(self, channel: Channel) -> int:
-        """Messages of a channel that are in the files."""
+        """Number of messages of a channel in the files."""
         known = self._known.get(channel)
         return 0 if known is None else self.written[known.channel_id]
 
     def abort(self) -> None:
-        """Stop at once; sealed segments and flushed chunks stay where they are."""
+        """Stop at once; sealed segments and flushed chunks stay."""
         self._broken = self._broken or StoreError("The recording was stopped.")
         self._shut_down()
         if self._segment is not None:
@@ -338,7 +337,7 @@ class RecordingWriter:
         self._disk.shutdown(wait=True, cancel_futures=True)
 
     def _meet(self, channel: Channel, mean: float) -> _Known:
-        """Make a new channel known: its ids, and from its mean payload bytes its cluster."""
+        """Register a new channel: its ids and, from its mean payload size, its cluster."""
         if len(self._known) >= _MAX_CHANNELS:
             raise StoreError(f"more than {_MAX_CHANNELS} channels in one recording")
         schema_id = 0
@@ -362,15 +361,14 @@ class RecordingWriter:
     def _next_capacity(self, key: int, before: int) -> int:
         """Bytes at which the next chunk of a cluster closes.
 
-        Topics of one rate would close theirs at one time, which is much to do at once where
-        chunks are large. So when they become twice as large or more, each cluster begins with
-        another size between half of it and all.
+        Topics of equal rate would close large chunks at the same time. So when chunks at least
+        double in size, each cluster starts with a different size between half and full.
         """
         size = self._next_chunk_size()
         return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
     def _fill(self, key: int, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
-        """Lay messages into a cluster's chunk, closing chunks at their bounds."""
+        """Append messages to a cluster's chunk, closing chunks at their bounds."""
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
         start, total = 0, len(batch)
         while start < total:
@@ -379,7 +377,7 @@ class RecordingWriter:
             room = builder.capacity - len(builder)
             end = int(np.searchsorted(sizes, before + room, side="right"))
             if not len(builder):
-                end = max(end, start + 1)  # a message larger than a chunk is a chunk
+                end = max(end, start + 1)  # a message larger than a chunk is a chunk of its own
             if key != _SHARED:
                 end = min(end, self._span_end(builder, batch, start))
             if end > start:
@@ -395,7 +393,7 @@ class RecordingWriter:
         return self.settings.chunk_span_ns * (1 + (_SMALL_SPANS - 1) * is_small)
 
     def _span_end(self, builder: ChunkBuilder, batch: Batch | LooseBatch, start: int) -> int:
-        """First row from `start` on that lies too far in log time from the chunk's first."""
+        """First row from `start` on whose log time is too far from the chunk's first."""
         log_time = batch.log_time[start:]
         first = builder.first_log_time if len(builder) else int(log_time[0])
         away = np.abs(log_time - first)
@@ -418,11 +416,11 @@ class RecordingWriter:
             self._keep_pace(limit=AT_WORK)
 
     def _keep_pace(self, limit: int) -> None:
-        """Wait as `_drain` does, or only hear of what went wrong if somebody else waits."""
+        """Wait as `_drain` does, or with `on_written` only raise a failure."""
         self._drain(limit if self._on_written is None else len(self._storing))
 
     def _drain(self, limit: int) -> None:
-        """Wait until at most `limit` chunks are still being packed and written; tell a failure."""
+        """Wait until at most `limit` chunks are being packed or written; raise a failure."""
         while self._storing and (len(self._storing) > limit or self._storing[0].done()):
             self._storing.popleft().result()
         if self._broken is not None:
@@ -431,11 +429,11 @@ class RecordingWriter:
     def _pack(
         self, copying: Sequence[Lock], batch: Batch, seq: NDArray[np.int64], size: int
     ) -> PackedChunk:
-        """Pack a chunk once all payloads are there: the same microseconds, seldom more."""
+        """Pack a chunk once all payloads are copied, which takes microseconds."""
         for lock in copying:
             lock.acquire()
-        # Only now: topics of one rate close their chunks at one time, and nobody is in a
-        # hurry before most of these wait here, or for their turn.
+        # Checked here: topics of equal rate close their chunks at the same time, and the
+        # hurry shows only when most of these are waiting.
         hurried = self._hurry()
         with nullcontext() if hurried else self._turn():
             hurried = hurried or self._hurry()
@@ -443,7 +441,7 @@ class RecordingWriter:
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
-        """A processor to spare, if one can be had soon; nothing waits long for who has it."""
+        """Hold a spare processor, if one is free soon."""
         has_one = self._spare.acquire(timeout=_TURN_S)
         try:
             yield
@@ -451,14 +449,14 @@ class RecordingWriter:
             if has_one:
                 self._spare.release()
 
-    # What follows runs on the thread that writes, and on no other.
+    # The methods below run on the writing thread only.
 
     def _store(self, packed: Future[PackedChunk]) -> None:
-        """See a closed chunk written, with those behind it that can be; none after a failure."""
+        """Write a closed chunk and packed chunks behind it; none after a failure."""
         if self._broken is not None:
-            return  # whoever appends hears of it
+            return  # the next append raises it
         if not self._packed or packed is not self._packed[0]:
-            return  # it was written with one before it
+            return  # it was written together with an earlier one
         try:
             self._write()
         except BaseException as error:
@@ -466,10 +464,10 @@ class RecordingWriter:
             raise
 
     def _next_chunks(self, segment: SegmentFile) -> list[PackedChunk]:
-        """The first chunk, once it is packed, and what is packed already and lies behind it.
+        """The first chunk, once it is packed, and the packed chunks behind it.
 
-        Each time this thread stops and goes on, it waits for its turn at the interpreter;
-        so when much waits, much is written at once. The file is as if it had not waited.
+        After each blocking call this thread waits for the interpreter lock. So many waiting
+        chunks are written at once; the file is the same either way.
         """
         first = self._packed[0].result()
         for channel_id in first.indexes:
@@ -515,7 +513,7 @@ class RecordingWriter:
             self._seal()
 
     def _tell(self, chunk: PackedChunk, stored: StoredChunk) -> None:
-        """Whom it concerns that a chunk is in the file."""
+        """Report that a chunk is in the file."""
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
@@ -527,7 +525,7 @@ class RecordingWriter:
             self._on_written()
 
     def _sync_behind(self, segment: SegmentFile) -> None:
-        """Force long segments to the disk as they grow, so that sealing them takes no time."""
+        """Force long segments to the disk as they grow, so that sealing them is fast."""
         if segment.position - self._synced >= _SYNC_STRIDE and self._syncing is None:
             self._synced = segment.position
             self._syncing = self._pool.submit(segment.sync)

@@ -1,6 +1,6 @@
-"""The settings of a store: its file `hybridlog.toml`, and what may stand in it.
+"""The settings of a store: its file `hybridlog.toml`.
 
-The file may come from somebody else, or be read by others of a group. So it holds no
+The file may come from another user, or be read by others of a group. So it holds no
 password, and a URI in it is only a proposal (`hybridlog.consent`).
 """
 
@@ -21,7 +21,7 @@ from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError, UsageError
 
 FORMAT: Final = 2
-"""Format of the stores that this version makes and reads."""
+"""Store format of this version."""
 NAME: Final = "hybridlog.toml"
 EMBEDDED: Final = "embedded"
 """In place of a URI: the MongoDB that comes with hybridlog."""
@@ -36,20 +36,19 @@ LOGIN_CURE: Final = (
     "Give the password in HYBRIDLOG_MONGO_PASSWORD, or in a file that "
     "HYBRIDLOG_MONGO_PASSWORD_FILE names."
 )
-"""What to do where a password is missing, or stands where others can read it."""
+"""The cure for a password that is missing or readable by others."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoreSettings:
-    """What `hybridlog.toml` says.
+    """The content of `hybridlog.toml`.
 
     Attributes:
-        store_id: Drawn at random when the store was made.
-        mongo: URI, without a password, of the MongoDB to use instead of the embedded one;
-            None for that.
+        store_id: Random id of the store.
+        mongo: URI, without a password, of the MongoDB to use; None for the embedded one.
         shared: Whether a group shares the store (`hybridlog_storage.sharing`).
         requires: Features that a reader must know to read the store.
-        optional: Features that a reader may pass over.
+        optional: Features that a reader may ignore.
     """
 
     store_id: str
@@ -60,14 +59,14 @@ class StoreSettings:
 
 
 def read_settings(path: Path) -> StoreSettings:
-    """The settings of a store.
+    """Read the settings of a store.
 
     Args:
         path: The store's directory.
 
     Raises:
-        StoreError: There is no store, it has another format, or needs what this version does
-            not know; or the settings are damaged, or hold a password.
+        StoreError: It is not a store, has another format, or requires an unknown feature;
+            or the settings are damaged, or hold a password.
     """
     file = path / NAME
     values = _read(path, file)
@@ -103,15 +102,15 @@ def read_settings(path: Path) -> StoreSettings:
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
-    """Write the settings of a store; a password in its URI is left out.
+    """Write the settings of a store, without a password in its URI.
 
     Args:
         path: The store's directory.
-        settings: What to write.
+        settings: The settings.
 
     Raises:
-        UsageError: The URI is no MongoDB connection string.
-        OSError: They cannot be written.
+            UsageError: The URI is not a MongoDB connection string.
+            OSError: They cannot be written.
     """
     lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
     if settings.mongo is not None:
@@ -126,14 +125,14 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
 
 
 def without_password(uri: str) -> str:
-    """A connection string as it may be kept in a file: the user's name stays, secrets go.
+    """A connection string with the user's name, but without secrets.
 
     Args:
         uri: MongoDB connection string.
 
     Raises:
-        UsageError: It is none, so that a part of a password may stand anywhere in it. The
-            message does not show it.
+        UsageError: It is invalid, so a password may be anywhere in it. The message does not
+            show it.
     """
     parts = _split(uri)
     user, colon, _ = parts.user.partition(":")
@@ -146,10 +145,10 @@ def without_password(uri: str) -> str:
 
 
 def with_password(uri: str) -> str:
-    """A connection string with the password out of the environment.
+    """A connection string with the password from the environment.
 
-    HYBRIDLOG_MONGO_PASSWORD has it, or a file that HYBRIDLOG_MONGO_PASSWORD_FILE names. A URI
-    without a user, or with a password of its own, stays as it is.
+    HYBRIDLOG_MONGO_PASSWORD holds it, or the file named by HYBRIDLOG_MONGO_PASSWORD_FILE. A
+    URI without a user, or with a password of its own, is unchanged.
 
     Args:
         uri: MongoDB connection string.
@@ -160,7 +159,7 @@ def with_password(uri: str) -> str:
     try:
         parts = _split(uri)
     except UsageError:
-        return uri  # whoever connects says what is wrong with it
+        return uri  # connecting reports the error
     if not parts.user or ":" in parts.user:
         return uri
     password = _password()
@@ -172,14 +171,14 @@ def with_password(uri: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Uri:
-    """The parts of a connection string; those that are not there are empty.
+    """The parts of a connection string; missing ones are empty.
 
     Attributes:
         scheme: `mongodb` or `mongodb+srv`.
         user: Name, and password behind a colon.
-        hosts: One or several.
+        hosts: One or several hosts.
         path: `/` and the name of a database.
-        options: What follows the question mark.
+        options: The text behind the question mark.
     """
 
     scheme: str
@@ -218,7 +217,7 @@ def _join(parts: _Uri) -> str:
 
 
 def _is_secret(option: str) -> bool:
-    """Whether an option of a URI holds a password or a token."""
+    """True if an option of a URI holds a password or a token."""
     name, _, value = option.lower().partition("=")
     return "password" in name or "passphrase" in name or "token" in value
 
@@ -241,10 +240,10 @@ def _stored_uri(file: Path, mongo: object) -> str | None:
 
 
 def _password() -> str | None:
-    """The password out of the environment.
+    """The password from the environment.
 
     Raises:
-        UsageError: It is said to be in a file, and is not to be had from there.
+        UsageError: Its file cannot be used.
     """
     given = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
     if given:
@@ -253,7 +252,7 @@ def _password() -> str | None:
     if not named:
         return None
     try:
-        # The user's own choice: symlinks on the way are followed.
+        # The user chose this path: symlinks are followed.
         fd = os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             about = os.fstat(fd)
@@ -283,10 +282,10 @@ def _password() -> str | None:
 
 
 def _read(path: Path, file: Path) -> dict[str, object]:
-    """What stands in the file.
+    """The parsed file.
 
     Raises:
-        StoreError: It cannot be read, or is no TOML.
+        StoreError: It cannot be read, or is not TOML.
     """
     try:
         content = files.read_file(file, _LIMIT, depth=files.IN_STORE)
@@ -296,7 +295,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
     except FileNotFoundError:
         reason = "there is no such directory" if not path.exists() else f"it has no {NAME}"
         raise StoreError(
-            f"{path} is no hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
+            f"{path} is not a hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
             "makes one; --store or HYBRIDLOG_STORE says where to look."
         ) from None
     except NotADirectoryError:
@@ -313,7 +312,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
 
 
 def _names(file: Path, values: dict[str, object], key: str) -> tuple[str, ...]:
-    """A list of names of features."""
+    """A list of feature names."""
     found = values.get(key, [])
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
         raise StoreError(f"{file}: {key} must be a list of names in quotes.")

@@ -1,8 +1,8 @@
-"""Stores that a group shares: each of its users can record, ask and remove.
+"""Shared stores: every user of a group can record, ask and remove.
 
-The folders of such a store are setgid and group-writable. That is the mark that
-`hybridlog_storage.files` goes by: what is made in them later belongs to the same group, and
-is group-writable, too. The embedded MongoDB's folders stay each user's own.
+The folders of a shared store are setgid and group-writable. `hybridlog_storage.files`
+recognizes them by that: new files in them belong to the same group and are group-writable,
+too. The folders of the embedded MongoDB belong to one user each.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import Final
 from hybridlog_storage import durability, files
 
 _OWN: Final = "mongod"
-"""Names of folders that belong to one user begin like this."""
+"""Prefix of folders that belong to one user."""
 _FOLDER: Final = stat.S_ISGID | stat.S_IRWXG
 _FILE: Final = stat.S_IRGRP | stat.S_IWGRP
 
 
 def make_shared(path: Path) -> None:
-    """Let the group of a store's directory write it, in all that is there now.
+    """Make all files and folders of a store writable by the group of its directory.
 
-    What belongs to other users stays as it is: only they could change it.
+    Files of other users are unchanged: only they could change them.
 
     Args:
-        path: The store's directory; `shared = true` in its settings is not this one's part.
+        path: The store's directory; the caller writes `shared = true` into its settings.
 
     Raises:
         StoreError: The system refuses.
@@ -43,7 +43,7 @@ def make_shared(path: Path) -> None:
 
 
 def _share(parent: int, name: str, group: int) -> None:
-    """Open what lies in a folder to the group, and what lies in that."""
+    """Open a folder and its content to the group, recursively."""
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
     about = os.stat(name, dir_fd=parent, follow_symlinks=False)
     if not stat.S_ISDIR(about.st_mode) and not stat.S_ISREG(about.st_mode):

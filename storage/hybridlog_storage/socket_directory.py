@@ -1,4 +1,4 @@
-"""Unix sockets of this user's processes: in private directories with short paths."""
+"""Private directories with short paths for unix sockets of this user's processes."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from pathlib import Path
 from hybridlog_storage.errors import StoreError
 
 MAX_SOCKET_PATH = 100
-"""Bytes; the kernel takes 107, other systems 103."""
+"""Bytes; Linux allows 107, other systems 103."""
 
 
 def socket_base() -> Path:
     """The directory of this user's sockets.
 
-    Not the store's directory, whose path may be too long for a socket, and not
-    XDG_RUNTIME_DIR, which is removed when its user logs out, while a recording may go on.
-    HYBRIDLOG_RUNTIME_DIR overrides `/tmp`.
+    It is in `/tmp`, or in HYBRIDLOG_RUNTIME_DIR. The path of the store's directory may be too
+    long for a socket, and XDG_RUNTIME_DIR is removed at logout, while a recording may go on.
     """
     base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
     return base / f"hybridlog-{os.geteuid()}"
 
 
 def new_socket(directory: Path, name: str) -> Path:
-    """Where a new socket that belongs to a directory may be made: in one of its own.
+    """Path of a new socket for a store's directory, in a new private directory.
 
-    New each time, so that the end of a process can never remove the socket of the next.
+    The directory is new each time, so that the end of one process cannot remove the socket
+    of the next.
 
     Args:
-        directory: A part of the path says whose it is, to whoever looks around in /tmp.
-        name: Of the socket.
+        directory: The directory that the socket belongs to; its name is part of the path.
+        name: Name of the socket.
 
     Raises:
         StoreError: The path is too long, or the directory is not private to this user.
@@ -41,7 +41,7 @@ def new_socket(directory: Path, name: str) -> Path:
 
 
 def is_socket_of(path: str, directory: Path) -> bool:
-    """Whether a path is one that `new_socket` may have given for a directory."""
+    """True if `new_socket` may have returned a path for a directory."""
     place = Path(path)
     own = place.parent
     return own.parent == socket_base() and own.name.startswith(f"{_part(directory)}-")
@@ -52,7 +52,7 @@ def _part(directory: Path) -> str:
 
 
 def _private(directory: Path, name: str) -> Path:
-    """Make a directory that nobody else can open, and the one above it."""
+    """Create a directory that only this user can open, and its parent."""
     own = directory.parent
     if len(os.fsencode(directory / name)) > MAX_SOCKET_PATH:
         raise StoreError(
@@ -71,14 +71,14 @@ def _private(directory: Path, name: str) -> Path:
             ) from error
         if not is_private(path):
             raise StoreError(
-                f"{path} has to be a directory of this user that nobody else can open, and is "
+                f"{path} must be a directory that only this user can open, and is "
                 f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
             )
     return directory / name
 
 
 def is_private(directory: Path) -> bool:
-    """Whether this is a real directory, ours, and closed to everybody else."""
+    """True if a path is a real directory that only this user can open."""
     try:
         about = directory.lstat()
     except OSError:
@@ -91,7 +91,7 @@ def is_private(directory: Path) -> bool:
 
 
 def is_our_socket(path: str) -> bool:
-    """Whether a path leads to a socket of ours in a private directory."""
+    """True if a path is a socket of this user in a private directory."""
     place = Path(path)
     if not place.is_absolute() or ".." in place.parts or not is_private(place.parent):
         return False

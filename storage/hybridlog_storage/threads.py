@@ -1,8 +1,8 @@
-"""Threads that can be waited for once more, after the waiting was interrupted.
+"""A thread pool that can be joined again after an interrupted wait.
 
-When a signal handler raises an exception in `Thread.join`, Python (before 3.13) takes the
-thread for ended, and joining it again returns at once. Whoever then tidies up would do so
-while the thread still writes.
+If a signal handler raises an exception in `Thread.join`, Python before 3.13 marks the
+thread as ended, and the next join returns at once. Cleanup would then run while the thread
+still writes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _T = TypeVar("_T")
 
 
 class Threads(ThreadPoolExecutor):
-    """A pool of threads; `shutdown` waits for what runs, however often it was interrupted."""
+    """A pool of threads; `shutdown` waits for running tasks, however often it is interrupted."""
 
     def __init__(self, count: int, name: str) -> None:
         super().__init__(count, thread_name_prefix=name)
@@ -24,7 +24,7 @@ class Threads(ThreadPoolExecutor):
         self._idle = threading.Condition()
 
     def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
-        """Have something done."""
+        """Run a function on a thread of the pool."""
         with self._idle:
             self._left += 1
         try:
@@ -36,7 +36,7 @@ class Threads(ThreadPoolExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002 - as it is there
-        """Take nothing more; return once all is done or, with `cancel_futures`, what runs."""
+        """Stop accepting tasks and wait for all, or with `cancel_futures` for the running ones."""
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         if wait:
             with self._idle:

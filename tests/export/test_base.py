@@ -131,7 +131,7 @@ def test_wrong_places(name: str, tmp_path: Path) -> None:
 
 def test_no_such_format() -> None:
     for open_writer in (open_batch_writer, open_table_writer, open_row_writer):
-        with pytest.raises(UsageError, match="no format"):
+        with pytest.raises(UsageError, match="not a format"):
             open_writer("docx", io.BytesIO())
     with pytest.raises(UsageError, match="mcap"):
         open_batch_writer("csv", io.BytesIO())

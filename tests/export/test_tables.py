@@ -425,7 +425,7 @@ def test_npz_of_slices_and_other_types() -> None:
     assert load(written(NpzWriter, words))["c"].tolist() == ["a", "b", "a"]
     with pytest.raises(UsageError, match="does not fit"):
         written(NpzWriter, pa.table({"a": [1]}), pa.table({"a": ["x"]}))
-    with pytest.raises(UsageError, match="numpy has not"):
+    with pytest.raises(UsageError, match="numpy does not have"):
         written(
             NpzWriter, pa.table({"a": pa.array([[("k", 1)]], pa.map_(pa.string(), pa.int64()))})
         )

@@ -435,10 +435,10 @@ def test_idl_that_is_refused(body, reason):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("uint8\n", "line 1 is no field"),
-        ("\nuint8 a\n??\n", "line 3 is no field"),
-        ("uint8 a.b\n", "line 1 is no field"),
-        ("uint8 a; import os\n", "line 1 is no field"),
+        ("uint8\n", "line 1 is not a field"),
+        ("\nuint8 a\n??\n", "line 3 is not a field"),
+        ("uint8 a.b\n", "line 1 is not a field"),
+        ("uint8 a; import os\n", "line 1 is not a field"),
         ("uint8 a\nuint8 a\n", "two fields named a"),
         ("uint8 9a\n", "cannot be named '9a'"),
         ("uint8 _a\n", "cannot be named '_a'"),
@@ -466,14 +466,14 @@ def test_definitions_that_are_refused(text, reason):
 
 
 def test_defaults_are_no_ros1():
-    with pytest.raises(DefinitionError, match="line 1 is no field"):
+    with pytest.raises(DefinitionError, match="line 1 is not a field"):
         parse("uint8 a 7\n", "ros1msg")
 
 
 def test_no_definition_and_foreign_encodings():
     with pytest.raises(DefinitionError, match="no definition in the source"):
         parse("", "")
-    with pytest.raises(DefinitionError, match="no ROS definition"):
+    with pytest.raises(DefinitionError, match="not a ROS definition"):
         parse("{}", "jsonschema")
     with pytest.raises(DefinitionError, match="more than"):
         parse("#" * (MAX_DEFINITION + 1))

@@ -724,7 +724,7 @@ def test_what_lies_in_the_place_of_a_segment(tmp_path: Path) -> None:
     for number, make in enumerate((os.mkfifo, os.mkdir)):
         path = tmp_path / f"{number:06d}.mcap"
         make(path)
-        with pytest.raises(SegmentError, match="no ordinary file"):
+        with pytest.raises(SegmentError, match="not an ordinary file"):
             SegmentReader(path, number)
 
 

@@ -108,7 +108,7 @@ def test_a_symlink_or_a_pipe_is_not_read(tmp_path: Path) -> None:
     assert read_settings(store) == StoreSettings("y")
     (store / "hybridlog.toml").unlink()
     os.mkfifo(store / "hybridlog.toml")
-    with pytest.raises(StoreError, match="no ordinary file"):
+    with pytest.raises(StoreError, match="not an ordinary file"):
         read_settings(store)
 
 
