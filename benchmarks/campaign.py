@@ -131,7 +131,7 @@ def run(choices: Choices, command: Sequence[str]) -> int:
         UsageError: An option is wrong, or the journal belongs to other settings.
         Stopped: The command was told to stop; what is done is kept.
     """
-    from hybridlog.cli.stopping import Stopped
+    from hybridlog.cli.signals import Stopped
 
     backends = _chosen_backends(choices.backends)
     planned = [_plan(name, choices) for name in choices.parts]

@@ -456,12 +456,12 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
     Returns:
         The exit code.
     """
-    from hybridlog.cli import stopping
+    from hybridlog.cli import signals
     from hybridlog.cli.exit_codes import of_os_error
     from hybridlog.cli.output import printable
     from hybridlog_storage.errors import HybridlogError
 
-    stopping.install()
+    signals.install()
     _calls.append([*program.split(), *arguments])
     try:
         app(args=list(arguments), prog_name=program)
@@ -470,7 +470,7 @@ def main(arguments: Sequence[str], program: str = "python -m benchmarks") -> int
     except HybridlogError as error:
         print(f"benchmarks: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
-    except stopping.Stopped as stopped:
+    except signals.Stopped as stopped:
         print(f"\nbenchmarks: interrupted. {stopped.consequence}".rstrip(), file=sys.stderr)
         return stopped.exit_code
     except BrokenPipeError:

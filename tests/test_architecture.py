@@ -35,6 +35,7 @@ ALLOWED = {
         "hybridlog_storage.bson_columns",
         "hybridlog_storage.database",
     ),
+    "click": ("hybridlog.cli",),
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog_storage.checksum",),
     "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
@@ -59,7 +60,6 @@ ALLOWED = {
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
     "ruamel": ("hybridlog.live_sources.ros2_overrides", "hybridlog.sources.rosbag2_metadata"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
-    "typer": ("hybridlog.cli",),
     "websockets": (
         "hybridlog.live_sources.foxglove_handshake",
         "hybridlog.live_sources.foxglove_socket",

@@ -1,12 +1,13 @@
-"""`hybridlog bench`: finds the benchmarks, which live in the source tree, and hands over."""
+"""`hybridlog bench`: finds the benchmarks in the source tree and becomes their process."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
+
+import click
 
 from hybridlog_storage.errors import MissingDependencyError
 
@@ -16,20 +17,28 @@ _START = (
     f"sys.exit(main(sys.argv[1:], program={PROGRAM!r}))"
 )
 _MARKS = ("__main__.py", "samples.py")
-"""Files that tell our benchmarks from somebody else's directory of that name."""
+"""Files that tell these benchmarks from another directory of that name."""
 
 
-def run(arguments: Sequence[str]) -> NoReturn:
-    """Become the process of the benchmarks.
+@click.command(
+    # Everything after the name belongs to the benchmarks, their own --help included.
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
+@click.argument(
+    "arguments",
+    nargs=-1,
+    type=click.UNPROCESSED,
+    metavar="[ARGUMENT]...",
+    help="Of the benchmarks: all --quick, report, --list-backends, throughput --help.",
+)
+def command(*, arguments: tuple[str, ...]) -> NoReturn:
+    """Compare hybridlog with databases and files.
 
-    Args:
-        arguments: Of `python -m benchmarks`.
-
-    Raises:
-        MissingDependencyError: There is no source tree.
+    Needs the source tree. The arguments are those of `python -m benchmarks`; without any, it
+    lists the benchmarks.
     """
     root = find(Path(__file__).parents[2], Path.cwd())
-    # The benchmarks bring the code they lie beside, whatever else is installed.
+    # The benchmarks run the code of their own tree, whatever else is installed.
     roots = [str(root), str(root / "storage")]
     before = os.environ.get("PYTHONPATH")
     environment = {
@@ -38,7 +47,7 @@ def run(arguments: Sequence[str]) -> NoReturn:
     }
     sys.stdout.flush()
     sys.stderr.flush()
-    # -P: what lies in the current directory must not stand in for a module.
+    # -P: files in the current directory must not replace modules.
     os.execve(sys.executable, [sys.executable, "-P", "-c", _START, *arguments], environment)  # noqa: S606
 
 
@@ -46,7 +55,7 @@ def find(*roots: Path) -> Path:
     """The first of some directories that is a source tree with the benchmarks.
 
     Raises:
-        MissingDependencyError: None is.
+        MissingDependencyError: No directory is one.
     """
     for root in roots:
         if all((root / "benchmarks" / name).is_file() for name in _MARKS):

@@ -26,7 +26,7 @@ from benchmarks.campaign import PARTS
 from benchmarks.progress import Steps, short
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies.runs import Context
-from hybridlog.cli.stopping import Stopped
+from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import SourceError
 from tests.imports import ROOT
 
@@ -130,7 +130,7 @@ class Study:
 def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     found = Study()
     monkeypatch.setattr(campaign, "import_module", lambda name: found)
-    monkeypatch.setattr("hybridlog.cli.stopping.install", lambda: None)
+    monkeypatch.setattr("hybridlog.cli.signals.install", lambda: None)
     return found
 
 

@@ -16,7 +16,7 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 
-from hybridlog.cli.fetch import closing_line
+from hybridlog.cli.answer_notes import print_cost
 from hybridlog.query.plan import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
@@ -398,7 +398,7 @@ def test_json_is_asked_as_it_stands(store: Path) -> None:
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    closing_line(Counters(messages=251, reduced=12), 0.1, count=False)
+    print_cost(Counters(messages=251, reduced=12), 0.1, count=False)
     assert capsys.readouterr().err.startswith("239 messages, ")
 
 

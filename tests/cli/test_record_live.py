@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from hybridlog.cli.app import app
 from hybridlog.cli.live_table import closing_rows, summary
