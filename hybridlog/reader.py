@@ -12,7 +12,6 @@ answer has cost stands in `counters` afterwards.
 
 from __future__ import annotations
 
-import difflib
 import heapq
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,8 +24,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hybridlog.counting import count_in_columns, in_all_times
-from hybridlog.indexing import STAMP
 from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_counts import count_in_chunks
 from hybridlog.query.chunk_lists import earlier_and_earlier
@@ -53,6 +50,7 @@ from hybridlog.query.times import (
     parse_range,
     parse_time,
 )
+from hybridlog.schema.column import STAMP
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import (
     IndexChangedError,
@@ -935,6 +933,8 @@ class Query:
         has_index = not is_plain and self.store.database is not None
         total, left = 0, list(self.topics)
         if has_index and not is_plain:
+            from hybridlog.counting import count_in_columns
+
             total, left = count_in_columns(self, self.topics)
             if not left:
                 return total
@@ -955,6 +955,8 @@ class Query:
         wanted = [(topic, t) for topic in left for t in targets if topic in _topics_of(t)]
         if not self.is_unbounded:
             return total + self._count_documents(wanted)
+        from hybridlog.counting import in_all_times
+
         of_topic: dict[str, list[RecordingEntry]] = {}
         for topic, target in wanted:
             of_topic.setdefault(topic, []).append(target.recording)
@@ -979,6 +981,8 @@ class Query:
         others = sorted(topics - counted)
         if not others:
             return total
+        from hybridlog.counting import count_in_columns
+
         found, left = count_in_columns(self._with(recording_ids=(target.recording.id,)), others)
         total += found
         if not left:
@@ -1108,6 +1112,8 @@ def summary_type(path: str, known: Mapping[str, str]) -> str | None:
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
+    import difflib
+
     near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
     return (
         f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "

@@ -6,16 +6,13 @@ import os
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from hybridlog import consent, field_indexes
-from hybridlog.columns.kept import KeptColumns
-from hybridlog.columns.stored import FieldColumns
+from hybridlog import field_indexes
 from hybridlog.entries import channels_of, take_inventory, text
 from hybridlog.field_indexes import FieldIndex
-from hybridlog.guarded import Belief, GuardedIndex
 from hybridlog.losses import topics_of
 from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
 from hybridlog.maintenance.report import Progress, RepairReport, being_written
@@ -44,6 +41,9 @@ from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.settings import EMBEDDED, NAME, with_password
 
 if TYPE_CHECKING:
+    from hybridlog.columns.kept import KeptColumns
+    from hybridlog.columns.stored import FieldColumns
+    from hybridlog.guarded import Belief, GuardedIndex
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
@@ -99,6 +99,8 @@ def open_store(
         directory.check_writable()
         if is_new and own is not None:
             with suppress(StoreError):  # without a home, each command names it again
+                from hybridlog import consent
+
                 consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
@@ -156,7 +158,6 @@ class Store:
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._columns: dict[str, FieldColumns | None] = {}
         self._chunk_lists = ChunkLists()
-        self.kept = KeptColumns(self)
         self.recent_chunks = RecentChunks()
         self._lock = threading.Lock()
         self.catalog = open_catalog(directory)
@@ -241,6 +242,8 @@ class Store:
         from hybridlog_storage.database import Database
 
         if self._uri is None:
+            from hybridlog import consent
+
             self._uri = self._wanted or consent.trusted_uri(
                 self.directory.settings, self.directory.path
             )
@@ -308,6 +311,8 @@ class Store:
             DatabaseError: it is unavailable; says what it was needed for, and why it is.
             IndexChangedError: another process removes documents of these recordings.
         """
+        from hybridlog.guarded import GuardedIndex
+
         return GuardedIndex(self, self.database_for(purpose), recordings)
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
@@ -318,6 +323,8 @@ class Store:
             keys: Of the recordings.
             anew: Ask it now.
         """
+        from hybridlog.guarded import Belief
+
         found = self._belief = Belief.of(database, keys, None if anew else self._belief)
         return found
 
@@ -358,7 +365,8 @@ class Store:
             self._columns.clear()  # closed by the last thread that reads from them
             self._segments.clear()
         self._chunk_lists.clear()
-        self.kept.clear()
+        if "kept" in self.__dict__:
+            self.kept.clear()
         self.recent_chunks.clear()
         self._learn()
 
@@ -543,6 +551,8 @@ class Store:
 
     def columns(self, recording: str) -> FieldColumns | None:
         """The columns that lie beside the segments of a recording; None without good ones."""
+        from hybridlog.columns.stored import FieldColumns
+
         with self._lock:
             if recording not in self._columns:
                 _make_room(self._columns)
@@ -552,6 +562,13 @@ class Store:
                     found = FieldColumns(path)
                     self._columns[recording] = found
             return self._columns[recording]
+
+    @cached_property
+    def kept(self) -> KeptColumns:
+        """Fields of messages in memory."""
+        from hybridlog.columns.kept import KeptColumns
+
+        return KeptColumns(self)
 
     # Changing.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import Final
 
@@ -96,8 +97,12 @@ def _install_script(context: click.Context, _: click.Parameter, wanted: bool) ->
     callback=_print_script,
     help="Print the completion script of your shell.",
 )
-def app() -> None:
+@click.pass_context
+def app(context: click.Context) -> None:
     """Record what a robot says, and ask it.
 
     Payloads go into MCAP files, fields into MongoDB, one reader joins the two.
     """
+    if context.invoked_subcommand != "bench":
+        # No command multiplies matrices, and starting a thread a processor for that takes time.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

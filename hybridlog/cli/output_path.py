@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -47,6 +45,9 @@ def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
     if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
         yield
         return
+    import secrets
+    import shutil
+
     aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
     try:
         path.rename(aside)

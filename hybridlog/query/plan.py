@@ -18,10 +18,8 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from hybridlog.indexing import STAMP
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.codec import codec_for
-from hybridlog.schema.column import header_stamps
+from hybridlog.schema.column import STAMP, header_stamps
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
@@ -103,6 +101,8 @@ class Lane:
     @cached_property
     def codec(self) -> Codec:
         """Reads its payloads; of a hundred definitions a question needs one or two."""
+        from hybridlog.schema.codec import codec_for
+
         return codec_for(self.channel)
 
     @property

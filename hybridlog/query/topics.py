@@ -17,7 +17,6 @@ A name that exists is always that topic, whatever characters it has.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 
@@ -248,6 +247,8 @@ def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
 
 
 def _unknown(pattern: str, known: list[str]) -> str:
+    import difflib
+
     # Compared by last part and in lower case too: `/scna` is near `/base/scan`.
     nearest: dict[str, None] = {}
     wanted = pattern.casefold().strip("/")
