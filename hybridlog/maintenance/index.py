@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.columns.topic import is_small
 from hybridlog.entries import take_inventory
-from hybridlog.index_writer import IndexWriter
-from hybridlog.indexing import ChunkIndexer
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import describe_inventory, put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
@@ -308,6 +305,10 @@ def _index(
     progress: Progress | None,
 ) -> None:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
+    from hybridlog.columns.gatherer import FieldGatherer
+    from hybridlog.index_writer import IndexWriter
+    from hybridlog.indexing import ChunkIndexer
+
     gatherer = FieldGatherer(directory.recording(entry.label))
     index = IndexWriter(ChunkIndexer(entry.id), database)
     # What is indexed already is missing in the columns all the same.

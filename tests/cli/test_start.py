@@ -1,8 +1,7 @@
-"""Help, exit codes, speed of the start, and what is not imported for it."""
+"""Help, completion, exit codes, and the modules that commands import."""
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -18,12 +17,6 @@ from .running import COMMAND, complete, environment, run
 
 HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
 
-
-def imported(*arguments: object) -> set[str]:
-    """Top packages that a command imports."""
-    return {name.split(".")[0] for name in modules_of(*arguments)}
-
-
 LISTED = """
 import atexit, os, sys
 os._exit = sys.exit  # a command leaves without the interpreter's own end
@@ -37,7 +30,8 @@ def modules_of(*arguments: object) -> set[str]:
     """Modules that a command imports."""
     ended = subprocess.run(
         [sys.executable, "-c", LISTED, *map(str, arguments)],
-        capture_output=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
         env=environment(),
         check=True,
@@ -45,24 +39,22 @@ def modules_of(*arguments: object) -> set[str]:
     return set(ended.stderr.splitlines())
 
 
-def test_help_imports_nothing_heavy_and_is_fast() -> None:
-    assert not imported("--help") & HEAVY
-    assert not imported("fetch", "--help") & HEAVY
-    times = []
-    for _ in range(5):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        run("--help")
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # Work, not time gone by: others may be busy.
-        times.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-        if times[-1] < 0.2:
-            return
-    assert min(times) < 0.6, times
+def packages_of(*arguments: object) -> set[str]:
+    """Top packages that a command imports."""
+    return {name.split(".")[0] for name in modules_of(*arguments)}
+
+
+def test_help_imports_little() -> None:
+    """Each module costs about a millisecond: the number of modules is the time of the start."""
+    for arguments, most in ((("--help",), 190), (("fetch", "--help"), 160)):
+        loaded = modules_of(*arguments)
+        assert not {name.split(".")[0] for name in loaded} & HEAVY
+        assert len(loaded) < most, sorted(loaded)
 
 
 def test_looking_imports_no_table_libraries(store: Path) -> None:
     for command in ("ls", "info"):
-        assert not imported(command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
+        assert not packages_of(command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
 
 
 def test_help_names_commands_and_exit_codes() -> None:
@@ -208,3 +200,32 @@ def test_a_reader_that_ends_early_is_no_error(store: Path) -> None:
         assert process.wait(60) == 0, text
         assert "Traceback" not in text
         assert "BrokenPipe" not in text
+
+
+UNNEEDED = {
+    *("PIL", "asyncio", "bson", "pandas", "pyarrow", "pydantic", "pymongo", "rich", "rosbags"),
+    *("subprocess", "typer", "websockets"),
+}
+
+
+@pytest.mark.parametrize("wanted", [("--count",), ("-F", "raw"), ("-F", "mcap")])
+def test_a_fetch_by_topic_and_time_imports_what_it_needs(
+    wanted: tuple[str, ...], store: Path
+) -> None:
+    question = ("fetch", "--store", store, "-t", "scan", "--between", "+1s", "+2s")
+    loaded = modules_of(*question, *wanted)
+    assert not {name.split(".")[0] for name in loaded} & UNNEEDED
+    ours = {name for name in loaded if name.split(".")[0] in {"hybridlog", "hybridlog_storage"}}
+    unneeded = ("hybridlog.columns", "hybridlog.frames", "hybridlog.indexing", "hybridlog.record")
+    assert not {name for name in ours if name.startswith(unneeded)}
+    assert "numpy.ma" not in loaded
+    # Each module costs about a millisecond.
+    assert len(ours) < 80, sorted(ours)
+
+
+def test_a_count_by_content_imports_no_tables(store: Path) -> None:
+    question = ("fetch", "--store", store, "-t", "scan", "--where", "ranges.min < 1", "--count")
+    loaded = modules_of(*question)
+    assert "pymongo" in loaded
+    assert not {name.split(".")[0] for name in loaded} & {"pandas", "pyarrow", "pydantic", "rich"}
+    assert not loaded & {"numpy.ma", "hybridlog.recorder", "hybridlog.index_writer"}
