@@ -40,7 +40,7 @@ def command(
 ) -> None:
     """Make, list or drop an index that speeds up queries of a field."""
     if remove and not field:
-        raise UsageError("--remove needs an index: name the topic and the fields.")
+        raise UsageError("--remove needs an index. Name the topic and the fields after it.")
     with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
         if topic is None:
             found = opened.indexes()

@@ -229,3 +229,32 @@ def test_a_count_by_content_imports_no_tables(store: Path) -> None:
     assert "pymongo" in loaded
     assert not {name.split(".")[0] for name in loaded} & {"pandas", "pyarrow", "pydantic", "rich"}
     assert not loaded & {"numpy.ma", "hybridlog.recorder", "hybridlog.index_writer"}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("ls",),
+        ("info",),
+        ("info", "odd"),
+        ("losses",),
+        ("losses", "torn"),
+        ("tag", "robot"),
+        ("schema", "scan"),
+        ("intervals", "-t", "scan", "-r", "robot", "--where", "ranges.min < 1"),
+        ("changes", "-t", "scan", "-r", "robot", "--fields", "ranges.min"),
+        ("index",),
+        ("verify", "robot"),
+        ("repair", "robot"),
+        ("reindex", "-r", "odd"),
+    ],
+    ids=" ".join,
+)
+def test_json_is_all_that_is_on_standard_output(arguments: tuple[str, ...], store: Path) -> None:
+    done = run(*arguments, "--json", store=store)
+    assert isinstance(done.json, dict | list)
+
+
+def test_a_terminal_encoding_without_a_character_is_no_error(store: Path) -> None:
+    done = run("info", "odd", store=store, LC_ALL="C", PYTHONIOENCODING="ascii")
+    assert done.out.isascii()
