@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog.schema.codec import Codec, codec_for
-from hybridlog.schema.column import header_stamps
+from hybridlog.schema.column import STAMP, header_stamps
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.collection_names import collection_of
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ARRAY_LIMIT = 32
-STAMP = "header.stamp"
 
 
 class Documents(NamedTuple):

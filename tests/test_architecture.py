@@ -35,6 +35,7 @@ ALLOWED = {
         "hybridlog_storage.bson_columns",
         "hybridlog_storage.database",
     ),
+    "click": ("hybridlog.cli",),
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog_storage.checksum",),
     "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
@@ -69,7 +70,6 @@ ALLOWED = {
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
     "ruamel": ("hybridlog.live.sources.ros2.overrides", "hybridlog.sources.rosbag2_metadata"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
-    "typer": ("hybridlog.cli",),
     "websockets": (
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",

@@ -1,11 +1,11 @@
-"""How complete an answer is: what the recordings it came from have lost."""
+"""Completeness of an answer: the losses of the recordings that it comes from."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.cli.output import counted, note, unfit
+from hybridlog.cli.output import counted
 from hybridlog.losses import Cause
 from hybridlog_storage.errors import TimeError
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
-    """The loss ledger of a recording; what a crash cut off stands in it, too."""
+    """The loss ledger of a recording, with a row for what a crash cut off."""
     losses = [dict(loss) for loss in entry.end.get("losses", [])]
     if entry.status == "unfinished":
         losses.append(
@@ -53,12 +53,12 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
 
 
 def was_cut_short(entry: RecordingEntry) -> bool:
-    """Whether a crash ended a recording, whatever else is the matter with it."""
+    """True for a recording that a crash ended, whatever its status is."""
     return "recovered" in {entry.status, entry.end.get("status")}
 
 
 def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
-    """How much of a recording is there: `complete`, or how much is missing."""
+    """The completeness of a recording in words: `complete`, or the number of missing messages."""
     wished = sum(loss["count"] or 0 for loss in losses if loss["cause"] == Cause.THROTTLE)
     losses = [loss for loss in losses if loss["cause"] != Cause.THROTTLE]
     thinned = f"; {counted(wished, 'message')} thinned out by wish" if wished else ""
@@ -71,7 +71,7 @@ def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
             return "being recorded"
         if entry.status == "unproven":
             return "not known: its journal was lost, so a segment may be missing"
-        # A log of no messages is complete without any; of a robot nobody can say that.
+        # An empty log is complete; a robot that sent nothing may not have been reached.
         is_live = not entry.source["bytes"]
         return "nothing was received" if is_live and not entry.messages else "complete"
     lost = sum(loss["count"] or 0 for loss in losses)
@@ -87,7 +87,7 @@ def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
 
 
 def line_of(loss: dict[str, Any]) -> str:
-    """One loss in words."""
+    """A row of the ledger in words."""
     count = "messages" if loss["count"] is None else counted(loss["count"], "message")
     place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
     file = f" {loss['file']}{place}:" if loss.get("file") else ""
@@ -103,16 +103,16 @@ def gaps(
     topics: Collection[str],
     between: tuple[str, str] | None,
 ) -> Iterator[str]:
-    """What an answer may lack, a line a recording.
+    """Lines about what an answer may lack, one a recording.
 
     Args:
-        recordings: Where the answer comes from.
-        topics: What it is about.
+        recordings: The recordings of the answer.
+        topics: Its topics.
         between: The time range as typed, by the log clock; None for all times.
     """
     for entry in recordings:
         if entry.status == "open":
-            yield f"{entry.label} is still being recorded; what comes later is not in this answer."
+            yield f"{entry.label} is still being recorded; later messages are not in this answer."
         if entry.status == "unproven":
             yield f"{entry.label} has lost its journal, so this answer may not be complete."
         if between is not None and not _touches(entry, between):
@@ -134,7 +134,7 @@ def gaps(
 
 
 def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
-    """Whether a time range may meet what a recording lost: it can lie behind its end, too."""
+    """True when a time range may contain losses; they may lie after the last message."""
     from hybridlog.query.intervals import span_of
     from hybridlog.query.times import parse_range
 
@@ -147,23 +147,3 @@ def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
         return False
     is_cut = entry.status == "unfinished" or was_cut_short(entry)
     return high > start and (low < end or is_cut)
-
-
-def tell_unreadable(missing: int) -> None:
-    """Say how many messages are in no table because they have no fields to read."""
-    if missing > 0:
-        are = "is" if missing == 1 else "are"
-        note(
-            f"{unfit(missing)} and {are} not in this answer; --format raw, mcap or bag has what "
-            "came."
-        )
-
-
-def tell_reduced(reduced: int) -> None:
-    """Say how many messages lack their payload because the recorder had to give it up."""
-    if reduced:
-        have = "has" if reduced == 1 else "have"
-        note(
-            f"{counted(reduced, 'message')} {have} no payload any more, given up under "
-            "pressure: not in this answer; --where and --fields find what was kept of them."
-        )

@@ -3,113 +3,124 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog.cli import output
-from hybridlog.cli.asking import question
-from hybridlog.cli.coverage import gaps
-from hybridlog.cli.fetch import write
-from hybridlog.cli.opening import opened
-from hybridlog.cli.placing import check_room, replacing
-from hybridlog.cli.stopping import Stopped
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.answer_notes import print_gaps
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output_path import check_room, replacing
+from hybridlog.cli.query_options import query_of
+from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
 
-_WHOLE = {"mcap", "bag"}
+_EXACT = {"mcap", "bag"}
 
 
-@dataclass(frozen=True, slots=True)
-class Choices:
-    """The options of the command, as typed."""
-
-    store: Path | None
-    recordings: list[str] | None
-    topics: list[str] | None
-    between: tuple[str, str] | None
-    force: bool
-    mongo: str | None
-    quiet: bool
-
-
-def run(target: Path, form: str | None, choices: Choices) -> None:
-    """Write everything that is chosen."""
+@click.command()
+@click.argument(
+    "target",
+    type=options.PATH,
+    metavar="OUTPUT",
+    help="File (mcap, bag) or directory (parquet, csv).",
+)
+@click.option(
+    "--format",
+    "-F",
+    "form",
+    type=click.Choice(["parquet", "csv", "mcap", "bag"]),
+    help="Format; without, by the suffix (.mcap, .bag).",
+)
+@options.store
+@options.recordings
+@options.only_topics
+@options.between
+@options.force
+@options.mongo
+@options.quiet
+def command(
+    *,
+    target: Path,
+    form: str | None,
+    store: Path | None,
+    recording: tuple[str, ...],
+    topic: tuple[str, ...],
+    between: tuple[str, str] | None,
+    force: bool,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Export whole recordings; tables get one file a topic."""
     form = form or _form(target)
-    force, quiet = choices.force, choices.quiet
-    if form in _WHOLE:
+    if form in _EXACT:
         check_room(target, form=form, force=force)
-    with opened(choices.store, choices.mongo, quiet=quiet) as view:
-        query = question(view, choices.topics, choices.recordings)
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        query = query_of(opened, topic, recording)
         if not query.topics:
-            raise UsageError("Nothing was recorded, so there is nothing to export.")
-        if choices.between is not None:
-            query = query.between(*choices.between)
-        if form in _WHOLE:
-            _whole(query, form, target, force=force, quiet=quiet)
-        else:
-            _tables(query, form, target, force=force, quiet=quiet)
+            raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
+        if between is not None:
+            query = query.between(*between)
+        write = _write_file if form in _EXACT else _write_directory
+        write(query, form, target, force=force, quiet=quiet)
         if not quiet:
-            chosen = [r for r in view.recordings() if r.id in query.recordings]
-            for line in gaps(chosen, query.topics, choices.between):
-                output.note(line)
+            print_gaps(opened, query, between)
 
 
 def _form(target: Path) -> str:
     form = target.suffix.lower().lstrip(".")
-    if form not in _WHOLE:
+    if form not in _EXACT:
         raise UsageError(
-            f"{target} does not say what to export: end it in .mcap or .bag, or name a directory "
+            f"{target} does not give the format: end it in .mcap or .bag, or name a directory "
             "for tables and add --format parquet or csv."
         )
     return form
 
 
-def _whole(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -> None:
-    try:
-        with replacing(target, form=form, force=force):
-            write(query, form, target, quiet=quiet)
-    except Stopped as stopped:
-        stopped.consequence = f"{target} is not written."
-        raise
-    _tell(target, query, 0, quiet=quiet)
+def _write_file(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -> None:
+    from hybridlog.cli.write_answer import write_answer
+
+    with if_stopped(f"{target} is not written."), replacing(target, form=form, force=force):
+        write_answer(query, form, target, quiet=quiet)
+    _print_written(target, query, 0, quiet=quiet)
 
 
-def _tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    """One file a topic; a topic that is no table, or lies beside the range, is left out."""
-    query.check_range()  # refuses a range that holds nothing of any topic
+def _write_directory(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
+    """Write one file a topic, except topics that fit no table or have no message in the range."""
+    query.check_range()  # refuses a range without any message
     new = not directory.exists()
     try:
         _make(directory)
         _write_tables(query, form, directory, force=force, quiet=quiet)
     finally:
         if new:
-            with contextlib.suppress(OSError):  # it holds what was written
+            with contextlib.suppress(OSError):  # files were written into it
                 directory.rmdir()
 
 
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
+    from hybridlog.cli.write_answer import write_answer
+
     paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
     for path in paths.values():
         check_room(path, form=form, force=force)
     left_out: list[HybridlogError] = []
-    try:
-        for topic, path in paths.items():
-            one = query.with_topic(topic)
-            try:
-                missing = write(one, form, path, quiet=quiet)
-            except (DefinitionError, TimeError) as error:
-                what = "" if isinstance(error, DefinitionError) else f"{topic}: "
-                output.note(f"{what}{error}")
-                left_out.append(error)
-                continue
-            _tell(path, one, missing, quiet=quiet)
-    except Stopped as stopped:
-        stopped.consequence = f"The files named above are whole, {path} is not written."
-        raise
+    for topic, path in paths.items():
+        one = query.with_topic(topic)
+        try:
+            with if_stopped(f"The files named above are whole, {path} is not written."):
+                missing = write_answer(one, form, path, quiet=quiet)
+        except (DefinitionError, TimeError) as error:
+            what = "" if isinstance(error, DefinitionError) else f"{topic}: "
+            output.note(f"{what}{error}")
+            left_out.append(error)
+            continue
+        _print_written(path, one, missing, quiet=quiet)
     if len(left_out) == len(paths):
         raise left_out[0]
 
@@ -119,15 +130,15 @@ def _make(directory: Path) -> None:
     if directory.is_dir():
         return
     if directory.exists():
-        raise UsageError(f"{directory} is a file; tables go into a directory, one a topic.")
+        raise UsageError(f"{directory} is a file; tables go into a directory: name another path.")
     try:
         directory.mkdir(parents=True)
     except OSError as error:
         raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
 
 
-def _tell(path: Path, query: Query, missing: int, *, quiet: bool) -> None:
-    """A line a file; what is not in it is said in any case."""
+def _print_written(path: Path, query: Query, missing: int, *, quiet: bool) -> None:
+    """Print a line about a file; --quiet leaves it out, unless messages are missing."""
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
         output.note(

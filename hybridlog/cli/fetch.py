@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hybridlog.cli import output
-from hybridlog.cli.asking import question
-from hybridlog.cli.coverage import gaps, tell_reduced, tell_unreadable
-from hybridlog.cli.opening import opened
-from hybridlog.cli.placing import check_room, replacing
-from hybridlog.cli.progress import progress_bar
-from hybridlog.cli.screen import print_answer
-from hybridlog.cli.stopping import Stopped
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.answer_notes import print_cost, print_gaps, print_reduced, print_unreadable
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output_path import check_room, replacing
+from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.export.base import Target
-    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
+_FORMATS = ("table", "jsonl", "csv", "parquet", "arrow", "npz", "mcap", "bag", "raw")
 _SUFFIXES = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
@@ -36,21 +35,20 @@ _SUFFIXES = {
     ".mcap": "mcap",
     ".bag": "bag",
 }
-Progress = Callable[[], None]
 _TEXT = {"jsonl", "csv"}
 
 
 @dataclass(frozen=True, slots=True)
-class Choices:
-    """The options of the command, as typed."""
+class _Choices:
+    """The parameters of the command."""
 
-    topic: list[str]
+    topic: tuple[str, ...]
     store: Path | None
     between: tuple[str, str] | None
     clock: str
     at: str | None
-    where: list[str] | None
-    recording: list[str] | None
+    where: tuple[str, ...]
+    recording: tuple[str, ...]
     limit: int | None
     every: int
     reverse: bool
@@ -66,117 +64,122 @@ class Choices:
     quiet: bool
 
 
-def run(choices: Choices) -> None:
-    """Answer, and say on standard error what the answer has cost and what it may lack."""
+@click.command()
+@click.option(
+    "--topic",
+    "-t",
+    required=True,
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+)
+@options.store
+@options.between
+@click.option(
+    "--clock",
+    type=click.Choice(["log", "publish", "header"]),
+    default="log",
+    help="The clock of --between.",
+)
+@click.option("--at", metavar="T", help="Only the message that was current at this time.")
+@options.where
+@options.recordings
+@click.option(
+    "--limit",
+    "-n",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="At most this number of messages.",
+)
+@click.option(
+    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Only every n-th message."
+)
+@click.option("--reverse", is_flag=True, help="Latest first.")
+@click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
+@click.option(
+    "--event",
+    nargs=2,
+    metavar="TOPIC PREDICATE",
+    help="Only messages near those of TOPIC that satisfy PREDICATE, such as: rosout "
+    "'level >= 8'. Needs --before or --after.",
+)
+@click.option("--before", metavar="DURATION", help="Start this long before each event: 5min.")
+@click.option("--after", metavar="DURATION", help="End this long after each event.")
+@options.count
+@click.option(
+    "--format",
+    "-F",
+    "form",
+    type=click.Choice(_FORMATS),
+    help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+)
+@click.option(
+    "--output",
+    "-o",
+    type=options.PATH,
+    metavar="FILE",
+    help="Write to this file (raw: a directory); - is standard output.",
+)
+@options.force
+@options.mongo
+@options.quiet
+def command(**parameters: Any) -> None:
+    """Fetch messages by topic, time and content.
+
+    Without --format and -o: a table on a terminal, JSON lines elsewhere. The cost of the
+    answer, and what it may lack, is printed on standard error.
+    """
+    choices = _Choices(**parameters)
     form = _form(choices)
     path = _path(choices, form)
     started = time.monotonic()
-    with opened(choices.store, choices.mongo, quiet=choices.quiet) as store:
+    with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
         query = _query(store, choices)
         if choices.count:
             output.say(str(query.count()))
-        elif form == "table":
-            query = print_answer(query)
-        elif path is None:
-            tell_unreadable(write(query, form, sys.stdout.buffer, quiet=True))
-            tell_reduced(query.counters.reduced)
         else:
-            _write_file(query, form, path, choices)
+            query = _answer(query, form, path, choices)
         sys.stdout.flush()
         if not choices.quiet:
-            closing_line(query.counters, time.monotonic() - started, count=choices.count)
-            _tell_gaps(store, query, choices)
+            print_cost(query.counters, time.monotonic() - started, count=choices.count)
+            print_gaps(store, query, choices.between if choices.clock == "log" else None)
 
 
-def _write_file(query: Query, form: str, path: Path, choices: Choices) -> None:
-    try:
-        with replacing(path, form=form, force=choices.force):
-            missing = write(query, form, path, quiet=choices.quiet)
-    except Stopped as stopped:
-        stopped.consequence = f"{path} is not written."
-        raise
-    tell_unreadable(missing)
-    tell_reduced(query.counters.reduced)
+def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:
+    """Print or write the messages; returns the query with its counters."""
+    if form == "table":
+        from hybridlog.cli.screen import print_answer
+
+        return print_answer(query)
+    from hybridlog.cli.write_answer import write_answer
+
+    if path is None:
+        missing = write_answer(query, form, sys.stdout.buffer, quiet=True)
+    else:
+        with (
+            if_stopped(f"{path} is not written."),
+            replacing(path, form=form, force=choices.force),
+        ):
+            missing = write_answer(query, form, path, quiet=choices.quiet)
+    print_unreadable(missing)
+    print_reduced(query.counters.reduced)
+    return query
 
 
-def write(query: Query, form: str, target: Target, *, quiet: bool = False) -> int:
-    """Write a query's answer to a file or a stream; all of it or nothing.
-
-    Args:
-        query: The question.
-        form: A format of `hybridlog.export.FORMATS`.
-        target: Path or binary stream.
-        quiet: No progress bar.
-
-    Returns:
-        Messages that are not in it, because they do not fit their definition.
-    """
-    from hybridlog.export import FORMATS
-
-    total = 0 if quiet else query.size_hint()
-    with progress_bar(form, total, quiet=quiet) as bar:
-        counters = query.counters
-
-        def progress() -> None:
-            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
-
-        if FORMATS[form].kind == "exact":
-            _write_exact(query, form, target, progress)
-            return 0
-        written = _write_rows(query, form, target, progress)
-        return counters.messages - counters.reduced - written
-
-
-def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:
-    from hybridlog.export import open_batch_writer
-
-    with open_batch_writer(form, target, profile=_profile(query)) as exact:
-        if form != "raw":
-            for batch, channels in query.latched():
-                exact.write(batch, [c.channel for c in channels])
-        for batch, channels in query.batches():
-            exact.write(batch, [c.channel for c in channels])
-            progress()
-
-
-def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> int:
-    """Write the rows; returns how many."""
-    from hybridlog.export import open_table_writer
-    from hybridlog.export.jsonl import JsonlWriter
-    from hybridlog.frames.answer import json_columns
-
-    written = 0
-    if form == "jsonl":
-        with JsonlWriter(target) as rows:
-            for some in query.to_json_lines():
-                rows.write_lines(some)
-                written += len(some)
-                progress()
-        return written
-    schema = query.schema()
-    with open_table_writer(form, target, schema=schema) as tables:
-        for table in query.to_tables():
-            tables.write(table)
-            written += table.num_rows
-            progress()
-    for name in json_columns(schema):
-        output.note(f"{name} has values of several types: it is written as JSON text.")
-    return written
-
-
-def _query(store: Store, choices: Choices) -> Query:
-    query = question(store, choices.topic, choices.recording)
+def _query(store: Store, choices: _Choices) -> Query:
+    query = query_of(store, choices.topic, choices.recording)
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)
     if choices.event is not None:
         topic, predicate = choices.event
-        events = question(store, [topic], choices.recording).where(predicate)
+        events = query_of(store, [topic], choices.recording).where(predicate)
         query = query.around(events, choices.before or 0, choices.after or 0)
-    for predicate in choices.where or ():
+    for predicate in choices.where:
         query = query.where(predicate)
     if choices.fields is not None:
-        query = query.fields(*names_of(choices.fields))
+        query = query.fields(*parse_fields(choices.fields))
     if choices.at is not None:
         return query.at_time(choices.at)
     if choices.every > 1:
@@ -188,19 +191,7 @@ def _query(store: Store, choices: Choices) -> Query:
     return query
 
 
-def names_of(text: str) -> list[str]:
-    """The fields of --fields, each once.
-
-    Raises:
-        UsageError: One of them is empty.
-    """
-    names = [name.strip() for name in text.split(",")]
-    if not all(names):
-        raise UsageError(f"--fields wants names with commas between them, not {text!r}.")
-    return list(dict.fromkeys(names))
-
-
-def _form(choices: Choices) -> str:
+def _form(choices: _Choices) -> str:
     _check_event(choices)
     if choices.at is not None:
         for given, option in (
@@ -212,43 +203,43 @@ def _form(choices: Choices) -> str:
             (choices.event is not None, "--event"),
         ):
             if given:
-                raise UsageError(f"--at asks for one message, by log time; {option} does not fit.")
+                raise UsageError(f"--at gives one message, by log time: leave out {option}.")
     if choices.form is not None:
         form = choices.form
     elif choices.output is None or str(choices.output) == "-":
         form = "table" if sys.stdout.isatty() else "jsonl"
     else:
-        form = form_of(choices.output)
+        form = _form_of(choices.output)
     if form == "table" and choices.output is not None:
-        raise UsageError("A table is for the screen; use --format csv or parquet with -o.")
+        raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
     return form
 
 
-def _check_event(choices: Choices) -> None:
+def _check_event(choices: _Choices) -> None:
     near = choices.before is not None or choices.after is not None
     if near and choices.event is None:
-        raise UsageError("--before and --after of what? Say it with --event TOPIC PREDICATE.")
+        raise UsageError("--before and --after need events: add --event TOPIC PREDICATE.")
     if choices.event is not None and not near:
-        raise UsageError("How long before or after the events? Say it with --before or --after.")
+        raise UsageError("--event needs a length of time: add --before or --after.")
 
 
-def form_of(path: Path) -> str:
-    """The format that the end of a name stands for.
+def _form_of(path: Path) -> str:
+    """The format that a suffix names.
 
     Raises:
-        UsageError: It stands for none.
+        UsageError: It names none.
     """
     form = _SUFFIXES.get(path.suffix.lower())
     if form is None:
         raise UsageError(
-            f"The name {path} does not say what to write: add --format, or end it in "
+            f"The name {path} does not give the format: add --format, or end it in "
             f"{', '.join(_SUFFIXES)}."
         )
     return form
 
 
-def _path(choices: Choices, form: str) -> Path | None:
-    """Where to; None for standard output. Refused before anything is opened."""
+def _path(choices: _Choices, form: str) -> Path | None:
+    """The file to write; None for standard output. Errors come before the store is opened."""
     if choices.count:
         return None
     if choices.output is None or str(choices.output) == "-":
@@ -257,34 +248,3 @@ def _path(choices: Choices, form: str) -> Path | None:
         return None
     check_room(choices.output, form=form, force=choices.force)
     return choices.output
-
-
-def _profile(query: Query) -> str:
-    encodings = {c.channel.message_encoding for c in query.channels()}
-    return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
-
-
-def closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:
-    """Say what an answer has cost.
-
-    Args:
-        counters: What was counted.
-        elapsed: Seconds, with opening the store.
-        count: The answer was a number, not messages.
-    """
-    taken = f"{output.size(counters.bytes_read)} read from disk"
-    if counters.chunks_read:
-        taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
-    given = counters.messages - counters.reduced
-    found = "" if count else f"{output.counted(given, 'message')}, "
-    output.note(
-        f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
-        f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"
-    )
-
-
-def _tell_gaps(store: Store, query: Query, choices: Choices) -> None:
-    recordings = [r for r in store.recordings() if r.id in query.recordings]
-    between = choices.between if choices.clock == "log" else None
-    for line in gaps(recordings, query.topics, between):
-        output.note(line)

@@ -1,4 +1,4 @@
-"""What a recorder is doing, as a table that updates in place."""
+"""The state of a recorder as a table that updates in place."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 
 
 class LiveTable:
-    """The table; a context manager that takes it away at the end.
+    """The table; a context manager that removes it at the end.
 
     Args:
-        error: On standard error; else on standard output.
+        error: Draw it on standard error, else on standard output.
     """
 
     def __init__(self, *, error: bool = True) -> None:
@@ -37,7 +37,7 @@ class LiveTable:
         )
 
     def __enter__(self) -> Self:
-        """Take the screen."""
+        """Begin to draw."""
         self._live.start()
         return self
 
@@ -47,23 +47,23 @@ class LiveTable:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give it back."""
+        """Remove the table."""
         self._live.stop()
 
     def note(self, text: str) -> None:
-        """A line above the table."""
+        """Print a line above the table."""
         from rich.text import Text
 
         self._live.console.print(Text(f"hybridlog: {output.printable(text)}"))
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
-        """Draw it anew, with lines below."""
+        """Draw a state, with lines below it."""
         rows = max(self._live.console.height - 6 - len(below), 3)
         self._live.update(drawn(state, rows=rows, below=below), refresh=True)
 
 
 def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Group:
-    """A state as a table of at most so many topics, and lines below."""
+    """A state as a table of at most `rows` topics, with lines below it."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -72,7 +72,7 @@ def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Grou
     table.add_column("topic", no_wrap=True, overflow="ellipsis", ratio=1)
     for heading in ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost"):
         table.add_column(heading, justify="right", no_wrap=True)
-    # Those that matter most when not all fit: with losses, then the largest.
+    # When not all fit: topics with losses first, then those with most bytes.
     topics = sorted(state.topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))
     shown = {t.topic for t in topics[:rows]}
     for topic in state.topics:
@@ -102,7 +102,7 @@ def summary(state: RecorderState) -> str:
     causes = {cause: count for cause, count in state.lost.items() if cause != Cause.THROTTLE}
     lost = sum(causes.values())
     if causes:
-        # A cause without a number: how many they are cannot be known.
+        # A cause without a number stands for an unknown number.
         named = ", ".join(
             f"{cause} {count or 'unknown'}" for cause, count in sorted(causes.items())
         )
@@ -119,7 +119,7 @@ def _index(state: RecorderState) -> str:
 
 
 def in_short(reason: str) -> str:
-    """The beginning of a reason, for a place where not much fits."""
+    """The beginning of a reason, for a place with little room."""
     line = output.printable(reason.partition("\n")[0])
     sentence = line.partition(". ")[0].rstrip(".")
     return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"
@@ -144,12 +144,12 @@ def _cells(topic: TopicState) -> list[Text | str]:
 def closing_rows(
     report: RecordReport, state: RecorderState, unreached: Sequence[str]
 ) -> list[tuple[str, str]]:
-    """What stands in the table at the end.
+    """Rows of the table at the end.
 
     Args:
-        report: How the recording went.
+        report: Result of the recording.
         state: Of the recorder, at its end.
-        unreached: Sources that never answered.
+        unreached: Addresses of sources that never answered.
     """
     entry = report.entry
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
@@ -176,7 +176,7 @@ def closing_rows(
 
 
 def _number(known: int, losses: Sequence[Mapping[str, Any]]) -> str:
-    """How many are lost, as far as that can be known."""
+    """The number of lost messages, as far as it is known."""
     if not known:
         return "unknown"
     is_more = any(row["count"] is None for row in losses)

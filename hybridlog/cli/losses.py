@@ -6,28 +6,36 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.cli import output
+import click
+
+from hybridlog.cli import options, output
 from hybridlog.cli.coverage import losses_of
-from hybridlog.cli.opening import opened
+from hybridlog.cli.open_store import opened_store
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 
-def show(
-    recordings: Sequence[str],
-    topics: Sequence[str],
-    store: Path | None,
-    mongo: str | None,
+@click.command()
+@options.only_recordings
+@options.store
+@options.only_topics
+@options.mongo
+@options.as_json
+def command(
     *,
+    recording: tuple[str, ...],
+    store: Path | None,
+    topic: tuple[str, ...],
+    mongo: str | None,
     as_json: bool,
 ) -> None:
-    """Print every row of the ledger of some recordings, or of all."""
+    """Show what is missing, from when to when, and why."""
     from hybridlog.query.topics import matcher
 
-    fits = matcher(topics) if topics else None
-    with opened(store, mongo) as found:
-        entries = found.select(recordings) if recordings else found.recordings()
+    fits = matcher(topic) if topic else None
+    with opened_store(store, mongo) as opened:
+        entries = opened.select(recording) if recording else opened.recordings()
     rows = [
         {"recording": entry.label, **loss}
         for entry in entries
@@ -44,8 +52,8 @@ def show(
     for entry in entries:
         if entry.status == "open":
             output.note(
-                f"{entry.label} is still being recorded: what it lacks stands here at its end, and "
-                f"`hybridlog top {entry.label}` shows it now."
+                f"{entry.label} is still being recorded: its losses appear here when it ends, and "
+                f"`hybridlog top {entry.label}` shows them now."
             )
 
 

@@ -8,9 +8,8 @@ import sys
 import traceback
 from typing import NoReturn, TextIO
 
-from hybridlog.cli import stopping
+from hybridlog.cli import import_blocker, signals
 from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL, of_os_error
-from hybridlog.cli.spared import spare
 from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
@@ -18,14 +17,14 @@ __all__ = ["EXIT_CODES", "main"]
 
 def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
-    stopping.install()
-    spare()
+    signals.install()
+    import_blocker.install()
     for stream in (sys.stdout, sys.stderr):
-        # A name that the terminal's encoding lacks is shown as an escape.
+        # Characters that the terminal's encoding lacks are shown as escapes.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         code = _run()
-    except stopping.Stopped as stopped:
+    except signals.Stopped as stopped:
         _remove_unfinished()
         _complain(f"interrupted. {stopped.consequence}".rstrip())
         code = stopped.exit_code
@@ -40,29 +39,49 @@ def _remove_unfinished() -> None:
 
 
 def _run() -> int:
-    from hybridlog.cli.app import app
-
     try:
-        app(prog_name="hybridlog")
-    except SystemExit as leaving:
-        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+        return _run_command()
     except HybridlogError as error:
         _complain(str(error))
         return error.exit_code
     except BrokenPipeError:
-        _let_go(sys.stdout)
+        _discard(sys.stdout)
+        return 0
     except OSError as error:
-        # What the library maps carries a cure; this is the rest, such as a failing disk.
+        # The library maps most of these; the rest are such as a failing disk.
         _complain(str(error))
         return of_os_error(error)
     except MemoryError:
-        _complain("there is not enough memory for this. Ask for less at a time.")
+        _complain("there is not enough memory for this: ask for less at a time.")
         return HybridlogError.exit_code
     except Exception:
         traceback.print_exc()
-        _complain("this is a mistake in hybridlog; please report it with the lines above.")
+        _complain("this is an error in hybridlog: please report it with the lines above.")
         return INTERNAL
-    return 0
+
+
+def _run_command() -> int:
+    import click
+
+    from hybridlog.cli.app import app
+    from hybridlog.cli.completion import VARIABLE
+
+    if VARIABLE in os.environ:
+        from click.shell_completion import shell_complete
+
+        return shell_complete(app, {}, "hybridlog", VARIABLE, os.environ[VARIABLE])
+    try:
+        with app.make_context("hybridlog", sys.argv[1:]) as context:
+            code = app.invoke(context)
+    except click.exceptions.Exit as leaving:
+        return leaving.exit_code
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        _complain("aborted.")
+        return HybridlogError.exit_code
+    return code if isinstance(code, int) else 0
 
 
 def _complain(text: str) -> None:
@@ -72,34 +91,33 @@ def _complain(text: str) -> None:
     try:
         print(f"hybridlog: {lines}", file=sys.stderr, flush=True)  # noqa: T201
     except OSError:
-        _let_go(sys.stderr)
+        _discard(sys.stderr)
 
 
 def _flushed(code: int) -> int:
-    """The exit code, after the last bytes are out: that is where a full disk shows."""
+    """The exit code after the last bytes are written, which fails on a full disk."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output has gone, as `head` does: nothing is wrong.
-        _let_go(sys.stdout)
+        # The reader of the output has ended, as `head` does: this is no error.
+        _discard(sys.stdout)
     except OSError as error:
-        _let_go(sys.stdout)
+        _discard(sys.stdout)
         _complain(f"standard output cannot be written: {error.strerror}")
         return code or of_os_error(error)
     return code
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process at once, when everything is closed and flushed.
+    """End the process without the interpreter's cleanup; everything is closed and flushed.
 
-    At an ordinary end, the connections' background threads are waited for: half a second
-    of sleep for each command that has used MongoDB.
+    The cleanup would wait half a second for the background threads of MongoDB connections.
     """
     with contextlib.suppress(OSError):
         sys.stderr.flush()
     os._exit(code)
 
 
-def _let_go(stream: TextIO) -> None:
-    """What a stream still holds goes nowhere; the interpreter flushes it at its end."""
+def _discard(stream: TextIO) -> None:
+    """Discard what a stream still holds; the interpreter flushes it at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

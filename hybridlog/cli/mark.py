@@ -1,41 +1,63 @@
-"""`hybridlog mark` and `trigger`."""
+"""`hybridlog mark`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from hybridlog.cli import output
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.open_store import opened_store
 from hybridlog_storage.errors import UsageError
 
 
-def run(
-    text: str, tags: list[str], recordings: Sequence[str], store: Path | None, *, quiet: bool
+@click.command()
+@click.argument("text", metavar="TEXT", help="What happened.")
+@options.tags
+@options.running
+@click.option(
+    "--at",
+    metavar="T",
+    help="Mark a recording that has ended, at this time, written as for --between.",
+)
+@options.store
+@options.quiet
+def command(
+    *,
+    text: str,
+    tag: tuple[str, ...],
+    recording: tuple[str, ...],
+    at: str | None,
+    store: Path | None,
+    quiet: bool,
 ) -> None:
-    """Set a mark in the recordings that are meant."""
-    from hybridlog.cli.record import tags_of
-    from hybridlog.live.control_server import choose, request
-    from hybridlog.store import store_path
+    """Set a mark that queries can use, now or at a past time.
 
+    A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --event
+    /hybridlog/marks "text = 'gripper slipped'" --before 5s --after 5s`.
+    """
+    tags = options.parse_tags(tag)
     if not text.strip():
         raise UsageError("A mark needs a text: say what happened.")
-    pairs = tags_of(tags)
-    path = store_path(store)
-    for name in choose(path, recordings):
-        answer = request(path, name, "mark", text=text, tags=pairs)
+    if at is None:
+        labels = _mark_running(text, tags, recording, store)
+    elif len(recording) == 1:
+        with opened_store(store, None, quiet=quiet) as opened:
+            labels = iter([opened.mark(recording[0], at, text, tags).label])
+    else:
+        raise UsageError("A mark at a time needs one recording: name it with --recording.")
+    for label in labels:
         if not quiet:
-            output.note(f"Marked in {answer['recording']}.")
+            output.note(f"Marked in {label}.")
 
 
-def fire(name: str, recorders: Sequence[str], store: Path | None, *, quiet: bool) -> None:
-    """Let the recorders that are meant write a snapshot."""
+def _mark_running(
+    text: str, tags: dict[str, str], recordings: tuple[str, ...], store: Path | None
+) -> Iterator[str]:
     from hybridlog.live.control_server import choose, request
     from hybridlog.store import store_path
 
-    if not name.strip():
-        raise UsageError("A trigger needs a name: say why, in a word.")
     path = store_path(store)
-    for recorder in choose(path, recorders):
-        answer = request(path, recorder, "trigger", reason=name)
-        if not quiet:
-            output.note(f"{answer['recording']} writes a snapshot.")
+    for name in choose(path, recordings):
+        yield str(request(path, name, "mark", text=text, tags=tags)["recording"])

@@ -1,4 +1,4 @@
-"""Everything that is printed: tables, sizes, times, JSON, notes."""
+"""Prints answers, tables, JSON and notes; writes sizes and times for people."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     """Print rows under headings; on a terminal, cells that do not fit are folded.
 
     Args:
-        columns: What stands above, and on which side the cells stand.
+        columns: Headings, and the side on which the cells stand.
         rows: Cells; control characters in them are shown, not obeyed.
     """
     shown = [[printable(cell) for cell in row] for row in rows]
@@ -60,7 +60,7 @@ def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -
 
 
 def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
-    """For files and pipes: as wide as it needs to be, nothing folded or left out."""
+    """Print full width for files and pipes: nothing is folded or left out."""
     headings = [printable(heading) for heading, _ in columns]
     widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]
     for row in (headings, *rows):
@@ -72,12 +72,12 @@ def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) 
 
 
 def is_narrow() -> bool:
-    """Whether a table should do without its less important columns."""
+    """True on a terminal that is too narrow for the less important columns."""
     return sys.stdout.isatty() and console().width < 100
 
 
 def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-    """Whether rows fit as a table: always, where the lines may be as long as they like."""
+    """True when rows fit the terminal as a table; files and pipes fit any row."""
     if not sys.stdout.isatty():
         return True
     widths = [max(map(len, cells)) for cells in zip(names, *rows, strict=True)]
@@ -107,7 +107,7 @@ def _escaped(code: int) -> str:
 
 
 def quoted(text: str) -> str:
-    """What was typed, in quotes; bytes that are no text are shown as such."""
+    """Typed text in quotes; bytes that are not UTF-8 are shown as escapes."""
     raw = text.encode("utf-8", "surrogateescape")
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
 
@@ -143,12 +143,12 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
 
 
 def stored(messages: int) -> str:
-    """That so many messages are there: `1 message is stored`."""
+    """A number of stored messages: `1 message is stored`."""
     return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
 
 
 def unfit(messages: int) -> str:
-    """That so many messages cannot be read: `1 message does not fit its definition`."""
+    """A number of unreadable messages: `1 message does not fit its definition`."""
     verb = "does not fit its" if messages == 1 else "do not fit their"
     return f"{counted(messages, 'message')} {verb} definition"
 
@@ -177,7 +177,7 @@ def parse_size(text: str) -> int:
     """Bytes from `1MiB`, `500kB`, `65536`.
 
     Raises:
-        UsageError: it is no size.
+        UsageError: The text is no size.
     """
     match = _SIZE.fullmatch(text)
     if match is None:

@@ -17,7 +17,7 @@ class Bar(Protocol):
     """Shows progress."""
 
     def __call__(self, done: int, note: str = "") -> None:
-        """So many bytes are done; `note` stands beside the bar."""
+        """Set the number of finished bytes, and a note beside the bar."""
 
 
 @contextmanager
@@ -25,8 +25,8 @@ def progress_bar(label: str, total: int, *, quiet: bool) -> Iterator[Bar]:
     """A bar with rate and remaining time on a terminal; nothing elsewhere.
 
     Args:
-        label: What is under way.
-        total: Bytes in all, about.
+        label: Name of the work.
+        total: Approximate number of bytes.
         quiet: No bar.
     """
     if quiet or not sys.stderr.isatty():
@@ -39,10 +39,10 @@ def progress_bar(label: str, total: int, *, quiet: bool) -> Iterator[Bar]:
 
 
 class Stages:
-    """One bar over parts that each count from zero.
+    """One bar for several parts that each count from zero.
 
     Args:
-        bar: Shows the sum.
+        bar: The bar that shows the sum.
     """
 
     def __init__(self, bar: Bar) -> None:
@@ -52,7 +52,7 @@ class Stages:
         self._last = 0
 
     def __call__(self, recording: str, done: int, total: int) -> None:
-        """In a recording, `done` of `total` bytes."""
+        """Report `done` of `total` bytes of a recording."""
         part = (recording, total)
         if self._part != part or done < self._last:
             self._before += self._last
@@ -62,10 +62,10 @@ class Stages:
 
 
 class LateBar:
-    """A bar that appears when there is progress to show, for work that is seldom needed.
+    """A bar that appears at the first progress, for work that is seldom needed.
 
     Args:
-        label: What is under way.
+        label: Name of the work.
         quiet: No bar.
     """
 
@@ -76,7 +76,7 @@ class LateBar:
         self._task: TaskID | None = None
 
     def __call__(self, recording: str, done: int, total: int) -> None:
-        """In a recording, `done` of `total` bytes."""
+        """Report `done` of `total` bytes of a recording."""
         if self._quiet:
             return
         if self._bar is None:
@@ -87,7 +87,7 @@ class LateBar:
         self._bar.update(self._task, completed=done, total=total, note=_short(printable(recording)))
 
     def close(self) -> None:
-        """Take it away."""
+        """Remove it."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

@@ -8,44 +8,44 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
-from hybridlog.cli.live_choices import LiveChoices, sources_of
-from hybridlog.cli.live_closing import Closing
+from hybridlog.cli.live_options import recorder_options, sources_of
+from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short
-from hybridlog.cli.opening import opened
-from hybridlog.cli.stopping import SIGNALS
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.signals import SIGNALS
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from hybridlog.cli.record import Choices
+    from hybridlog.cli.record_choices import RecordChoices
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
 
-_LOOK_S = 1.0
-_PATIENCE_S = 2.0  # of closing; what takes longer is explained
-_NEWS = re.compile(r"snapshot \S+ because of ")
-"""What a recorder says that is no trouble: `--quiet` does without it."""
+_STATE_S = 1.0
+_EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
+_SNAPSHOT = re.compile(r"snapshot \S+ because of ")
+"""A message of a recorder that is no problem: `--quiet` leaves it out."""
 
 
-def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choices) -> None:
-    """Record until a bound is reached, everything has been played, or Ctrl-C."""
+def record_live(choices: RecordChoices) -> None:
+    """Record until a bound is reached, the replay has ended, or Ctrl-C."""
     from hybridlog.live.recorder import Recorder
 
-    # Everything that can be wrong with the options is wrong before a store is made.
-    chosen = options()
-    sources = sources_of(live)
+    # Wrong options are found before a store is made.
+    options = recorder_options(choices)
+    sources = sources_of(choices)
     quiet = choices.quiet
-    shown = _Shown(as_json=choices.as_json, quiet=quiet)
+    display = _Display(as_json=choices.as_json, quiet=quiet)
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
         store = held.enter_context(
-            opened(
+            opened_store(
                 choices.store,
                 choices.mongo,
                 create=True,
@@ -54,39 +54,40 @@ def run(live: LiveChoices, options: Callable[[], RecorderOptions], choices: Choi
                 quiet=quiet,
             )
         )
-        with _until_told() as told_to_stop:
-            recorder = Recorder(store, sources, chosen, shown.say)
+        with _stop_event() as stop:
+            recorder = Recorder(store, sources, options, display.say)
             recorder.start()
-            with shown.table(), _fired_by_signal(recorder, chosen):
-                last = _watch(recorder, told_to_stop, shown)
+            with display.table(), _snapshot_on_signal(recorder, options):
+                last = _watch(recorder, stop, display)
             if quiet:
                 reports = recorder.stop()
             else:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
-                with _explained(last):
+                with _explain_wait(last):
                     reports = recorder.stop()
-        Closing(reports, recorder, sources, chosen).tell(as_json=choices.as_json, quiet=quiet)
+        summary = LiveSummary(reports, recorder, sources, options)
+        summary.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 
-def _watch(recorder: Recorder, told_to_stop: threading.Event, shown: _Shown) -> RecorderState:
+def _watch(recorder: Recorder, stop: threading.Event, display: _Display) -> RecorderState:
     state = recorder.look()
-    shown.state(state)
-    while not told_to_stop.is_set() and not recorder.wait(0):
-        told_to_stop.wait(_LOOK_S)
+    display.state(state)
+    while not stop.is_set() and not recorder.wait(0):
+        stop.wait(_STATE_S)
         state = recorder.look()
-        shown.state(state)
+        display.state(state)
     return state
 
 
 @contextmanager
-def _explained(last: RecorderState) -> Iterator[None]:
-    """Say what closing waits for, when it takes long."""
+def _explain_wait(last: RecorderState) -> Iterator[None]:
+    """Print what the end of the recording waits for, when it takes long."""
     what = "what is left is still being written"
     if last.lag:
         what = f"waiting for MongoDB, which lacks {output.counted(last.lag, 'message')}"
     if last.index_failure:
         what += f" ({in_short(last.index_failure)})"
-    timer = threading.Timer(_PATIENCE_S, output.note, [f"hybridlog: {what}"])
+    timer = threading.Timer(_EXPLAIN_AFTER_S, output.note, [f"hybridlog: {what}"])
     timer.start()
     try:
         yield
@@ -95,40 +96,40 @@ def _explained(last: RecorderState) -> Iterator[None]:
 
 
 @contextmanager
-def _until_told() -> Iterator[threading.Event]:
-    """Set the event at the first signal; at the second one, leave at once.
+def _stop_event() -> Iterator[threading.Event]:
+    """An event that the first signal sets; the second signal ends the process at once.
 
-    What was flushed by then stays, and the next command on the store seals it.
+    Flushed chunks stay, and the next command on the store seals them.
     """
-    told = threading.Event()
+    stopped = threading.Event()
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        if told.is_set():
-            text = "\nhybridlog: left. What was flushed stays; the next command seals it.\n"
+        if stopped.is_set():
+            text = "\nhybridlog: stopped. Flushed chunks stay; the next command seals them.\n"
             os.write(2, text.encode())
             os._exit(128 + number)
-        told.set()
+        stopped.set()
 
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
             signal.signal(number, stop)
     try:
-        yield told
+        yield stopped
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
 @contextmanager
-def _fired_by_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[None]:
+def _snapshot_on_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[None]:
     """SIGUSR1 writes a snapshot."""
     if options.snapshots is None or not hasattr(signal, "SIGUSR1"):
         yield
         return
 
     def fire(number: int, _frame: FrameType | None) -> None:
-        # Not in the handler: what it interrupts may hold the locks that are needed.
+        # Not in the handler: the code it interrupts may hold the locks.
         threading.Thread(target=recorder.fire, args=("SIGUSR1",), daemon=True).start()
 
     before = signal.signal(signal.SIGUSR1, fire)
@@ -138,8 +139,8 @@ def _fired_by_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[N
         signal.signal(signal.SIGUSR1, before)
 
 
-class _Shown:
-    """What the person, or the script, sees while it goes on."""
+class _Display:
+    """Shows the progress: a table on a terminal, JSON for scripts."""
 
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json = as_json
@@ -149,12 +150,12 @@ class _Shown:
             self._table = LiveTable()
 
     def table(self) -> AbstractContextManager[object]:
-        """Shown while recording."""
+        """The table, as a context manager."""
         return self._table or nullcontext()
 
     def say(self, text: str) -> None:
-        """Tell something at once."""
-        if self._quiet and _NEWS.match(text):
+        """Print a message of the recorder at once."""
+        if self._quiet and _SNAPSHOT.match(text):
             return
         if self._table is not None:
             self._table.note(text)
@@ -162,7 +163,7 @@ class _Shown:
             output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
-        """How it goes, about once a second."""
+        """Show the state, about once a second."""
         if self._table is not None:
             self._table.show(state)
         elif self._as_json:

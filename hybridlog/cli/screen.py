@@ -1,4 +1,4 @@
-"""An answer on a terminal: a table when it fits, else a block a message."""
+"""Prints an answer on a terminal: a table when it fits, else a block for each message."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.cli import output
-from hybridlog.cli.coverage import tell_reduced, tell_unreadable
+from hybridlog.cli.answer_notes import print_reduced, print_unreadable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 SCREEN_ROWS = 20
 """Messages shown without --limit."""
-_WIDEST_CELL = 40
-_WIDEST_LINE = 200
-_INNER = 4
+_MAX_CELL = 40
+_MAX_LINE = 200
+_MAX_ITEMS = 4
 
 
 class _Answer(NamedTuple):
@@ -30,30 +30,30 @@ def print_answer(query: Query) -> Query:
     """Print messages for people to read, long arrays in short.
 
     Args:
-        query: The question; without a limit, its first messages are shown.
+        query: The query; without a limit, its first messages are shown.
 
     Returns:
-        The question that was answered, with its counters.
+        The query that was answered, with its counters.
     """
     limit = query.question.limit
     # One more than is shown tells whether there is more.
-    asked = query if limit is not None else query.limit(SCREEN_ROWS + 1)
+    answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
     shown = 0
-    for table in asked.to_tables():
+    for table in answered.to_tables():
         wanted = table if limit is not None else table.slice(0, SCREEN_ROWS - shown)
-        _print_block(_cells(wanted), asked.topics)
+        _print_block(_cells(wanted), answered.topics)
         shown += wanted.num_rows
-    if not shown and not asked.counters.messages:
+    if not shown and not answered.counters.messages:
         output.note("No message.")
-    if limit is None and asked.counters.messages > SCREEN_ROWS:
+    if limit is None and answered.counters.messages > SCREEN_ROWS:
         output.note(
             f"The first {SCREEN_ROWS} messages. --limit shows more, --format jsonl or -o FILE "
-            "gives them all."
+            "gives all."
         )
-        asked.counters.messages = SCREEN_ROWS
-    tell_unreadable(asked.counters.messages - asked.counters.reduced - shown)
-    tell_reduced(asked.counters.reduced)
-    return asked
+        answered.counters.messages = SCREEN_ROWS
+    print_unreadable(answered.counters.messages - answered.counters.reduced - shown)
+    print_reduced(answered.counters.reduced)
+    return answered
 
 
 def _cells(table: pa.Table) -> _Answer:
@@ -85,7 +85,7 @@ def _cell(value: pa.Scalar) -> str:
     for applies, shown in _forms():
         if applies(value.type):
             return shown(value)
-    return _cut(str(value.as_py()), _WIDEST_CELL)
+    return _cut(str(value.as_py()), _MAX_CELL)
 
 
 @functools.cache
@@ -115,17 +115,17 @@ def _forms() -> list[tuple[Callable[[pa.DataType], bool], Callable[[pa.Scalar], 
 
 def _struct(value: pa.Scalar) -> str:
     inside = (f"{name}: {_cell(item)}" for name, item in value.items())
-    return _cut("{" + ", ".join(inside) + "}", _WIDEST_LINE)
+    return _cut("{" + ", ".join(inside) + "}", _MAX_LINE)
 
 
 def _list(value: pa.Scalar) -> str:
     inner = value.values
     if inner is None or not len(inner):
         return "[]"
-    if len(inner) <= _INNER:
-        return _cut("[" + ", ".join(_cell(item) for item in inner) + "]", _WIDEST_LINE)
+    if len(inner) <= _MAX_ITEMS:
+        return _cut("[" + ", ".join(_cell(item) for item in inner) + "]", _MAX_LINE)
     first = ", ".join(_cell(inner[i]) for i in range(2))
-    return _cut(f"[{first}, … {len(inner)} in all]", _WIDEST_LINE)
+    return _cut(f"[{first}, … {len(inner)} in all]", _MAX_LINE)
 
 
 def _cut(text: str, most: int) -> str:

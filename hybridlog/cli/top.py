@@ -1,4 +1,4 @@
-"""`hybridlog top`: what a running recorder is doing."""
+"""`hybridlog top`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.cli import output
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.live_table import LiveTable, drawn
-from hybridlog.cli.opening import opened
-from hybridlog.cli.stopping import Stopped
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,46 +31,72 @@ _ALL_ROWS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field whose values are summed up."""
+    """A field whose values are summarized."""
 
     topic: str
     path: str
 
 
-def run(
-    recording: str | None,
-    fields: Sequence[str],
-    last: str,
-    store: Path | None,
-    mongo: str | None,
+@click.command()
+@click.argument(
+    "recording",
+    required=False,
+    metavar="[RECORDING]",
+    shell_complete=complete_running,
+    help="One of several recorders: id or name of its recording, or the beginning of the id.",
+)
+@options.store
+@click.option(
+    "--field",
+    multiple=True,
+    metavar="TOPIC:FIELD",
+    shell_complete=complete_field,
+    help="Least, mean and greatest of a field in the last seconds, such as scan:ranges.min. "
+    "Repeatable.",
+)
+@click.option(
+    "--last", default="5s", metavar="TIME", help="The time that --field covers, up to now."
+)
+@click.option("--once", is_flag=True, help="Show it once and end.")
+@options.mongo
+@click.option("--json", "as_json", is_flag=True, help="A line of JSON a second, for scripts.")
+def command(
     *,
+    recording: str | None,
+    store: Path | None,
+    field: tuple[str, ...],
+    last: str,
     once: bool,
+    mongo: str | None,
     as_json: bool,
 ) -> None:
-    """Show a recorder's state until it ends, or Ctrl-C; once, where nobody watches."""
+    """Watch a running recorder, until it ends or Ctrl-C.
+
+    Without a terminal, and without --json, the state is shown once.
+    """
     from hybridlog.live.control_server import choose, states
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
 
-    asked = [_field(text) for text in fields]
+    fields = [_field(text) for text in field]
     span = parse_duration(last)
     path = store_path(store)
     (name,) = choose(path, [] if recording is None else [recording])
     on_screen = not as_json and sys.stdout.isatty() and not once
-    with _left_by_ctrl_c(), ExitStack() as held:
+    with _ended_by_ctrl_c(), ExitStack() as held:
         database = None
-        if asked:
-            opened_store = held.enter_context(opened(store, mongo, needs_database=True))
-            database = opened_store.database_for("top --field")
+        if fields:
+            opened = held.enter_context(opened_store(store, mongo, needs_database=True))
+            database = opened.database_for("top --field")
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for raw in states(path, name, _EVERY_S):
             if not raw:
-                continue  # it has only just started
+                continue  # it has just started
             values = []
-            if asked and raw.get("snapshots") is not None:
-                values = _values_of_ring(path, name, raw, asked, span)
+            if fields and raw.get("snapshots") is not None:
+                values = _values_of_ring(path, name, raw, fields, span)
             elif database is not None:
-                values = _values(database, name, raw, asked, span)
+                values = _values(database, name, raw, fields, span)
             if as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
@@ -81,8 +110,8 @@ def run(
 
 
 @contextmanager
-def _left_by_ctrl_c() -> Iterator[None]:
-    """Who has watched long enough presses Ctrl-C: nothing is interrupted by that."""
+def _ended_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C ends the command with exit code 0: it interrupts no work."""
     try:
         yield
     except Stopped as stopped:
@@ -93,7 +122,7 @@ def _left_by_ctrl_c() -> Iterator[None]:
 def _field(text: str) -> _Field:
     topic, sign, path = text.rpartition(":")
     if not sign or not topic or not path or path.startswith("$"):
-        raise UsageError(f"--field wants TOPIC:FIELD, such as scan:ranges.min, not {text!r}.")
+        raise UsageError(f"--field takes TOPIC:FIELD, such as scan:ranges.min, not {text!r}.")
     return _Field(topic, path)
 
 
@@ -104,7 +133,7 @@ def _values(
     fields: Sequence[_Field],
     span: int,
 ) -> list[dict[str, Any]]:
-    """Least, mean and greatest of each field in the last seconds, out of the index."""
+    """Least, mean and greatest of each field in the last seconds, from the index."""
     from hybridlog_storage.collection_names import collection_of
 
     since = time.time_ns() - span
@@ -136,7 +165,7 @@ def _values_of_ring(
     fields: Sequence[_Field],
     span: int,
 ) -> list[dict[str, Any]]:
-    """The same out of the memory of a recorder that stores nothing until it must."""
+    """The same from the memory of a recorder that stores only snapshots."""
     from hybridlog.live.control_server import request
 
     since = time.time_ns() - span
@@ -155,7 +184,7 @@ def _resolved(state: Mapping[str, Any], fields: Sequence[_Field]) -> Iterator[tu
 
     Raises:
         TopicError: No topic has that name.
-        UsageError: Several have.
+        UsageError: Several topics have.
     """
     from hybridlog.query.topics import resolve
 

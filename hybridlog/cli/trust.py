@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybridlog.cli import output
+import click
+
+from hybridlog.cli import options, output
 
 
-def run(store: Path | None, *, forget: bool) -> None:
-    """Agree, or agree no more, to the MongoDB that a store names."""
+@click.command()
+@options.store
+@click.option("--forget", is_flag=True, help="Do not trust this store's server any more.")
+def command(*, store: Path | None, forget: bool) -> None:
+    """Trust the MongoDB server that another user's store names.
+
+    Until then, commands do not connect to it: a user's own stores only are trusted. The store
+    does not contain the password: see HYBRIDLOG_MONGO_PASSWORD.
+    """
     from hybridlog import consent
     from hybridlog.store import store_path
     from hybridlog_storage.settings import read_settings
 
-    path = store_path(store)
-    settings = read_settings(path)
+    settings = read_settings(store_path(store))
     if forget:
         found = consent.forget(settings.store_id)
         output.say("forgotten" if found else "nothing was trusted")

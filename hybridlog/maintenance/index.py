@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.entries import take_inventory
-from hybridlog.index_writer import IndexWriter
-from hybridlog.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import describe_inventory, put_entry
@@ -309,6 +307,9 @@ def _index(
     progress: Progress | None,
 ) -> None:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
+    from hybridlog.index_writer import IndexWriter
+    from hybridlog.indexing import ChunkIndexer
+
     topics = tables.missing(directory, entry)
     writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
     index = IndexWriter(ChunkIndexer(entry.id), database)

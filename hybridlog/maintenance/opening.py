@@ -19,13 +19,11 @@ from hybridlog.entries import (
     sealed_event,
     take_inventory,
 )
-from hybridlog.indexing import ChunkIndexer
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.directory import LOCK, REMOVED
 from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.recovery import recover_segment
 from hybridlog_storage.segment_file import sealed_name
 
 if TYPE_CHECKING:
@@ -344,6 +342,8 @@ def finish_renaming(directory: StoreDirectory, label: str, state: JournalState |
 def _recover_segments(
     directory: StoreDirectory, label: str, listing: Listing, state: JournalState | None
 ) -> list[Recovered]:
+    from hybridlog_storage.recovery import recover_segment
+
     path = directory.recording(label)
     log = Journal(path)
     said = None
@@ -460,6 +460,8 @@ def describe_inventory(
     Raises:
         SegmentError: Nothing says what recording it is.
     """
+    from hybridlog.indexing import ChunkIndexer
+
     if not inventory.id:
         raise SegmentError(
             f"Recording {inventory.label!r} has neither a journal nor a segment that can be "

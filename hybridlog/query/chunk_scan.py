@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from hybridlog.indexing import STAMP
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.column import header_stamps
+from hybridlog.schema.column import STAMP, header_stamps
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
 from hybridlog.query.engines.base import Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex
@@ -25,6 +24,7 @@ from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.message_filter import MessageFilter, residual
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import (
     DatabaseError,
     IndexChangedError,

@@ -16,7 +16,6 @@ A name that exists is always that topic, whatever characters it has.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, text_of
@@ -244,6 +243,8 @@ def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
 
 
 def _unknown(pattern: str, known: list[str]) -> str:
+    import difflib
+
     # Compared by last part and in lower case too: `/scna` is near `/base/scan`.
     nearest: dict[str, None] = {}
     wanted = pattern.casefold().strip("/")

@@ -7,7 +7,7 @@ pandas frames are made from them. No row of a column is a Python object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -157,6 +157,10 @@ def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     result = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=result[1:])
     return result
+
+
+STAMP: Final = "header.stamp"
+"""Path of the header stamp in messages that have one."""
 
 
 def flatten(records: Records) -> dict[str, Column]:

@@ -28,6 +28,7 @@ import numpy as np
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import ChunkTable
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import ChunkPlace
@@ -872,7 +873,7 @@ def chunk_entries(
     edges = table.part_bounds().tolist()
     silent = {c.id for c in entry.channels if not c.has_publish_time}
     found = []
-    for number in np.unique(chunk_of[wanted]).tolist():
+    for number in distinct(chunk_of[wanted]).tolist():
         chunk = table.chunks[number]
         rows = range(edges[number], edges[number + 1])
         stats = {

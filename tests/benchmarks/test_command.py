@@ -23,7 +23,7 @@ from benchmarks.backends.base import Backend, BackendMissingError
 from benchmarks.backends.registry import BACKENDS
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies.runs import Context, step
-from hybridlog.cli.stopping import Stopped
+from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import SourceError
 from tests.imports import ROOT
 
@@ -124,7 +124,7 @@ class Study:
 def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     found = Study()
     monkeypatch.setattr(command, "import_module", lambda name: found)
-    monkeypatch.setattr("hybridlog.cli.stopping.install", lambda: None)
+    monkeypatch.setattr("hybridlog.cli.signals.install", lambda: None)
     return found
 
 

@@ -76,14 +76,14 @@ def complete(words: str) -> list[str]:
         capture_output=True,
         text=True,
         env=environment(
-            _HYBRIDLOG_COMPLETE="complete_bash",
+            _HYBRIDLOG_COMPLETE="bash_complete",
             COMP_WORDS=f"hybridlog {words}",
             COMP_CWORD=str(len(words.split())),
         ),
         check=True,
     )
     assert ended.stderr == ""
-    return ended.stdout.split()
+    return [line.partition(",")[2] for line in ended.stdout.splitlines() if line]
 
 
 def start(*arguments: object, output: IO[bytes], wrapper: tuple[str, ...] = ()) -> Any:

@@ -16,7 +16,7 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 
-from hybridlog.cli.fetch import closing_line
+from hybridlog.cli.answer_notes import print_cost
 from hybridlog.query.counters import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
@@ -63,9 +63,9 @@ def test_json_lines(store: Path, scans: list[Seen], decoded: list[Any]) -> None:
     assert {r["topic"] for r in rows} == {"/base/scan"}
     for row, message in zip(rows, decoded, strict=True):
         assert row["header.frame_id"] == message.header.frame_id
-        # JSON has no infinities: they are strings.
-        want = [float(v) for v in message.ranges]
-        got = [float(np.float32(v)) for v in row["ranges"]]
+        # JSON has no infinities.
+        want = [float(v) if np.isfinite(v) else None for v in message.ranges]
+        got = [None if v is None else float(np.float32(v)) for v in row["ranges"]]
         assert got == want
 
 
@@ -398,7 +398,7 @@ def test_json_is_asked_as_it_stands(store: Path) -> None:
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    closing_line(Counters(messages=251, reduced=12), 0.1, count=False)
+    print_cost(Counters(messages=251, reduced=12), 0.1, count=False)
     assert capsys.readouterr().err.startswith("239 messages, ")
 
 

@@ -123,7 +123,7 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
         (("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "x"), "duration"),
         (
             ("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "1s", "--at", "0"),
-            "--event does not fit",
+            "leave out --event",
         ),
         (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
         (("intervals", *GRIPPER, "--where", "position ="), "value"),

@@ -275,9 +275,9 @@ def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
 def test_too_little_memory_is_no_mistake_of_ours(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def starve(**_: object) -> None:
+    def starve(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("hybridlog.cli.app.app", starve)
+    monkeypatch.setattr("hybridlog.cli.app.app.make_context", starve)
     assert import_module("hybridlog.cli.main")._run() == 1
     assert "not enough memory" in capsys.readouterr().err

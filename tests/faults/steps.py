@@ -426,12 +426,12 @@ COMMANDS: Mapping[str, Command] = {
 
 def _run(job: Mapping[str, Any], tell: Callable[[str], None]) -> tuple[str, str]:
     """Run a command in this process; returns outcome and message."""
-    from hybridlog.cli import stopping
+    from hybridlog.cli import signals
     from hybridlog_storage.errors import HybridlogError
 
     name, *args = job["command"]
     point = Point(**job["point"])
-    stopping.install()
+    signals.install()
     pauses = ""
     if point.fault == "pause":
         pauses, *args = args
@@ -444,7 +444,7 @@ def _run(job: Mapping[str, Any], tell: Callable[[str], None]) -> tuple[str, str]
 
     try:
         COMMANDS[name](arm, Path(job["store"]), job["uri"], args)
-    except stopping.Stopped:
+    except signals.Stopped:
         return "stopped", ""
     except HybridlogError as error:
         return type(error).__name__, str(error)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.indexing import STAMP
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, Values
 from hybridlog.query.predicate.to_mongo import MongoFilter, to_mongo
 from hybridlog.query.predicate.tree import And
 from hybridlog.query.times import TIME_LIMIT
+from hybridlog.schema.column import STAMP
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns

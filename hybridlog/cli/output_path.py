@@ -1,10 +1,8 @@
-"""Where an answer is written, and what becomes of what is there already."""
+"""Checks the file or directory that is written, and replaces what is there."""
 
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,10 +11,10 @@ from hybridlog_storage.errors import UsageError
 
 
 def check_room(path: Path, *, form: str, force: bool) -> None:
-    """Refuse to overwrite without --force, and what we did not write even with it.
+    """Refuse to overwrite without --force, and foreign directories even with it.
 
     Raises:
-        UsageError: something is there that stays.
+        UsageError: The path cannot be written.
     """
     if not os.path.lexists(path) or _is_device(path):
         return
@@ -36,17 +34,20 @@ def check_room(path: Path, *, form: str, force: bool) -> None:
 
 @contextmanager
 def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
-    """Make room for a new output; what was there comes back when the block fails.
+    """Move a directory aside while a new one is written; it comes back when the block fails.
 
-    Files are replaced by their writers in one step; only a directory has to step aside.
+    Files are replaced by their writers in one step.
 
     Raises:
-        UsageError: something is there that stays.
+        UsageError: The path cannot be written.
     """
     check_room(path, form=form, force=force)
     if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
         yield
         return
+    import secrets
+    import shutil
+
     aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
     try:
         path.rename(aside)

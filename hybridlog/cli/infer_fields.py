@@ -1,4 +1,4 @@
-"""Fields of messages that no definition fixes: those that messages have."""
+"""Infers the fields of a topic without a definition from its first messages."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
 
 SAMPLE = 100
-"""Messages that are looked at."""
-_MOST_FIELDS = 1000
-_DEEPEST = 50
+"""Messages that are read."""
+_MAX_FIELDS = 1000
+_MAX_DEPTH = 50
 _WORDS = ((bool, "bool"), (int, "integer"), (float, "number"), (str, "string"))
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-def observed_fields(messages: Iterable[Message]) -> list[dict[str, object]]:
+def infer_fields(messages: Iterable[Message]) -> list[dict[str, object]]:
     """Paths and types of the fields that the first messages have, in their order.
 
     Args:
-        messages: Messages in JSON; what cannot be read of them is passed over.
+        messages: Messages in JSON; those that cannot be read are skipped.
 
     Returns:
         `path` as a predicate takes it, `type` (several joined by `|`), and whether a
@@ -45,14 +45,14 @@ def observed_fields(messages: Iterable[Message]) -> list[dict[str, object]]:
 def _visit(
     value: object, path: str, found: dict[str, tuple[set[str], bool]], *, within_array: bool
 ) -> None:
-    if path.count(".") >= _DEEPEST:
+    if path.count(".") >= _MAX_DEPTH:
         return
     if isinstance(value, dict):
         for name, item in value.items():
             plain = _PLAIN.fullmatch(name) is not None
             part = name if plain else f"`{name}`"
             below = f"{path}.{part}" if path else part
-            if below not in found and len(found) >= _MOST_FIELDS:
+            if below not in found and len(found) >= _MAX_FIELDS:
                 return
             kinds, array = found.get(below, (set(), within_array))
             kinds.add(_kind(item))
@@ -65,7 +65,7 @@ def _visit(
 
 
 def _spelled(kinds: set[str]) -> str:
-    # In JSON 1 is a number, too, that happened to have no fraction.
+    # In JSON, 1 is also a number, without a fraction.
     return "|".join(sorted(kinds - {"integer"} if "number" in kinds else kinds))
 
 

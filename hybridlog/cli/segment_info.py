@@ -1,4 +1,4 @@
-"""`hybridlog info SEGMENT`: what a segment file says of itself."""
+"""`hybridlog info SEGMENT`: prints the summary of a segment file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     """Print the summary of a sealed segment.
 
     Raises:
-        StoreError: it is being written, or is no segment of ours.
+        StoreError: It is being written, or is no segment of a store.
     """
     from hybridlog_storage.segment_reader import SegmentReader
 
@@ -20,7 +20,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     if path.name.endswith(".open"):
         raise StoreError(
             f"{path} is being written, or was left by a crash. Any command on its store, such as "
-            "`hybridlog ls --store DIR`, seals what a crash has left."
+            "`hybridlog ls --store DIR`, seals segments that a crash left."
         )
     if not path.is_file():
         raise StoreError(f"{path} is no file; a segment is a file that ends in .mcap.")
@@ -79,7 +79,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
 
 
 def _check_magic(path: Path) -> None:
-    """Tell a log from a damaged segment."""
+    """Tell another file from a damaged segment."""
     from hybridlog_storage.mcap_scan import MAGIC
 
     try:
@@ -90,5 +90,5 @@ def _check_magic(path: Path) -> None:
     if begins != MAGIC:
         raise StoreError(
             f"{path} is no segment of a hybridlog store. If it is a log, `hybridlog record {path}` "
-            "takes it into one."
+            "records it."
         )

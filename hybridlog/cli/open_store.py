@@ -1,4 +1,4 @@
-"""Opening the store for a command, with a word about what had to be mended."""
+"""Opens the store for a command and reports the repairs that this took."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def opened(
+def opened_store(
     path: Path | None,
     mongo: str | None,
     *,
@@ -25,14 +25,14 @@ def opened(
     needs_database: bool = False,
     quiet: bool = False,
 ) -> Iterator[Store]:
-    """A store.
+    """The open store.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
         create: Make it if there is none.
         shared: If it is made: for the group of its directory.
-        needs_database: Fail when MongoDB is away.
+        needs_database: Fail when MongoDB is unavailable.
         quiet: No progress while the index is brought up to date.
     """
     from hybridlog.store import open_store
@@ -50,24 +50,24 @@ def opened(
     finally:
         bar.close()
     with store:
-        _tell(store)
+        _print_repairs(store)
         yield store
 
 
-def _tell(store: Store) -> None:
+def _print_repairs(store: Store) -> None:
     repairs = store.repairs
     for recording, segments in repairs.recovered.items():
-        _tell_recovered(recording, segments)
+        _print_recovered(recording, segments)
     for recording in repairs.journals:
         note(
-            f"Recording {recording} has lost its journal. It was written again, but nobody can "
-            "say whether a segment is missing, too."
+            f"Recording {recording} has lost its journal. It was written again, but a missing "
+            "segment would go unnoticed: compare the recording with a copy if you have one."
         )
     for recording in repairs.adopted:
         note(f"Recording {recording} came from another store; it belongs to this one now.")
     for copy, original in repairs.copies.items():
         note(
-            f"{copy} is a copy of recording {original}, which answers. Remove one of them: "
+            f"{copy} is a copy of recording {original}, which is used. Remove one of them: "
             f"`hybridlog rm {copy}`."
         )
     for recording, problem in repairs.unreadable.items():
@@ -79,11 +79,11 @@ def _tell(store: Store) -> None:
         )
     elif not store.directory.is_writable:
         note(f"The store {store.directory.path} is read-only; its segments answer.")
-    tell_index(store)
+    print_index_repairs(store)
 
 
-def tell_index(store: Store) -> None:
-    """Say what the connection to the index has mended, or why there is none."""
+def print_index_repairs(store: Store) -> None:
+    """Report the repairs of the index, or why there is no connection to it."""
     repairs = store.repairs
     for recording, chunks in repairs.indexed.items():
         if chunks and recording not in repairs.recovered:
@@ -97,7 +97,7 @@ def tell_index(store: Store) -> None:
         )
 
 
-def _tell_recovered(recording: str, segments: list[Recovered]) -> None:
+def _print_recovered(recording: str, segments: list[Recovered]) -> None:
     kept = sum(s.messages for s in segments)
     if not any(s.path for s in segments):
         note(f"Recording {recording} was cut short by a crash before anything was stored.")

@@ -9,7 +9,7 @@ from pathlib import Path
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.cli.look import _channel_row
+from hybridlog.cli.info import _channel_row
 from hybridlog.cli.output import parse_size, quoted
 from hybridlog_storage.catalog import ChannelEntry
 from hybridlog_storage.messages import REDUCED, Channel, Schema

@@ -1,4 +1,4 @@
-"""How recording a robot went: tables, remarks, and the exit code."""
+"""The summary of a live recording: tables, remarks, and the exit code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
 from hybridlog.cli import output
 from hybridlog.cli.coverage import line_of
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource
     from hybridlog.recorder import RecordReport
 
-_MOST_ROWS = 10  # of the ledger that are told at the end; `losses` has all
+_MAX_ROWS = 10  # of the ledger; `losses` prints all
 
 
-class Closing:
-    """What there is to say when everything is stored.
+class LiveSummary:
+    """The summary of a recorder that has stopped.
 
     Args:
-        reports: How each recording went.
+        reports: Results of its recordings.
         recorder: It has been stopped.
-        sources: What was recorded.
-        options: What was asked for.
+        sources: Its sources.
+        options: Its options.
     """
 
     def __init__(
@@ -52,8 +52,8 @@ class Closing:
         self._unreached = [source.address for source in sources if not source.was_reached]
         self._is_all_unreached = len(self._unreached) == len(sources)
 
-    def tell(self, *, as_json: bool, quiet: bool) -> None:
-        """Print it; leaves with the code of what went wrong."""
+    def print_and_exit(self, *, as_json: bool, quiet: bool) -> None:
+        """Print it; exits with the code of the worst problem, if there is one."""
         recorder, state = self._recorder, self._state
         if as_json:
             summary = _summary(self._reports, state, recorder.reason)
@@ -67,7 +67,7 @@ class Closing:
             output.note(f"hybridlog: {line}")
         code = self._exit_code()
         if code:
-            raise typer.Exit(code)
+            raise click.exceptions.Exit(code)
 
     def _print(self) -> None:
         reports, state = self._reports, self._state
@@ -84,7 +84,7 @@ class Closing:
     def _remarks(self) -> Iterator[str]:
         silent = self._recorder.silent()
         for topic in silent:
-            yield f"{topic}: has a publisher, and never said anything"
+            yield f"{topic}: has a publisher that sent nothing"
         topics = {*silent, *(topic.topic for topic in self._state.topics)}
         matcher = self._options.matcher
         unused = [] if matcher is None else matcher.unused()
@@ -99,7 +99,7 @@ class Closing:
             yield from _idle(option, rules, topics)
 
     def _errors(self, *, is_reason_shown: bool) -> Iterator[str]:
-        """What a script that wants nothing but errors must hear, too."""
+        """Lines that --quiet does not leave out."""
         if self._recorder.stopped_for_disk and not is_reason_shown:
             yield self._recorder.reason
         for address in self._unreached:
@@ -110,10 +110,10 @@ class Closing:
             for row in report.entry.end.get("losses", [])
             if row["cause"] == Cause.UNREADABLE
         ]
-        for row in rows[:_MOST_ROWS]:
+        for row in rows[:_MAX_ROWS]:
             yield line_of(row)
-        if len(rows) > _MOST_ROWS:
-            more = output.counted(len(rows) - _MOST_ROWS, "more place")
+        if len(rows) > _MAX_ROWS:
+            more = output.counted(len(rows) - _MAX_ROWS, "more place")
             yield f"and {more} that could not be read; `hybridlog losses` lists them"
         for report in self._reports:
             if report.failure is not None:
@@ -134,7 +134,7 @@ class Closing:
 
 
 def _idle(option: str, rules: Sequence[Rule], topics: set[str]) -> Iterator[str]:
-    """Rules that were for no topic."""
+    """Lines about rules that no topic fits."""
     for rule in rules:
         if not any(map(rule.fits, topics)):
             yield f"no topic fits {output.quoted(rule.pattern)} of {option}"
@@ -174,7 +174,7 @@ def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str)
         "recordings": recordings,
         "messages_received": state.messages,
         "bytes": state.stored_bytes,
-        # A cause that is there without a number stands for an unknown one.
+        # A cause without a number stands for an unknown number.
         "lost": {cause: count or None for cause, count in state.lost.items()},
         "topics": {
             topic.topic: {"received": topic.messages, "lost": topic.lost} for topic in state.topics

@@ -1,0 +1,65 @@
+"""Notes on standard error about an answer: its cost and what it lacks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hybridlog.cli import output
+from hybridlog.cli.coverage import gaps
+
+if TYPE_CHECKING:
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+
+
+def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
+    """Print what an answer cost.
+
+    Args:
+        counters: Of the query.
+        elapsed: Seconds, including the opening of the store.
+        count: The answer was a number, not messages.
+    """
+    taken = f"{output.size(counters.bytes_read)} read from disk"
+    if counters.chunks_read:
+        taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
+    given = counters.messages - counters.reduced
+    found = "" if count else f"{output.counted(given, 'message')}, "
+    output.note(
+        f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
+        f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"
+    )
+
+
+def print_gaps(store: Store, query: Query, between: tuple[str, str] | None) -> None:
+    """Print what an answer may lack, a line a recording.
+
+    Args:
+        store: The store.
+        query: The query that was answered.
+        between: Its time range as typed, by the log clock; None for all times.
+    """
+    recordings = [entry for entry in store.recordings() if entry.id in query.recordings]
+    for line in gaps(recordings, query.topics, between):
+        output.note(line)
+
+
+def print_unreadable(missing: int) -> None:
+    """Print how many messages are missing because they do not fit their definition."""
+    if missing > 0:
+        are = "is" if missing == 1 else "are"
+        output.note(
+            f"{output.unfit(missing)} and {are} not in this answer; --format raw, mcap or bag "
+            "gives the payloads."
+        )
+
+
+def print_reduced(reduced: int) -> None:
+    """Print how many messages have no payload because the recorder dropped it."""
+    if reduced:
+        have = "has" if reduced == 1 else "have"
+        output.note(
+            f"{output.counted(reduced, 'message')} {have} no payload any more, given up under "
+            "pressure: not in this answer; --where and --fields find what was kept of them."
+        )

@@ -1,0 +1,170 @@
+"""Completion of recordings and topics, and the scripts that teach it to a shell.
+
+The names come from the segments: no MongoDB is started.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from hybridlog_storage.errors import HybridlogError, UsageError
+
+if TYPE_CHECKING:
+    import click
+    from click.shell_completion import ShellComplete
+
+    from hybridlog_storage.directory import StoreDirectory
+
+VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
+"""Environment variable in which a shell asks for completions."""
+_SCRIPTS: Final = {
+    "bash": ".local/share/hybridlog/completion.bash",
+    "zsh": ".zfunc/_hybridlog",
+    "fish": ".config/fish/completions/hybridlog.fish",
+}
+"""Path of the script of each shell, relative to the home directory."""
+_STARTUP: Final = {
+    "bash": (".bashrc", 'source "$HOME/.local/share/hybridlog/completion.bash"'),
+    "zsh": (".zshrc", 'fpath+="$HOME/.zfunc"; autoload -Uz compinit; compinit'),
+}
+"""Startup file of a shell and the line in it that loads the script; fish needs none."""
+
+
+def complete_recording(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Labels of recordings that begin with what was typed."""
+    with _nothing_on_error():
+        return [i for i in _store(context).labels() if i.startswith(incomplete)]
+    return []
+
+
+def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Ids of running recorders that begin with what was typed."""
+    from hybridlog.live.control_server import running
+
+    with _nothing_on_error():
+        return [name for name in running(_store(context).path) if name.startswith(incomplete)]
+    return []
+
+
+def complete_field(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Topics, with the colon that a field follows."""
+    if ":" in incomplete:
+        return []
+    return [f"{topic}:" for topic in complete_topic(context, param, incomplete)]
+
+
+def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Topics that begin with what was typed; without a slash, short names as well.
+
+    A short name is offered when it stands for one topic only. With `--recording`, the
+    topics of those recordings are offered.
+    """
+    with _nothing_on_error():
+        directory = _store(context)
+        given = context.params.get("recording") or ()
+        wanted = (given,) if isinstance(given, str) else tuple(given)
+        labels = directory.labels()
+        # A recording may also be given by its name, which is not looked up here.
+        topics = _topics(directory, [i for i in labels if i.startswith(wanted)] or labels)
+        found = {topic for topic in topics if topic.startswith(incomplete)}
+        if incomplete and not incomplete.startswith("/"):
+            found.update(n for n in _short_names(topics) if n.startswith(incomplete))
+        return sorted(found)
+    return []
+
+
+def _store(context: click.Context) -> StoreDirectory:
+    from hybridlog.store import store_path
+    from hybridlog_storage.directory import StoreDirectory
+
+    value: Path | None = context.params.get("store")
+    # The shell has not expanded the tilde of the line that is being completed.
+    return StoreDirectory(store_path(None if value is None else os.path.expanduser(value)))  # noqa: PTH111
+
+
+def _topics(directory: StoreDirectory, labels: Sequence[str]) -> set[str]:
+    from hybridlog.entries import read_summary
+
+    return {
+        channel.topic
+        for label in labels
+        for number, path in directory.segments(label)
+        for channel in read_summary(path, number).channels.values()
+    }
+
+
+def _short_names(topics: set[str]) -> Iterator[str]:
+    """Ends of topics, in whole parts, that no two topics share."""
+    owners: dict[str, int] = {}
+    for topic in topics:
+        parts = topic.strip("/").split("/")
+        for start in range(len(parts)):
+            name = "/".join(parts[start:])
+            owners[name] = owners.get(name, 0) + 1
+    yield from (name for name, count in owners.items() if count == 1)
+
+
+@contextmanager
+def _nothing_on_error() -> Iterator[None]:
+    """Swallow errors: a shell that completes a line cannot show them."""
+    try:
+        yield
+    except (HybridlogError, OSError):
+        return
+
+
+def show_completion(context: click.Context) -> str:
+    """The completion script of the user's shell."""
+    return _script(context, _shell()).source()
+
+
+def install_completion(context: click.Context) -> str:
+    """Write the completion script to where the user's shell loads it.
+
+    Returns:
+        What was done, for people.
+
+    Raises:
+        UsageError: A file cannot be written.
+    """
+    shell = _shell()
+    path = Path.home() / _SCRIPTS[shell]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(_script(context, shell).source(), encoding="utf-8")
+        if shell in _STARTUP:
+            name, line = _STARTUP[shell]
+            _append_once(Path.home() / name, line)
+    except OSError as error:
+        raise UsageError(
+            f"{error.filename} cannot be written: {error.strerror}. "
+            "`hybridlog --show-completion` prints the script."
+        ) from error
+    return f"Completion for {shell} is installed in {path}. Open a new terminal to use it."
+
+
+def _append_once(path: Path, line: str) -> None:
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    if line not in text.splitlines():
+        path.write_text(f"{text.rstrip()}\n{line}\n".lstrip(), encoding="utf-8")
+
+
+def _shell() -> str:
+    shell = Path(os.environ.get("SHELL", "")).name
+    if shell not in _SCRIPTS:
+        raise UsageError(
+            f"Completion works in {', '.join(_SCRIPTS)}: set the variable SHELL to one of them."
+        )
+    return shell
+
+
+def _script(context: click.Context, shell: str) -> ShellComplete:
+    from click.shell_completion import get_completion_class
+
+    kind = get_completion_class(shell)
+    assert kind is not None
+    return kind(context.command, {}, "hybridlog", VARIABLE)

@@ -1,0 +1,196 @@
+"""`hybridlog info`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from hybridlog.cli import coverage, options, output, recording_summary
+from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.open_store import opened_store
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+
+
+@click.command()
+@click.argument(
+    "what",
+    required=False,
+    metavar="[RECORDING|SEGMENT]",
+    shell_complete=complete_recording,
+    help="A recording or a segment file; without, every recording.",
+)
+@options.store
+@options.mongo
+@options.as_json
+def command(*, what: str | None, store: Path | None, mongo: str | None, as_json: bool) -> None:
+    """Show topics, types, rates, sizes, times, clock skew, losses."""
+    if what is not None and _is_segment(what):
+        from hybridlog.cli.segment_info import show_segment
+
+        show_segment(Path(what), as_json=as_json)
+        return
+    with opened_store(store, mongo, quiet=as_json) as opened:
+        chosen = opened.select([what]) if what is not None else opened.recordings()
+        index = opened.index_place
+    if as_json:
+        full = [_as_dict(entry) for entry in chosen]
+        output.print_json(full[0] if what is not None else full)
+        return
+    if not chosen:
+        output.note("The store is empty: `hybridlog record FILE` fills it.")
+    for number, entry in enumerate(chosen):
+        if number:
+            output.say()
+        _print_recording(entry, index)
+
+
+def _is_segment(what: str) -> bool:
+    """True for the path of a file; names and ids of recordings have no slash."""
+    looks = "/" in what or what.endswith((".mcap", ".mcap.open"))
+    return looks and Path(what).exists()
+
+
+def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
+    return {
+        **recording_summary.as_dict(entry),
+        "chunks": entry.chunks,
+        "coverage": coverage.describe(entry, coverage.losses_of(entry)),
+        "losses": coverage.losses_of(entry),
+        "notes": entry.notes,
+        "marks": entry.marks,
+        "channels": [
+            {
+                "topic": c.topic,
+                "type": c.type,
+                "message_encoding": c.message_encoding,
+                "messages": c.stats.messages,
+                "payload_bytes": c.stats.payload_bytes,
+                "rate_hz": _rate(c),
+                "first_ns": c.stats.first,
+                "last_ns": c.stats.last,
+                "skew_ns": _skew(c),
+                "unreadable": c.stats.unreadable if entry.is_decoded else None,
+                "not_indexed": c.reason,
+                "metadata": c.metadata,
+            }
+            for c in entry.channels
+        ],
+    }
+
+
+def _rate(channel: ChannelEntry) -> float | None:
+    """Mean rate in Hz: intervals over the time between first and last message."""
+    stats = channel.stats
+    if stats.messages < 2 or stats.first is None or stats.last is None or stats.last <= stats.first:
+        return None
+    return (stats.messages - 1) * 1e9 / (stats.last - stats.first)
+
+
+def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
+    """Log time minus header stamp, ns."""
+    stats = channel.stats
+    if not stats.stamped:
+        return None
+    return {
+        "mean": stats.skew_sum / stats.stamped,
+        "min": stats.skew_min,
+        "max": stats.skew_max,
+    }
+
+
+def _print_recording(entry: RecordingEntry, index: str | None) -> None:
+    from hybridlog.query.times import format_duration, format_time
+
+    span = entry.span
+    losses = coverage.losses_of(entry)
+    source = entry.source
+    has_content = recording_summary.has_content(entry)
+    status = recording_summary.status(entry)
+    if entry.status == "open":
+        status += f"; `hybridlog top {entry.label}` shows it"
+    held = (
+        f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
+        f"{output.counted(entry.chunks, 'chunk')}"
+    )
+    rows = [
+        ("id", entry.id),
+        ("name", entry.name),
+        ("status", status),
+        ("source", _source(source)),
+        ("start", format_time(span[0]) if span else "-"),
+        ("last", format_time(span[1]) if span else "-"),
+        ("duration", format_duration(span[1] - span[0]) if span else "-"),
+        ("messages", str(entry.messages) if has_content else "-"),
+        ("stored", held if has_content else "-"),
+        ("coverage", coverage.describe(entry, losses)),
+        *(("", coverage.line_of(loss)) for loss in losses),
+        *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
+        *(("note", note["text"]) for note in entry.notes),
+        ("index", index or "MongoDB is unavailable"),
+    ]
+    output.print_table([("recording", "left"), (entry.label, "left")], rows)
+    if not entry.channels:
+        return
+    output.say()
+    narrow = output.is_narrow()
+    columns: list[output.Column] = [
+        ("topic", "left"),
+        ("type", "left"),
+        ("messages", "right"),
+        ("Hz", "right"),
+        ("log - header", "right"),
+        ("note", "left"),
+    ]
+    if not narrow:
+        columns.insert(4, ("payload", "right"))
+    output.print_table(
+        columns,
+        [
+            _channel_row(c, is_decoded=entry.is_decoded, narrow=narrow)
+            for c in sorted(entry.channels, key=lambda c: c.topic)
+        ],
+    )
+
+
+def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> list[str]:
+    from hybridlog.latching import depth_of
+    from hybridlog_storage.messages import REDUCED, Channel
+
+    stats = channel.stats
+    rate = _rate(channel)
+    notes = []
+    if channel.reason is not None:
+        notes.append(f"not indexed: {channel.reason}")
+    if stats.unreadable:
+        notes.append(f"{stats.unreadable} unreadable")
+    if channel.message_encoding == REDUCED:
+        notes.append("fields only")
+    if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
+        notes.append("latched")
+    skew = "-" if is_decoded else "?"
+    if stats.stamped:
+        skew = output.short_duration(round(stats.skew_sum / stats.stamped))
+    kind = channel.type or channel.message_encoding
+    cells = [
+        channel.topic,
+        kind.rpartition("/")[2] if narrow else kind,
+        str(stats.messages),
+        f"{rate:.2f}" if rate is not None else "-",
+        skew,
+        "; ".join(notes),
+    ]
+    if not narrow:
+        cells.insert(4, output.size(stats.payload_bytes))
+    return cells
+
+
+def _source(source: Mapping[str, Any]) -> str:
+    """The source of a recording; a robot has no size, and a program has no address."""
+    size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
+    kind = f"{source['kind']}{size}"
+    return f"{source['path']} ({kind})" if source["path"] else kind

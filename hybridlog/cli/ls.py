@@ -1,0 +1,66 @@
+"""`hybridlog ls`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import options, output, recording_summary
+from hybridlog.cli.open_store import opened_store
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+@click.command()
+@options.store
+@options.mongo
+@options.as_json
+def command(*, store: Path | None, mongo: str | None, as_json: bool) -> None:
+    """List the recordings."""
+    with opened_store(store, mongo, quiet=as_json) as opened:
+        recordings = opened.recordings()
+    if as_json:
+        output.print_json([recording_summary.as_dict(entry) for entry in recordings])
+    elif recordings:
+        _print(recordings)
+    else:
+        output.note("The store is empty: `hybridlog record FILE` fills it.")
+
+
+def _print(recordings: list[RecordingEntry]) -> None:
+    narrow = output.is_narrow()
+    columns: list[output.Column] = [
+        ("recording", "left"),
+        ("start", "whole"),
+        ("duration", "right"),
+        ("messages", "right"),
+        ("note", "left"),
+    ]
+    if not narrow:
+        columns.insert(3, ("topics", "right"))
+        columns.insert(5, ("stored", "right"))
+    output.print_table(columns, [_row(entry, narrow=narrow) for entry in recordings])
+
+
+def _row(entry: RecordingEntry, *, narrow: bool) -> list[str]:
+    span = entry.span
+    notes = [] if entry.status == "complete" else [recording_summary.status(entry)]
+    if entry.name != entry.label:
+        notes.append(entry.name)
+    notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
+    known = recording_summary.has_content(entry)
+    start = output.short_time(span[0], minutes=narrow) if span else "-"
+    cells = [
+        entry.label,
+        start,
+        output.short_duration(span[1] - span[0]) if span else "-",
+        str(entry.messages) if known else "-",
+        ", ".join(notes),
+    ]
+    if not narrow:
+        cells.insert(3, str(len({c.topic for c in entry.channels})) if known else "-")
+        cells.insert(5, output.size(entry.stored_bytes) if known else "-")
+    return cells

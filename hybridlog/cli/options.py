@@ -1,0 +1,119 @@
+"""Parameters that several commands share, and types of parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import click
+
+from hybridlog.cli.completion import complete_recording, complete_running, complete_topic
+from hybridlog_storage.errors import UsageError
+
+PATH: Final = click.Path(readable=False, path_type=Path)
+"""A path that click does not check: the library's errors name a cure and have exit codes."""
+
+store = click.option(
+    "--store",
+    type=PATH,
+    envvar="HYBRIDLOG_STORE",
+    show_envvar=True,
+    metavar="DIR",
+    help="Directory of the store.",
+)
+mongo = click.option(
+    "--mongo",
+    envvar="HYBRIDLOG_MONGO_URI",
+    show_envvar=True,
+    metavar="URI",
+    help="URI of the MongoDB that holds the index, or 'embedded' for our own; without, the one "
+    "that the store was made with.",
+)
+as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for scripts.")
+quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
+force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")
+count = click.option("--count", is_flag=True, help="Only print how many.")
+recordings = click.option(
+    "--recording",
+    "-r",
+    multiple=True,
+    metavar="RECORDING",
+    shell_complete=complete_recording,
+    help="Only this recording (id, name, or the beginning of an id). Repeatable.",
+)
+running = click.option(
+    "--recording",
+    "-r",
+    multiple=True,
+    metavar="RECORDING",
+    shell_complete=complete_running,
+    help="Only this recorder (id or name of its recording, or the beginning of the id). "
+    "Repeatable.",
+)
+only_recordings = click.argument(
+    "recording",
+    nargs=-1,
+    metavar="[RECORDING]...",
+    shell_complete=complete_recording,
+    help="Only these recordings; without, all.",
+)
+one_recording = click.argument(
+    "recording",
+    metavar="RECORDING",
+    shell_complete=complete_recording,
+    help="A recording: label, name, or the beginning of its id.",
+)
+one_topic = click.option(
+    "--topic",
+    "-t",
+    required=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Full name, or an unambiguous short one (scan).",
+)
+only_topics = click.option(
+    "--topic",
+    "-t",
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Only these topics. Repeatable.",
+)
+between = click.option(
+    "--between",
+    nargs=2,
+    metavar="T0 T1",
+    help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
+    "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
+)
+where = click.option(
+    "--where",
+    multiple=True,
+    metavar="PREDICATE",
+    help="Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'. "
+    "Repeatable.",
+)
+at_least = click.option(
+    "--at-least",
+    metavar="DURATION",
+    help="Only those of at least this length, such as 60s.",
+)
+tags = click.option(
+    "--tag", multiple=True, metavar="K=V", help="Store KEY=VALUE with it. Repeatable."
+)
+
+
+def parse_tags(pairs: Iterable[str]) -> dict[str, str]:
+    """Tags from KEY=VALUE pairs.
+
+    Raises:
+        UsageError: A pair has no key or no equals sign.
+    """
+    tags = {}
+    for pair in pairs:
+        key, sign, value = pair.partition("=")
+        if not sign or not key:
+            raise UsageError(f"A tag is written KEY=VALUE, not {pair!r}.")
+        tags[key] = value
+    return tags

@@ -1,0 +1,68 @@
+"""`hybridlog reindex`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.signals import if_stopped
+
+
+@click.command()
+@options.recordings
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def command(
+    *,
+    recording: tuple[str, ...],
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Rebuild the index from the segments, recording by recording.
+
+    Queries of the other recordings work meanwhile. After an interruption, the next command
+    that needs the index finishes the recording at which it stopped.
+    """
+    started = time.monotonic()
+    with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
+        chosen = opened.select(recording) if recording else opened.recordings()
+        total = sum(entry.stored_bytes for entry in chosen)
+        with (
+            if_stopped(
+                "Finished recordings stay indexed; the next command that needs the index "
+                "finishes the recording at which it stopped."
+            ),
+            progress_bar("reindex", total, quiet=quiet) as bar,
+        ):
+            done = opened.reindex(recording or None, Stages(bar))
+    left = [entry.label for entry in chosen if entry.id not in {r.id for r in done}]
+    for label in left:
+        output.note(f"Recording {label} is being written, and was left as it is.")
+    for entry in done:
+        if entry.status == "damaged":
+            output.note(f"{entry.label} is damaged: `hybridlog losses {entry.label}` shows where.")
+    messages = sum(r.messages for r in done)
+    elapsed = time.monotonic() - started
+    if as_json:
+        output.print_json(
+            {
+                "recordings": len(done),
+                "messages": messages,
+                "left": left,
+                "seconds": round(elapsed, 3),
+            }
+        )
+    elif not quiet:
+        output.say(
+            f"{output.counted(len(done), 'recording')}, "
+            f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
+        )
