@@ -67,6 +67,7 @@ def bring_up_to_date(
     state = IndexState(database)
     known = state.of()
     has_changed = False
+    entries = list(entries)
     for entry in entries:
         indexed = known.get(entry.key)
         is_whole = indexed is not None and indexed.is_whole(entry)
@@ -90,7 +91,7 @@ def bring_up_to_date(
             else:
                 if chunks is not None:
                     report.indexed[entry.label] = chunks
-    _remove_strangers(directory, state, known, report)
+    _remove_strangers(directory, state, known, entries, report)
     return has_changed or bool(report.indexed)
 
 
@@ -139,9 +140,10 @@ def _remove_strangers(
     directory: StoreDirectory,
     state: IndexState,
     known: Mapping[str, Indexed],
+    entries: Iterable[RecordingEntry],
     report: RepairReport,
 ) -> None:
-    """Remove recordings from the index that have no directory any more.
+    """Remove recordings from index and tables that have no directory any more.
 
     The directories are listed after the index was: one that has begun meanwhile is in them.
     Where one cannot be read, nobody can say what is gone, and nothing is removed.
@@ -154,7 +156,7 @@ def _remove_strangers(
             forget(state, key)
             report.removed.append(indexed.id or key)
     if directory.is_writable:
-        tables.remove_strangers(directory, present)
+        tables.sweep(directory, entries, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
