@@ -17,12 +17,12 @@ from typing import Any
 import bson
 import numpy as np
 import pytest
+from hybridlog.columns.gatherer import FieldGatherer
 from rosbags.rosbag1 import Reader
 
 import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
-from hybridlog.columns.gatherer import FieldGatherer
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.schema.codec import codec_for
 from hybridlog_storage.chunk import StoredChunk, pack

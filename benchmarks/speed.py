@@ -22,6 +22,8 @@ import numpy as np
 import pandas as pd
 import pymongo
 import pytest
+from bson import decode_all
+from bson.raw_bson import DEFAULT_RAW_BSON_OPTIONS as RAW_BSON
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -31,7 +33,6 @@ from benchmarks.backends.conversion import message_plan
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags
 from benchmarks.side import run_side
-from hybridlog_storage.bson_columns import split
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.database import Database
 from hybridlog_storage.mongod import EmbeddedMongod
@@ -139,7 +140,7 @@ def bench_small_raw_documents(small: tuple[Path, int], tmp_path: Path, benchmark
     with hl.open(tmp_path / "store") as store:
         database = store.database_for("the benchmark")
         blocks = [
-            (name, raw, np.diff([*split(raw).tolist(), len(raw)]).astype(np.int64))
+            (name, raw, np.array([len(each.raw) for each in decode_all(raw, RAW_BSON)]))
             for name in database.list_collections()
             if not name.startswith("hybridlog.")
             for raw in (bytes(part) for part in database.find_raw(name))

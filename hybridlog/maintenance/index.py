@@ -65,6 +65,7 @@ def bring_up_to_date(
     state = IndexState(database)
     known = state.of()
     has_changed = False
+    entries = list(entries)
     for entry in entries:
         indexed = known.get(entry.key)
         is_whole = indexed is not None and indexed.is_whole(entry)
@@ -88,7 +89,7 @@ def bring_up_to_date(
             else:
                 if chunks is not None:
                     report.indexed[entry.label] = chunks
-    _remove_strangers(directory, state, known, report)
+    _remove_strangers(directory, state, known, entries, report)
     return has_changed or bool(report.indexed)
 
 
@@ -137,9 +138,10 @@ def _remove_strangers(
     directory: StoreDirectory,
     state: IndexState,
     known: Mapping[str, Indexed],
+    entries: Iterable[RecordingEntry],
     report: RepairReport,
 ) -> None:
-    """Remove recordings without a directory from the index.
+    """Remove recordings without a directory from the index and the tables.
 
     The directories are listed after the index, so they include recordings that have begun
     meanwhile. If one cannot be read, nothing is removed.
@@ -152,7 +154,7 @@ def _remove_strangers(
             forget(state, key)
             report.removed.append(indexed.id or key)
     if directory.is_writable:
-        tables.remove_strangers(directory, present)
+        tables.sweep(directory, entries, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:

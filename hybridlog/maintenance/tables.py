@@ -171,14 +171,23 @@ def remove(directory: StoreDirectory, recording: str) -> None:
             files.remove_tree(parts, depth=files.IN_FOLDER)
 
 
-def remove_strangers(directory: StoreDirectory, present: Iterable[str]) -> None:
-    """Remove tables of recordings that are not in the store any more.
+def sweep(
+    directory: StoreDirectory, entries: Iterable[RecordingEntry], present: Collection[str]
+) -> None:
+    """Remove tables of recordings that are gone, and what a crash has left unfinished.
 
     Args:
         directory: The store.
-        present: Keys of all recordings.
+        entries: All recordings that are known.
+        present: Keys of all that have a directory.
     """
-    keys = set(present)
+    for entry in entries:
+        parts = parts_folder(directory.path, entry.id)
+        with suppress(OSError, StoreError):
+            files.status(parts, depth=files.IN_FOLDER)  # most have none
+            with directory.writing(entry.label) as mine:
+                if mine:
+                    files.remove_tree(parts, depth=files.IN_FOLDER)
     for top, beginning in ((TABLES, "recording=r"), (PARTS, "r")):
         try:
             names = files.names(directory.path / top, depth=files.IN_STORE)
@@ -186,6 +195,6 @@ def remove_strangers(directory: StoreDirectory, present: Iterable[str]) -> None:
             continue
         for name in names:
             recording = name.removeprefix(beginning)
-            if recording != name and recording[:16] not in keys:
+            if recording != name and recording[:16] not in present:
                 with suppress(OSError):
                     remove(directory, recording)

@@ -1,0 +1,259 @@
+"""Tables follow their recording: through crashes, marks, new names, copies and its end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import tables as making
+from hybridlog.tables.layout import PARTS, TABLES, recording_folder
+from hybridlog.tables.reader import Tables
+from hybridlog_storage import files
+from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.tables.logs import BASE, channel, varied, write_log
+from tests.tables.test_writer import compare, topics_of
+
+FEW = [(BASE + n, "/a" if n % 3 else "/b", varied(n)) for n in range(90)]
+
+
+@pytest.fixture
+def few(store: hl.Store, tmp_path: Path) -> hl.Store:
+    """A recording of a few messages."""
+    store.record(write_log(tmp_path / "few.mcap", FEW), name="few")
+    return store
+
+
+def folders(store: hl.Store) -> set[str]:
+    return {p.name for p in (store.directory.path / TABLES).glob("*")}
+
+
+def contents(store: hl.Store) -> dict[str, bytes]:
+    root = store.directory.path / TABLES
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*.parquet")}
+
+
+def unfinished(store: hl.Store) -> list[Path]:
+    return list((store.directory.path / PARTS).glob("*"))
+
+
+def test_a_removed_recording_has_no_tables(few: hl.Store) -> None:
+    assert folders(few)
+    few.remove("few")
+    assert not folders(few)
+    assert not unfinished(few)
+
+
+def test_a_recording_that_is_taken_back_has_none(store: hl.Store) -> None:
+    settings = SegmentSettings(chunk_size=1024, segment_size=8192)
+    recording = store.start("live", settings=settings, flush_interval_s=0.01)
+    for n in range(500):
+        recording.write(channel("/a"), varied(n))
+    recording.abort()
+    assert not folders(store)
+    assert not unfinished(store)
+
+
+def test_tables_keep_their_place_when_a_recording_is_renamed(few: hl.Store) -> None:
+    before = contents(few)
+    few.rename("few", "another")
+    few.tag("another", place="yard")
+    assert contents(few) == before
+    assert compare(few, "another") == 90
+
+
+def test_tables_of_an_imported_recording(few: hl.Store, tmp_path: Path, server: str) -> None:
+    mongo = server.replace("/?", "/imported?")
+    with hl.open(tmp_path / "other", create=True, mongo=mongo) as other:
+        other.import_from(few.directory.path)
+        (entry,) = other.recordings()
+        assert all(Tables(other.directory.path).of(entry, t) is None for t in topics_of(entry))
+        other.connect()
+        assert compare(other) == 90
+        assert contents(other) == contents(few)
+
+
+def test_a_mark_changes_no_other_table(few: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(few)
+    few.mark("few", BASE + 5, "here")
+    few.connect()
+    after = contents(few)
+    assert before.items() <= after.items()
+    assert len(after) == len(before) + 1
+    few.mark("few", BASE + 6, "and here")
+    few.connect()
+    assert before.items() <= contents(few).items()
+    assert few.verify().findings == []
+    (entry,) = few.recordings()
+    tables = Tables(few.directory.path)
+    assert all(tables.of(entry, topic) for topic in topics_of(entry))
+
+
+def test_what_is_left_of_recordings_that_are_gone(few: hl.Store) -> None:
+    root = few.directory.path
+    shutil.copytree(next((root / TABLES).glob("*")), root / TABLES / ("recording=r" + "a" * 32))
+    (root / PARTS / ("r" + "b" * 32)).mkdir(parents=True)
+    few.refresh()
+    few.connect()
+    assert len(folders(few)) == 1
+    assert not unfinished(few)
+    assert compare(few) == 90
+
+
+def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
+    before = contents(few)
+    few.reindex()
+    assert contents(few) == before
+    shutil.rmtree(few.directory.path / TABLES)
+    few.reindex()
+    assert contents(few) == before
+
+
+def test_what_a_crash_has_left_gets_all_its_tables(
+    few: hl.Store, server: str, tmp_path: Path
+) -> None:
+    before = contents(few)
+    path, database = few.directory.path, few.database_for("This")
+    # As if the recorder had been killed while it wrote.
+    (entry,) = few.recordings()
+    IndexState(database).put(entry, "open", turn=1)
+    shutil.rmtree(path / TABLES)
+    (path / PARTS / f"r{entry.id}").mkdir(parents=True)
+    (path / PARTS / f"r{entry.id}" / "1.parquet").write_bytes(b"PAR1 half")
+    few.disconnect()
+    few.refresh()
+    few.connect()
+    assert contents(few) == before
+    assert not unfinished(few)
+
+
+def test_only_what_is_missing_is_read(few: hl.Store, tmp_path: Path) -> None:
+    said = [(BASE + n, f"/{n % 2}", varied(n)) for n in range(2400)]
+    entry = few.record(write_log(tmp_path / "two.mcap", said), name="two").entry
+    assert making.missing(few.directory, entry) == set()
+    folder = recording_folder(few.directory.path, entry.id)
+    shutil.rmtree(folder / "topic=1")
+    assert making.missing(few.directory, entry) == {"/1"}
+    kept = next(folder.glob("topic=0/*")).stat().st_mtime_ns
+    assert making.make(few.directory, entry)
+    assert next(folder.glob("topic=0/*")).stat().st_mtime_ns == kept
+    assert compare(few) == 2490
+
+
+def test_topics_that_share_a_file_are_missing_together(few: hl.Store) -> None:
+    (entry,) = few.recordings()
+    assert making.together(entry, ["/a"]) == {"/a", "/b"}
+    assert making.together(entry, []) == set()
+
+
+def test_a_store_that_cannot_be_written_makes_none(
+    few: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (entry,) = few.recordings()
+    monkeypatch.setattr(type(few.directory), "is_writable", False)
+    shutil.rmtree(few.directory.path / TABLES)
+    assert not making.make(few.directory, entry)
+    assert not folders(few)
+
+
+def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
+    (entry,) = few.recordings()
+    shutil.rmtree(few.directory.path / TABLES)
+    with few.directory.writing("few"):
+        assert not making.make(few.directory, entry)
+    assert not folders(few)
+
+
+class Killed(files.System):
+    """Ends the process at a step, as `kill -9` does."""
+
+    def __init__(self, step: int) -> None:
+        self.left = step
+
+    def _step(self, folder: int | None = None) -> None:
+        if self.left == 0:
+            os._exit(9)
+        self.left -= 1
+
+    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+        if flags & os.O_CREAT:
+            self._step()
+        return super().open(name, flags, mode, folder=folder)
+
+    def writev(self, fd: int, parts: object) -> int:
+        self._step()
+        return super().writev(fd, parts)  # type: ignore[arg-type]
+
+    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        self._step()
+        super().rename(old, new, folder=folder, new_folder=new_folder)
+
+    def unlink(self, name: str, *, folder: int) -> None:
+        self._step()
+        super().unlink(name, folder=folder)
+
+    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
+        self._step()
+        super().mkdir(name, mode, folder=folder)
+
+    def rmdir(self, name: str, *, folder: int) -> None:
+        self._step()
+        super().rmdir(name, folder=folder)
+
+
+def killed_at(step: int, work: Callable[[], object]) -> bool:
+    """Do something in a process that is killed at a step; whether it came so far."""
+    child = os.fork()
+    if child == 0:
+        files.system = Killed(step)
+        try:
+            work()
+        finally:
+            os._exit(0)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status) == 9
+
+
+@pytest.mark.parametrize("what", ["make", "make again", "remove"])
+def test_killed_at_each_step(few: hl.Store, tmp_path: Path, what: str) -> None:
+    """At every step: what is there is whole, and what is missing is made by the next one."""
+    said = [(BASE + n, "/large", varied(n)) for n in range(1100)]
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 16)
+    entry = few.record(write_log(tmp_path / "l.mcap", said), name="l", settings=settings).entry
+    few.mark("l", BASE, "so that there are small ones, too")
+    few.connect()
+    (entry,) = few.select(["l"])
+    everything = topics_of(entry)
+    whole = contents(few)
+
+    def work() -> object:
+        if what == "remove":
+            return making.remove(few.directory, entry.id)
+        return making.make(few.directory, entry, everything)
+
+    step = 0
+    while True:
+        if what == "make":
+            making.remove(few.directory, entry.id)
+        was_killed = killed_at(step, work)
+        found = contents(few)
+        assert found.items() <= whole.items()
+        tables = Tables(few.directory.path)
+        for topic in everything:
+            table = tables.of(entry, topic)
+            assert table is None or table.rows == entry.messages_of(topic)
+        assert making.make(few.directory, entry)
+        assert contents(few) == whole
+        if not was_killed:
+            break
+        step += 1
+    assert step > 5
+    few.refresh()
+    few.connect()
+    assert not unfinished(few)
+    assert few.verify().findings == []
