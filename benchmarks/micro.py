@@ -24,7 +24,7 @@ import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
 from hybridlog.indexing import ChunkIndexer
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.chunk import StoredChunk, pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor

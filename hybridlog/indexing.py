@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.schema.codec import Codec
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP, header_stamps
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.chunk import StoredChunk

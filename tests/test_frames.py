@@ -438,7 +438,7 @@ def document(n: int, /, **fields: Any) -> bytes:
 def test_real_log_agrees_with_rosbags(topic: str) -> None:
     from rosbags.highlevel import AnyReader
 
-    from hybridlog.schema.codec import codec_for
+    from hybridlog.schema.codecs import codec_for
     from hybridlog_storage.messages import Channel, Schema
 
     with AnyReader([DATA / "real/tilt_laser.bag"]) as reader:

@@ -32,6 +32,7 @@ from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
 from hybridlog.marks import mark_channel, mark_payload
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel
@@ -593,7 +594,7 @@ class Recorder:
             recorded.reduced = reduced_channel(recorded.channel)
         if self._target.write(
             recorded.reduced,
-            reduce(recorded.channel, payload),
+            reduce(codec_for(recorded.channel), payload),
             log_time=received,
             publish_time=sent,
             sequence=number,

@@ -21,7 +21,7 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import numbers_at, to_bool
 from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hybridlog.query.times import TIME_LIMIT, TimeLike
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:

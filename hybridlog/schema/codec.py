@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from hybridlog.schema.column import Records
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -20,9 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
-    from hybridlog_storage.messages import Buffer, Channel, Schema
-
-_ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl")}
+    from hybridlog_storage.messages import Buffer
 
 
 class BodyGroup(NamedTuple):
@@ -260,58 +256,6 @@ class OpaqueCodec:
 
     def _refusal(self) -> DefinitionError:
         return DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
-
-
-def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
-    """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
-
-    Args:
-        channel: The channel; its message encoding and schema determine the codec.
-        array_limit: Arrays of more elements are summarised in the index.
-    """
-    return _codec(channel.message_encoding, channel.schema, array_limit)
-
-
-@lru_cache(maxsize=1024)
-def _codec(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
-    try:
-        return _made(encoding, schema, array_limit)
-    except DefinitionError as error:
-        return OpaqueCodec(str(error))
-
-
-def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
-    if encoding == "json":
-        from hybridlog.schema.json_codec import JsonCodec
-
-        return JsonCodec(array_limit)
-    if encoding == REDUCED:
-        from hybridlog.schema.reduced_codec import ReducedCodec
-
-        return ReducedCodec()
-    return _defined(encoding, schema, array_limit)
-
-
-def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
-    """The codec of messages that need a definition."""
-    if encoding not in {"ros1", "cdr", "protobuf"}:
-        named = f"encoding {encoding!r}" if encoding else "a message without an encoding"
-        return OpaqueCodec(f"{named} is stored and fetched, not indexed")
-    if schema is None or not (schema.encoding or schema.data):
-        named = "" if schema is None or not schema.name else f"{schema.name}: "
-        return OpaqueCodec(f"{named}no definition in the source")
-    if (encoding, schema.encoding) in _ROS:
-        from hybridlog.schema.ros_codec import RosCodec
-
-        return RosCodec(schema, "ros1" if encoding == "ros1" else "cdr", array_limit)
-    if (encoding, schema.encoding) == ("protobuf", "protobuf"):
-        from hybridlog.schema.protobuf_codec import ProtobufCodec
-
-        return ProtobufCodec(schema, array_limit)
-    return OpaqueCodec(
-        f"{schema.name}: encoding {encoding!r} with a definition in {schema.encoding!r} "
-        "is stored and fetched, not indexed"
-    )
 
 
 def error_group(rows: NDArray[np.intp], error: str) -> BodyGroup:

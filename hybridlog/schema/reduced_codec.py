@@ -19,7 +19,7 @@ import bson
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.codec import codec_for, nothing_decoded
+from hybridlog.schema.codec import nothing_decoded
 from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
+    from hybridlog.schema.codec import BodyGroup, Codec, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Buffer
 
@@ -65,16 +65,16 @@ def reduced_channel(channel: Channel) -> Channel:
     )
 
 
-def reduce(channel: Channel, payload: bytes) -> bytes:
+def reduce(codec: Codec, payload: bytes) -> bytes:
     """Reduce a message. An unreadable payload is reduced to size and hash.
 
     Args:
-        channel: Its channel.
+        codec: The codec of its channel.
         payload: The serialized message.
     """
     head = _HEAD.pack(len(payload), hashlib.sha256(payload).digest())
     one = np.zeros(1, np.int64)
-    for group in codec_for(channel).bodies(payload, one, one + len(payload)):
+    for group in codec.bodies(payload, one, one + len(payload)):
         if group.error is None:
             return head + bytes(group.body[0])
     return head

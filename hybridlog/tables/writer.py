@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from hybridlog.indexing import rows_by_channel
-from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.schema.codec import Codec
+from hybridlog.schema.codecs import codec_for
 from hybridlog.tables.layout import (
     IN_TOPIC,
     OWN_FILE_ROWS,

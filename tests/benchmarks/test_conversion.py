@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.backends.conversion import converter_for, iso_text, without_nul
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog.sources.detect import open_source
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data

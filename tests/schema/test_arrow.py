@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from hybridlog.schema.codec import Codec, OpaqueCodec, codec_for
+from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Channel, Schema
@@ -324,7 +325,7 @@ def test_reduced_messages_have_what_the_index_has() -> None:
     )
     payload = struct.pack("<I100fiI1sII", 100, *range(100), 7, 1, b"x", 5, 6)
     codec = codec_for(reduced_channel(channel))
-    decoded = arrow_of(codec, [reduce(channel, payload), b"short"])
+    decoded = arrow_of(codec, [reduce(codec_for(channel), payload), b"short"])
     assert decoded.rows.tolist() == [0]
     assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
     (row,) = decoded.records.to_pylist()

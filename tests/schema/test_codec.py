@@ -23,7 +23,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hybridlog.schema.codec import Codec, OpaqueCodec, codec_for
+from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema

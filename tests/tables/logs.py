@@ -12,7 +12,7 @@ import numpy as np
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
 

@@ -23,7 +23,8 @@ from hybridlog.query.predicate.to_bool import statistic, to_bool, to_truth
 from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.to_mongo import to_mongo
 from hybridlog.query.predicate.tree import Predicate
-from hybridlog.schema.codec import Codec, codec_for
+from hybridlog.schema.codec import Codec
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import Channel, Schema
 from tests.schema.wire_oracle import oracle
 

@@ -1,0 +1,67 @@
+"""Finds the codec of a channel."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import REDUCED
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel, Schema
+
+_ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl")}
+
+
+def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
+    """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
+
+    Args:
+        channel: The channel; its message encoding and schema determine the codec.
+        array_limit: Arrays of more elements are summarised in the index.
+    """
+    return _codec(channel.message_encoding, channel.schema, array_limit)
+
+
+@lru_cache(maxsize=1024)
+def _codec(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+    try:
+        return _made(encoding, schema, array_limit)
+    except DefinitionError as error:
+        return OpaqueCodec(str(error))
+
+
+def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+    if encoding == "json":
+        from hybridlog.schema.json_codec import JsonCodec
+
+        return JsonCodec(array_limit)
+    if encoding == REDUCED:
+        from hybridlog.schema.reduced_codec import ReducedCodec
+
+        return ReducedCodec()
+    return _defined(encoding, schema, array_limit)
+
+
+def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+    """The codec of messages that need a definition."""
+    if encoding not in {"ros1", "cdr", "protobuf"}:
+        named = f"encoding {encoding!r}" if encoding else "a message without an encoding"
+        return OpaqueCodec(f"{named} is stored and fetched, not indexed")
+    if schema is None or not (schema.encoding or schema.data):
+        named = "" if schema is None or not schema.name else f"{schema.name}: "
+        return OpaqueCodec(f"{named}no definition in the source")
+    if (encoding, schema.encoding) in _ROS:
+        from hybridlog.schema.ros_codec import RosCodec
+
+        return RosCodec(schema, "ros1" if encoding == "ros1" else "cdr", array_limit)
+    if (encoding, schema.encoding) == ("protobuf", "protobuf"):
+        from hybridlog.schema.protobuf_codec import ProtobufCodec
+
+        return ProtobufCodec(schema, array_limit)
+    return OpaqueCodec(
+        f"{schema.name}: encoding {encoding!r} with a definition in {schema.encoding!r} "
+        "is stored and fetched, not indexed"
+    )
