@@ -269,6 +269,9 @@ SLOW = settings(
 @example([{"a": [[1, 2], [3]]}, {"a": [{"0": 1}]}], ["a[0] == 1", "a[0][1] == 2", "a[0].n == 2"])
 @example([{"a": [2**53 + 1] * 3}], ["a.max == 9007199254740993", "a.mean > 9007199254740992"])
 @example([{"a": [1, "x"] * 20}, {"a": {"n": 40}}], ["a == 1", "a > 0", "a.n == 40", "a.b missing"])
+@example([{"a": [[1, 0, 0, -1, 1], None]}, {"a": [[1] * 5]}], ["a.n == 2", "a.n in [1]", "a.n > 4"])
+@example([{"a": [[0, 1, 2, 3]]}, {"a": {"0": [1] * 5}}], ["a.max != 1", "a[0].n exists"])
+@example([{"m": {"n": {}}}, {"m": {"n": 4}}], ["m.`0` missing", "`m`.`0` missing", "m[1] exists"])
 @example([{"a": [{"n": 1}] * 40}], ["a.n >= 40", "a.n == 1", "a.min missing"])
 def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
     codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
