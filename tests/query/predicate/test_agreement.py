@@ -385,7 +385,15 @@ ros_paths = [
 def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]) -> None:
     codec = ros_codec()
     types = {path.path: path.type for path in codec.paths()}
-    ask(messages, [codec.fields(serialised(message)) for message in messages], questions, types)
+    asked = [*questions, *ROS_QUESTIONS]
+    ask(messages, [codec.fields(serialised(message)) for message in messages], asked, types)
+
+
+ROS_QUESTIONS = [
+    *("m.n == 1", "m[0].n > 0", "m.q.n >= 4", "names.n == 1", "flags.mean > 0.5", "flags == true"),
+    *("a > 1", "a < 0", "not a > 1", "a != 1", "not m.v == 1", "a == inf", "k[4] == 1"),
+    *("w.max >= 9223372036854775809", "u < 9223372036854775809", "w == 9223372036854775809"),
+]
 
 
 STORE = oracle("demo/msg/Whole", DEFINITION)
