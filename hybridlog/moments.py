@@ -17,7 +17,7 @@ from hybridlog.frames.bson import KeyColumns, key_columns, records_from_bson
 from hybridlog.query.intervals import Changing, Holding, Intervals, Span, clipped, span_of
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.query.unequal import unequal
-from hybridlog.schema.column import Scalars
+from hybridlog.schema.column import Scalars, flatten
 from hybridlog_storage.bson_columns import split
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.distinct import distinct
@@ -277,8 +277,6 @@ def _steps(documents: bytes, count: int, tolerance: float) -> NDArray[np.int64]:
 
 def _numbers(parts: tuple[BsonPart, ...]) -> list[str]:
     """Paths of plain numbers."""
-    from hybridlog.frames.accumulate import flatten
-
     return [
         path
         for part in parts

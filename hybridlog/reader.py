@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from hybridlog.counting import count_in_columns, in_all_times
+from hybridlog.frames.names import is_own, is_summary
 from hybridlog.indexing import STAMP
 from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_counts import count_in_chunks
@@ -80,12 +81,6 @@ _FEW = 50
 """So many index documents are counted in the time in which a chunk's entry is fetched."""
 _HANDFUL = 50  # messages for which nothing is read ahead
 _REFERENCE = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, "_meta.ref": 1}
-
-
-_NUMBERS = {
-    "bool", "byte", "char", "float32", "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -175,14 +170,17 @@ class Query:
         return self._with(_reverse=not self._reverse)
 
     def fields(self, *paths: str) -> Query:
-        """Only these fields in tables (`header.stamp`, `pose.position`).
+        """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
+
+        `publish_time`, `stamp` (of the header), `seq` (arrival number), `sequence` (the
+        sender's), `topic` and `recording` are columns, too, where no field is called so.
 
         Raises:
             TopicError: no topic of the query has such a field.
         """
         known = self.field_types()
         for path in paths:
-            if known and not _is_field(path, known):
+            if known and not (_is_field(path, known) or is_own(path)):
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(_fields=tuple(paths))
 
@@ -505,23 +503,18 @@ class Query:
 
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
-        from hybridlog.frames.answer import arranged, collect
+        from hybridlog.frames.answer import collect
 
         table = collect(self).to_arrow()
-        table = table.select(arranged(table.column_names, self._fields))
         if self._reverse:
             table = table.take(np.arange(table.num_rows - 1, -1, -1))
         return table
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: scalars as columns, arrays as numpy cells, indexed by log time (UTC, ns)."""
-        from hybridlog.frames.answer import arranged, collect
+        from hybridlog.frames.answer import collect
 
         frame = collect(self).to_pandas()
-        names = list(frame.columns)
-        wanted = arranged(names, self._fields)
-        if wanted != names:  # choosing columns takes as long as making the frame
-            frame = frame[wanted]
         if self._reverse:
             frame = frame.iloc[::-1]
         frame.attrs["hybridlog"] = _as_dict(self.counters)
@@ -807,10 +800,6 @@ class Query:
         """
         return self.store.index_for(purpose, self._recordings())
 
-    def empty_plan(self) -> Plan:
-        """The channels of the question, and nothing to read."""
-        return Plan(self.lanes(), [])
-
     def pieces(self, plan: Plan) -> Iterator[Piece]:
         """The plan's messages, thinned out and limited."""
         if self._limit == 0:
@@ -1091,20 +1080,9 @@ def _as_dict(counters: Counters) -> dict[str, float]:
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:
-    if summary_type(path, known) is not None:
+    if is_summary(path, known):
         return True
     return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
-
-
-def summary_type(path: str, known: Mapping[str, str]) -> str | None:
-    """Type of a summary of an array of numbers (`ranges.min`), None if a path is none."""
-    array, _, what = path.rpartition(".")
-    element, bracket, _ = known.get(array, "").partition("[")
-    if not bracket or what not in {"n", "min", "max", "mean"} or element not in _NUMBERS:
-        return None
-    if what == "n" or (what != "mean" and not element.startswith("float")):
-        return "int64"
-    return "float64"
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:

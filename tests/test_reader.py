@@ -130,16 +130,30 @@ def start_of(store: hl.Store, recording: str = "robot") -> int:
     return entry.span[0]
 
 
-def test_scalars_come_from_the_index_alone(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/base/scan").fields("header.seq", "range_min", "ranges.min")
+def test_summaries_beside_their_arrays(store: hl.Store, robot: Truth) -> None:
+    query = store.topic("/base/scan").fields("header.seq", "ranges.min", "ranges", "ranges.n")
     frame = query.to_pandas()
-    assert query.counters.chunks_read == query.counters.bytes_read == 0
-    assert query.counters.documents_read == query.counters.messages == len(frame)
-    assert list(frame.columns) == ["header.seq", "range_min", "ranges.min"]
+    assert query.counters.documents_read == 0
+    assert query.counters.messages == len(frame)
+    assert list(frame.columns) == ["header.seq", "ranges.min", "ranges", "ranges.n"]
     assert frame["header.seq"].tolist() == [m.message.header.seq for m in robot["/base/scan"]]
     want = [m.message.ranges[np.isfinite(m.message.ranges)].min() for m in robot["/base/scan"]]
-    assert frame["ranges.min"].tolist() == pytest.approx(want, rel=1e-6)
-    assert frame.attrs["hybridlog"]["chunks_read"] == 0
+    assert frame["ranges.min"].tolist() == [float(value) for value in want]
+    assert frame["ranges.n"].tolist() == [len(cell) for cell in frame["ranges"]]
+    indexed = [document["ranges"]["min"] for document in query.documents()]
+    assert frame["ranges.min"].tolist() == indexed
+    assert frame.attrs["hybridlog"]["chunks_read"] > 0
+
+
+def test_summaries_over_several_topics(store: hl.Store, robot: Truth) -> None:
+    topics = ("/base/scan", "/odom")
+    frame = store.query(topics).in_recording("robot").fields("ranges.max", "header.seq")
+    table = frame.to_pandas()
+    assert list(table.columns) == ["topic", "ranges.max", "header.seq"]
+    scans = table[table["topic"] == "/base/scan"]
+    want = [m.message.ranges[np.isfinite(m.message.ranges)].max() for m in robot["/base/scan"]]
+    assert scans["ranges.max"].tolist() == [float(value) for value in want]
+    assert table[table["topic"] == "/odom"]["ranges.max"].isna().all()
 
 
 def test_documents_read_no_chunk(store: hl.Store) -> None:

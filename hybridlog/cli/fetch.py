@@ -20,8 +20,6 @@ from hybridlog.cli.stopping import Stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from hybridlog.export.base import Target
     from hybridlog.query.plan import Counters
     from hybridlog.reader import Query
@@ -146,21 +144,25 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     """Write the rows; returns how many."""
     from hybridlog.export import open_table_writer
     from hybridlog.export.jsonl import JsonlWriter
-    from hybridlog.frames.answer import stream
+    from hybridlog.frames.answer import json_columns, schema_of, stream
+    from hybridlog.frames.lines import lines
 
     written = 0
     if form == "jsonl":
         with JsonlWriter(target) as rows:
-            for table in stream(query):
-                rows.write_table(_for_json(table, query))
-                written += table.num_rows
+            for some in lines(query):
+                rows.write_lines(some)
+                written += len(some)
                 progress()
-    else:
-        with open_table_writer(form, target) as tables:
-            for table in stream(query):
-                tables.write(table)
-                written += table.num_rows
-                progress()
+        return written
+    schema = schema_of(query)
+    with open_table_writer(form, target, schema=schema) as tables:
+        for table in stream(query):
+            tables.write(table)
+            written += table.num_rows
+            progress()
+    for name in json_columns(schema):
+        output.note(f"{name} has values of several types: it is written as JSON text.")
     return written
 
 
@@ -262,19 +264,6 @@ def _path(choices: Choices, form: str) -> Path | None:
 def _profile(query: Query) -> str:
     encodings = {lane.channel.message_encoding for lane in query.lanes()}
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
-
-
-def _for_json(table: pa.Table, query: Query) -> pa.Table:
-    """Log time as a number, and the topic, first."""
-    import pyarrow as pa
-
-    time_ns = table.column("log_time").cast(pa.int64())
-    table = table.remove_column(0)
-    if "topic" not in table.column_names or len(query.topics) == 1:
-        topic = pa.repeat(pa.scalar(query.topics[0], pa.string()), table.num_rows)
-        name = "topic" if "topic" not in table.column_names else "topic_"
-        table = table.add_column(0, name, topic)
-    return table.add_column(0, "log_time_ns", time_ns)
 
 
 def closing_line(counters: Counters, elapsed: float, *, count: bool) -> None:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.frames.accumulate import flatten
-from hybridlog.frames.text import repaired
 from hybridlog.query.column_filter import Single, is_single
-from hybridlog.schema.column import Records, Scalars, Strings, take
+from hybridlog.schema.column import Records, Scalars, Strings, flatten, take
+from hybridlog.schema.utf8 import repaired
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from hybridlog.export.base import BatchWriter, RowWriter, TableWriter, Target
 
 Kind = Literal["exact", "table", "rows"]
@@ -73,12 +75,13 @@ def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchW
     raise _no_such_format(name, "exact")
 
 
-def open_table_writer(name: str, target: Target) -> TableWriter:
+def open_table_writer(name: str, target: Target, *, schema: pa.Schema | None = None) -> TableWriter:
     """A writer of a `table` format.
 
     Args:
         name: `csv`, `parquet`, `arrow` or `npz`.
         target: Path, or a binary stream such as standard output.
+        schema: The columns, when they are known before; else they are learnt.
 
     Raises:
         UsageError: No such format, or the target cannot be written.
@@ -86,15 +89,15 @@ def open_table_writer(name: str, target: Target) -> TableWriter:
     if name == "npz":
         from hybridlog.export.npz import NpzWriter
 
-        return NpzWriter(target)
+        return NpzWriter(target, schema=schema)
     from hybridlog.export.tables import ArrowWriter, CsvWriter, ParquetWriter
 
     if name == "csv":
-        return CsvWriter(target)
+        return CsvWriter(target, schema=schema)
     if name == "parquet":
-        return ParquetWriter(target)
+        return ParquetWriter(target, schema=schema)
     if name == "arrow":
-        return ArrowWriter(target)
+        return ArrowWriter(target, schema=schema)
     raise _no_such_format(name, "table")
 
 

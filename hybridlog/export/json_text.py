@@ -1,11 +1,13 @@
 """Arrow columns as JSON text, whole columns at a time.
 
-JSON has no NaN and no infinities: they become null. Integers keep all their digits.
-Times and durations are integer nanoseconds, binary values their length: `{"n": 1024}`.
+JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
+`"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits. Times and
+durations are integer nanoseconds, binary values base64.
 """
 
 from __future__ import annotations
 
+import base64
 import json
 
 import numpy as np
@@ -32,7 +34,7 @@ def json_column(array: pa.Array) -> pa.Array:
 def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
     kind = array.type
     if isinstance(array, pa.ExtensionArray):
-        return _values(array.storage)
+        return array.storage if kind == pa.json_() else _values(array.storage)
     if pa.types.is_null(kind):
         return array.cast(pa.string())
     if pa.types.is_dictionary(kind):
@@ -40,7 +42,7 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
     if pa.types.is_boolean(kind) or pa.types.is_integer(kind):
         return array.cast(pa.string())
     if pa.types.is_floating(kind):
-        return pc.if_else(pc.is_finite(array), array.cast(pa.string()), "null")
+        return _floats(array)
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
         return array.cast(unit).cast(pa.int64()).cast(pa.string())
@@ -50,13 +52,28 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         quoted = [json.dumps(word) for word in words.dictionary.to_pylist()]
         return pa.array(quoted, pa.string()).take(words.indices)
     if pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or _is_fixed_binary(kind):
-        length = pc.binary_length(array).cast(pa.string())
-        return pc.binary_join_element_wise('{"n": ', length, "}", "")
+        return pc.binary_join_element_wise('"', base64_column(array), '"', "")
     if _is_list(kind):
         return _lists(array)
     if pa.types.is_struct(kind):
         return _structs(array)
     raise pa.ArrowNotImplementedError(f"no JSON form of {kind}")
+
+
+def _floats(array: pa.Array) -> pa.Array:
+    text = array.cast(pa.string())
+    if pc.all(pc.is_finite(array)).as_py() is not False:
+        return text
+    infinite = pc.if_else(pc.less(array, 0), '"-Infinity"', '"Infinity"')
+    odd = pc.if_else(pc.is_nan(array), '"NaN"', infinite)
+    return pc.if_else(pc.is_finite(array), text, odd)
+
+
+def base64_column(array: pa.Array) -> pa.Array:
+    """Binary values in base64, nulls as they are."""
+    cells = array.to_pylist()
+    encoded = [None if cell is None else base64.b64encode(cell).decode() for cell in cells]
+    return pa.array(encoded, pa.string())
 
 
 def _lists(array: pa.Array) -> pa.Array:

@@ -1,13 +1,15 @@
 """JSON lines: one object a message, in UTF-8.
 
-JSON has no NaN and no infinities: they become null. Integers keep all their digits, also
-those past 2**53, which some readers round. Binary values are their length: `{"n": 1024}`.
+JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
+`"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits, also those
+past 2**53, which some readers round. Binary values are base64. A field that a message
+lacks is not there, and one that is null is null.
 """
 
 from __future__ import annotations
 
+import base64
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
@@ -16,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.export.base import FileWriter, Sink, Target
+from hybridlog.schema.plain import without_nan
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    pass
 
 _MAX_DEPTH = 200
 _BLOCK = 1 << 20
@@ -63,7 +66,7 @@ class JsonlWriter(FileWriter):
         size = 0
         for row in rows:
             # A lone surrogate becomes the escape that JSON has for it.
-            line = _line(row).encode("utf-8", "backslashreplace")
+            line = f"{json_line(row)}\n".encode("utf-8", "backslashreplace")
             block.append(line)
             size += len(line)
             if size >= _BLOCK:
@@ -71,25 +74,13 @@ class JsonlWriter(FileWriter):
                 block, size = [], 0
         self._sink.write(b"".join(block))
 
-    def write_table(self, table: pa.Table) -> None:
-        """Append the rows of an Arrow table, which is faster than objects.
+    def write_lines(self, lines: Sequence[str]) -> None:
+        """Append lines that are made already, without their ends.
 
         Raises:
-            UsageError: A column that has no JSON form.
             DiskFullError: No space left.
         """
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
-        from hybridlog.export.json_text import json_column
-
-        for batch in table.to_batches(max_chunksize=rows_within(table)):
-            try:
-                lines = json_column(batch.to_struct_array())
-            except pa.ArrowException as error:
-                raise UsageError(f"the table cannot be written as JSON: {error}") from error
-            ended = pc.binary_join_element_wise(lines, "\n", "")
-            self._sink.write(b"".join(value.as_buffer() for value in ended))
+        self._sink.write("".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace"))
 
     def _finish(self) -> None:
         self._sink.commit()
@@ -98,17 +89,22 @@ class JsonlWriter(FileWriter):
         self._sink.abort()
 
 
-def rows_within(table: pa.Table, *, limit: int = 16 << 20) -> int:
-    """Rows of a table that are about `limit` bytes, from 1 to 4096."""
-    per_row = max(1, table.nbytes // max(1, table.num_rows))
+def rows_within(size: int, rows: int, *, limit: int = 16 << 20) -> int:
+    """Rows that are about `limit` bytes, from 1 to 4096, when so many have a size together."""
+    per_row = max(1, size // max(1, rows))
     return int(min(_ROWS, max(1, limit // per_row)))
 
 
-def _line(row: Mapping[str, object]) -> str:
+def json_line(row: Mapping[str, object]) -> str:
+    """An object as one line of JSON, without its end.
+
+    Raises:
+        UsageError: A value that has no JSON form.
+    """
     try:
-        return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_plain) + "\n"
+        return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_plain)
     except ValueError:  # NaN or an infinity; rare, so it is looked for only then
-        return json.dumps(_clean(row, 0), ensure_ascii=False, default=_plain) + "\n"
+        return json.dumps(_clean(row, 0), ensure_ascii=False, default=_plain)
     except RecursionError:
         raise UsageError("a message is nested too deep for JSON") from None
 
@@ -132,9 +128,9 @@ def _numbers(value: np.ndarray[tuple[int, ...], np.dtype[np.generic]] | np.gener
 _KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
     (np.ndarray, _numbers),
     (np.generic, _numbers),
-    (bytes, lambda value: {"n": len(value)}),
-    (bytearray, lambda value: {"n": len(value)}),
-    (memoryview, lambda value: {"n": value.nbytes}),
+    (bytes, lambda value: base64.b64encode(value).decode()),
+    (bytearray, lambda value: base64.b64encode(value).decode()),
+    (memoryview, lambda value: base64.b64encode(value).decode()),
     (date, lambda value: value.isoformat()),
     (timedelta, timedelta.total_seconds),
     (Mapping, dict),
@@ -144,11 +140,11 @@ _KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
 
 
 def _clean(value: object, depth: int) -> object:
-    """A copy with null for each number that JSON does not have."""
+    """A copy with a string for each number that JSON does not have."""
     if depth > _MAX_DEPTH:
         raise UsageError("a message is nested too deep for JSON")
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return without_nan(value)
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, Mapping):

@@ -30,6 +30,7 @@ import pyarrow.compute as pc
 
 from hybridlog.export.base import FileWriter, Sink, Target, failures
 from hybridlog.export.unfinished import scratch_directory
+from hybridlog.schema.arrow_types import converted
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,10 +47,12 @@ class NpzWriter(FileWriter):
 
     Args:
         target: Path or binary stream.
+        schema: The columns, when they are known before.
     """
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
         super().__init__()
+        self._schema = schema
         self._columns: dict[str, _Column] = {}
         self._sink = Sink(target)
         self._rows = 0
@@ -75,7 +78,8 @@ class NpzWriter(FileWriter):
         names = batch.schema.names
         if len(set(names)) != len(names):
             raise UsageError("two columns have the same name; leave one out with --fields")
-        for name, array in zip(names, batch.columns, strict=True):
+        for name, given in zip(names, batch.columns, strict=True):
+            array = self._plain(name, given)
             column = self._columns.get(name)
             if column is None:
                 if pa.types.is_null(array.type):
@@ -87,6 +91,12 @@ class NpzWriter(FileWriter):
         for name, column in self._columns.items():
             if name not in names:
                 column.append_nulls(batch.num_rows)
+
+    def _plain(self, name: str, array: pa.Array) -> pa.Array:
+        """The array in the type that its column is known to have, JSON as text."""
+        if self._schema is not None and name in self._schema.names:
+            array = converted(array, self._schema.field(name).type)
+        return array.storage if isinstance(array, pa.ExtensionArray) else array
 
     def _finish(self) -> None:
         with (

@@ -17,8 +17,9 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from hybridlog.export.base import FileWriter, Sink, Target
-from hybridlog.export.json_text import json_column
+from hybridlog.export.json_text import base64_column, json_column
 from hybridlog.export.jsonl import rows_within
+from hybridlog.schema.arrow_types import common_schema, converted, is_list
 from hybridlog_storage.errors import UsageError
 
 HELD_BYTES = 32 << 20
@@ -61,12 +62,11 @@ class TableFileWriter(FileWriter):
         """Append rows; columns are matched by name.
 
         Raises:
-            UsageError: A column that appears too late, twice, or with a type that does
-                not fit the one it had.
+            UsageError: A column that appears too late, twice, or with values that do not
+                fit the type it had.
             DiskFullError: No space left.
         """
         with self._failures():
-            table = self._prepared(table)
             _check_names(table.schema)
             if self._schema is not None:
                 table = self._fitted(table)
@@ -88,13 +88,16 @@ class TableFileWriter(FileWriter):
 
     def _write_group(self) -> None:
         if self._schema is None:
-            self._schema = _unified([piece.schema for piece in self._pieces])
+            self._schema = common_schema(self._pieces)
             self._pieces = [self._fitted(piece) for piece in self._pieces]
         if self._file is None:
-            self._file = self._open(self._sink, self._schema)
+            # `empty_table` knows no lists of extension types.
+            nothing = [pa.nulls(0, field.type) for field in self._schema]
+            empty = self._prepared(pa.Table.from_arrays(nothing, schema=self._schema))
+            self._file = self._open(self._sink, empty.schema)
         if self._pieces:
             # More than the bound is here only if one piece was.
-            self._file.write_table(pa.concat_tables(self._pieces))
+            self._file.write_table(self._prepared(pa.concat_tables(self._pieces)))
         self._written += self._rows
         self._pieces, self._bytes, self._rows = [], 0, 0
 
@@ -119,13 +122,14 @@ class TableFileWriter(FileWriter):
                 continue
             column = table.column(index)
             try:
-                columns.append(column.cast(field.type) if column.type != field.type else column)
+                arrays = [converted(chunk, field.type) for chunk in column.chunks]
             except pa.ArrowException as error:
                 raise UsageError(
                     f"column {field.name!r} is {field.type} at first and {column.type} later, "
                     f"which does not fit ({error}); leave it out with --fields, or write each "
                     "part into a file of its own with --between"
                 ) from error
+            columns.append(pa.chunked_array(arrays, type=field.type))
         return pa.Table.from_arrays(columns, schema=self._schema)
 
     @contextlib.contextmanager
@@ -156,12 +160,19 @@ class TableFileWriter(FileWriter):
 
 
 class ParquetWriter(TableFileWriter):
-    """Writes Parquet, row groups of zstd."""
+    """Writes Parquet, row groups of zstd.
+
+    Columns of floats have no statistics: readers skip row groups by them, and some then
+    lose rows where there are NaN among the values.
+    """
 
     format_name = "parquet"
 
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        writer: _ArrowFile = pa.parquet.ParquetWriter(sink, schema, compression="zstd")
+        exact = [path for field in schema for path in _exact_leaves(field.name, field.type)]
+        writer: _ArrowFile = pa.parquet.ParquetWriter(
+            sink, schema, compression="zstd", write_statistics=exact
+        )
         return writer
 
     def _prepared(self, table: pa.Table) -> pa.Table:
@@ -170,6 +181,17 @@ class ParquetWriter(TableFileWriter):
             if pa.types.is_struct(field.type) and field.type.num_fields == 0:
                 table = table.set_column(index, field.name, pa.nulls(table.num_rows))
         return table
+
+
+def _exact_leaves(path: str, kind: pa.DataType) -> Iterator[str]:
+    """Paths of the leaves of a column that are no floats, as Parquet spells them."""
+    if pa.types.is_struct(kind):
+        for field in kind:
+            yield from _exact_leaves(f"{path}.{field.name}", field.type)
+    elif is_list(kind):
+        yield from _exact_leaves(f"{path}.list.element", kind.value_type)
+    elif not pa.types.is_floating(kind):
+        yield path
 
 
 class ArrowWriter(TableFileWriter):
@@ -184,9 +206,18 @@ class ArrowWriter(TableFileWriter):
 
 
 class CsvWriter(TableFileWriter):
-    """Writes CSV with a header; lists, structures and binary values are JSON text.
+    """Writes CSV with a header.
 
-    A null is an empty cell. Durations are integer nanoseconds.
+    | value | cell |
+    |---|---|
+    | null or missing | nothing |
+    | empty string | `""` |
+    | empty array | `[]` |
+    | NaN | `nan` |
+    | false | `false` |
+
+    Durations are integer nanoseconds, binary values base64. Lists and structures are JSON
+    text, as in JSON lines.
     """
 
     format_name = "csv"
@@ -198,14 +229,19 @@ class CsvWriter(TableFileWriter):
         return writer
 
     def _prepared(self, table: pa.Table) -> pa.Table:
-        _check_names(table.schema)
         for index, field in enumerate(table.schema):
             kind = field.type
-            if pa.types.is_null(kind) or pa.types.is_dictionary(kind):
+            if kind == pa.json_():
+                chunks = [chunk.storage for chunk in table.column(index).chunks]
+                column = pa.chunked_array(chunks, pa.string())
+            elif pa.types.is_null(kind) or pa.types.is_dictionary(kind):
                 column = table.column(index).cast(
                     pa.string() if pa.types.is_null(kind) else kind.value_type
                 )
-            elif pa.types.is_nested(kind) or _is_binary(kind):
+            elif _is_binary(kind):
+                chunks = [base64_column(chunk) for chunk in table.column(index).chunks]
+                column = pa.chunked_array(chunks, pa.string())
+            elif pa.types.is_nested(kind):
                 column = _json_chunks(table.select([index]))
             else:
                 continue
@@ -225,7 +261,8 @@ class _Nothing:
 
 def _json_chunks(column: pa.Table) -> pa.ChunkedArray:
     chunks = []
-    for batch in column.to_batches(max_chunksize=rows_within(column)):
+    rows = rows_within(column.nbytes, column.num_rows)
+    for batch in column.to_batches(max_chunksize=rows):
         array = batch.column(0)
         text = json_column(array)
         chunks.append(pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string())))
@@ -245,21 +282,3 @@ def _check_names(schema: pa.Schema) -> None:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise UsageError(f"there are two columns {twice!r}; leave one out with --fields")
-
-
-def _unified(schemas: list[pa.Schema]) -> pa.Schema:
-    """One schema for all, in the order in which columns appear."""
-    if not schemas:
-        return pa.schema([])
-    unified = schemas[0]
-    for schema in schemas[1:]:
-        if schema.equals(unified):
-            continue
-        try:
-            unified = pa.unify_schemas([unified, schema], promote_options="permissive")
-        except pa.ArrowException as error:
-            raise UsageError(
-                f"the type of a column changes in a way that one table cannot hold ({error}); "
-                "leave it out with --fields, or write --format jsonl"
-            ) from error
-    return unified

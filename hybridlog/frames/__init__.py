@@ -1,7 +1,1 @@
-"""Tables of messages: columns to Arrow and pandas, index documents to columns."""
-
-from __future__ import annotations
-
-from hybridlog.frames.table import TableBuilder
-
-__all__ = ["TableBuilder"]
+"""Tables of messages, in Arrow and in pandas."""

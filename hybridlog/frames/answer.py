@@ -1,25 +1,29 @@
-"""From a query to columns: out of the index when that is enough, else out of payloads."""
+"""From a query to tables: payloads are decoded, or columns of whole topics are taken."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from hybridlog.columns.answers import judged
 from hybridlog.columns.judged import Judged
-from hybridlog.frames import TableBuilder
-from hybridlog.frames.bson import INDEX_TYPES, INSTANTS, records_from_bson
-from hybridlog.indexing import rows_by_channel
-from hybridlog.query.plan import Lane, Piece, Plan, Sweep
-from hybridlog.schema.column import Column, Records, Scalars, Strings, take
-from hybridlog_storage.errors import DefinitionError, UsageError
+from hybridlog.columns.topic import SINGLE_READ
+from hybridlog.frames.bson import INDEX_TYPES
+from hybridlog.frames.builder import Block, TableBuilder
+from hybridlog.frames.names import is_summary, own_columns, summary_of
+from hybridlog.indexing import STAMP, rows_by_channel
+from hybridlog.query.plan import Lane, Piece, Sweep
+from hybridlog.schema.arrow_columns import TIME, numbers, records_array, structs
+from hybridlog.schema.arrow_types import common_schema
+from hybridlog.schema.column import Column, Records, take
+from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.reader import Query
@@ -29,163 +33,227 @@ _BLOCK_BYTES = 32 << 20
 _SEQ_BITS = 44
 
 
-class Block(NamedTuple):
-    """Columns of some messages.
-
-    Attributes:
-        topic: Their topic.
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        records: n rows.
-        size: Bytes of their payloads, 0 when they came out of the index.
-    """
-
-    topic: str
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-    records: Records
-    size: int
-
-
 def collect(query: Query) -> TableBuilder:
     """All columns of a query's answer.
 
     Raises:
         DefinitionError: a topic has no definition to make columns from.
     """
-    several = len(query.topics) > 1
-    types = scalar_types(query)
-    if types is not None:
-        builder = TableBuilder()
-        for block in chain.from_iterable(_single_values(query, types)):
-            builder.append(block.log_time, block.seq, block.records)
+    found = _from_columns(query)
+    builder = TableBuilder(query.selected_fields)
+    if found is not None:
+        for block in chain.from_iterable(found):
+            builder.append(block)
         return builder
     plan = query.plan()
-    _check(plan.lanes)
-    builder = TableBuilder(expected_rows=_expected(query, plan))
-    for block in _empty(plan, query):
-        _append(builder, block, several=several)
+    decoder = Decoder(query, plan.lanes)
+    for block in decoder.empty():
+        builder.append(block)
     sweep = Sweep(plan, query.store.segment)
     for piece in sweep.unordered() if query.is_unthinned else query.pieces(plan):
-        for block in _decoded(plan.lanes, piece, query):
-            _append(builder, block, several=several)
+        for block in decoder.blocks(piece):
+            builder.append(block)
     return builder
 
 
 def stream(query: Query) -> Iterator[pa.Table]:
-    """The answer in order, in tables of bounded size; at least one, perhaps empty."""
-    several = len(query.topics) > 1
-    types = scalar_types(query)
-    groups: Iterator[Iterable[Block]]
-    if types is not None:
-        groups = _single_values(query, types)
-    else:
+    """The answer in order, in tables of bounded size; at least one, perhaps empty.
+
+    The type of a column may change from table to table where no definition fixes it.
+    """
+    groups: Iterator[Iterable[Block]] | None = _from_columns(query)
+    if groups is None:
         plan = query.plan()
-        _check(plan.lanes)
-        decoded = (_decoded(plan.lanes, piece, query) for piece in query.pieces(plan))
-        groups = chain([_empty(query.empty_plan(), query)], decoded)
-    yield from _tables(query, groups, several=several)
-
-
-def _tables(
-    query: Query, groups: Iterator[Iterable[Block]], *, several: bool
-) -> Iterator[pa.Table]:
-    builder, size = TableBuilder(), 0
+        decoder = Decoder(query, plan.lanes)
+        decoded = (decoder.blocks(piece) for piece in query.pieces(plan))
+        groups = chain([decoder.empty()], decoded)
+    builder, size = TableBuilder(query.selected_fields), 0
     given = False
     for group in groups:
         # Blocks of one group overlap in time, so no table ends between them.
         if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
             yield _finished(builder, query)
             given = True
-            builder, size = TableBuilder(), 0
+            builder, size = TableBuilder(query.selected_fields), 0
         for block in group:
-            _append(builder, block, several=several)
+            builder.append(block)
             size += block.size
     if len(builder) or not given:
         yield _finished(builder, query)
 
 
-def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
-    """Column names in the order in which their fields were asked for."""
-    if fields is None:
-        return list(names)
+def schema_of(query: Query) -> pa.Schema | None:
+    """The columns of an answer, when they depend on what is in its messages; else None.
 
-    def place(name: str) -> int:
-        for number, path in enumerate(fields):
-            plain = path.replace("[]", "")
-            if name == plain or name.startswith(f"{plain}.") or plain.startswith(f"{name}."):
-                return number
-        return -1  # what was not asked for comes first: log time, topic
+    The messages of which no definition fixes the fields are read for it.
+    """
+    if not any(_is_open(lane) for lane in query.lanes()):
+        return None
+    return common_schema(stream(query.again()))
 
-    return sorted(names, key=place)
+
+def json_columns(schema: pa.Schema | None) -> list[str]:
+    """Columns that are JSON text, since they have no common exact type."""
+    return [] if schema is None else [field.name for field in schema if field.type == pa.json_()]
+
+
+def _is_open(lane: Lane) -> bool:
+    """Whether the columns of a channel depend on what is in its messages."""
+    return lane.channel.message_encoding not in SINGLE_READ
 
 
 def _finished(builder: TableBuilder, query: Query) -> pa.Table:
     table = builder.to_arrow()
-    table = table.select(arranged(table.column_names, query.selected_fields))
-    if query.is_reversed:
-        table = table.take(np.arange(table.num_rows - 1, -1, -1))
-    return table
+    return table.take(np.arange(table.num_rows - 1, -1, -1)) if query.is_reversed else table
 
 
-def _append(builder: TableBuilder, block: Block, *, several: bool) -> None:
-    records = with_topic(block.records, block.topic) if several else block.records
-    builder.append(block.log_time, block.seq, records)
+class Decoder:
+    """Makes blocks of the messages of a query.
+
+    Args:
+        query: The question.
+        lanes: The channels that it is about.
+
+    Attributes:
+        lanes: The same.
+
+    Raises:
+        DefinitionError: A channel has no definition to make columns from.
+    """
+
+    def __init__(self, query: Query, lanes: Sequence[Lane]) -> None:
+        _check(lanes)
+        self._query = query
+        self.lanes = lanes
+        self._own = _own(query, lanes)
+        self._ranks = _ranks(lanes)
+        self._fields = [_to_decode(query.selected_fields, lane, self._own) for lane in lanes]
+
+    def empty(self) -> Iterator[Block]:
+        """A block without rows for each channel: columns exist even when no message does."""
+        none = np.empty(0, np.int64)
+        channel = np.empty(0, np.int32)
+        batch = Batch(b"", none, none, channel, none, none, none.astype(np.uint32))
+        for number, lane in enumerate(self.lanes):
+            if not lane.is_reduced:
+                yield self.block(number, batch, none)[0]
+
+    def blocks(self, piece: Piece) -> Iterator[Block]:
+        """The messages of a piece, by channel."""
+        for number, rows in rows_by_channel(piece.batch.channel):
+            if self.lanes[number].is_reduced:
+                self._query.counters.reduced += len(rows)
+            else:
+                yield self.block(number, piece.batch.take(rows), piece.seq[rows])[0]
+
+    def block(
+        self, number: int, batch: Batch, seq: NDArray[np.int64]
+    ) -> tuple[Block, NDArray[np.intp]]:
+        """Messages of one channel, and which of the rows could be read."""
+        lane = self.lanes[number]
+        decoded = lane.codec.arrow(batch.buffer, batch.offset, batch.length, self._fields[number])
+        records, good = decoded.records, decoded.rows
+        stamps = None
+        if "stamp" in self._own:
+            stamps = _stamps(records)
+            records = _without_stamp(records, self._query.selected_fields)
+        if len(good) < len(batch):
+            batch, seq = batch.take(good), seq[good]
+        own = self.own_columns(number, batch, seq, stamps)
+        order = seq + self._ranks[number]
+        topic = lane.channel.topic
+        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes), good
+
+    def own_columns(
+        self,
+        number: int,
+        batch: Batch,
+        seq: NDArray[np.int64],
+        stamps: pa.Array[Any] | None = None,
+    ) -> dict[str, pa.Array[Any]]:
+        """Our columns of messages of one channel, besides the log time."""
+        lane = self.lanes[number]
+        return {name: _own_column(name, lane, batch, seq, stamps) for name in self._own}
 
 
-def with_topic(records: Records, topic: str) -> Records:
-    """The same columns behind one that says the topic."""
-    name = np.frombuffer(topic.encode("utf-8", "replace"), np.uint8)
-    rows = len(records)
-    column = Strings(np.tile(name, rows), np.arange(rows + 1, dtype=np.int64) * len(name))
-    return Records({"topic": column, **records.fields}, rows)
+def _own(query: Query, lanes: Sequence[Lane]) -> list[str]:
+    """Columns of ours that a table has besides the log time."""
+    defined = {path.path for lane in lanes if not lane.is_reduced for path in lane.codec.paths()}
+    asked = own_columns(query.selected_fields, defined)
+    unasked = []
+    if len(query.topics) > 1:
+        unasked.append("topic")
+    if len({lane.recording.key for lane in lanes}) > 1:
+        unasked.append("recording")
+    return [name for name in dict.fromkeys([*unasked, *asked]) if name != "log_time"]
 
 
-def _decoded(lanes: Sequence[Lane], piece: Piece, query: Query) -> Iterator[Block]:
-    ranks = _ranks(lanes)
-    for number, rows in rows_by_channel(piece.batch.channel):
-        lane = lanes[number]
-        if lane.is_reduced:
-            query.counters.reduced += len(rows)
-            continue
-        batch, seq = piece.batch.take(rows), piece.seq[rows]
-        decoded = lane.codec.columns(
-            batch.buffer, batch.offset, batch.length, query.selected_fields
-        )
-        good = decoded.rows
-        yield Block(
-            lane.channel.topic,
-            batch.log_time[good],
-            seq[good] + ranks[number],
-            decoded.records,
-            batch.payload_bytes,
-        )
+def _own_column(
+    name: str, lane: Lane, batch: Batch, seq: NDArray[np.int64], stamps: pa.Array[Any] | None
+) -> pa.Array[Any]:
+    rows = len(batch)
+    if name == "topic":
+        return _text(lane.channel.topic, rows)
+    if name == "recording":
+        return _text(lane.recording.label, rows)
+    if name == "seq":
+        return numbers(seq)
+    if name == "sequence":
+        return numbers(batch.sequence)
+    if name == "publish_time":
+        known = lane.channel.has_publish_time
+        return numbers(batch.publish_time, "time") if known else pa.nulls(rows, TIME)
+    return pa.nulls(rows, TIME) if stamps is None else stamps
+
+
+def _text(text: str, rows: int) -> pa.Array[Any]:
+    text = text.encode("utf-8", "replace").decode()
+    return pa.repeat(pa.scalar(text, pa.string()), rows)
+
+
+def _to_decode(
+    fields: Sequence[str] | None, lane: Lane, own: Sequence[str]
+) -> frozenset[str] | None:
+    """Paths that are decoded: those asked for, arrays whose summaries are, the stamp."""
+    if fields is None or lane.is_reduced:
+        return None
+    known = {path.path: path.type for path in lane.codec.paths()}
+    wanted = set(fields)
+    for path in fields:
+        summary = summary_of(path)
+        if summary is not None and is_summary(path, known):
+            wanted.add(summary[0])
+    return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
+
+
+def _stamps(records: pa.StructArray) -> pa.Array[Any] | None:
+    """The header stamps of messages; None when they have none."""
+    found: pa.Array[Any] = records
+    for name in STAMP.split("."):
+        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
+            return None
+        found = found.flatten()[found.type.get_field_index(name)]
+    return found if found.type == TIME else None
+
+
+def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.StructArray:
+    """The messages without the stamp that was decoded only for the column of that name."""
+    if fields is None or any(path in {"header", STAMP} for path in fields):
+        return records
+    children = dict(zip([f.name for f in records.type], records.flatten(), strict=True))
+    header = children.get("header")
+    if header is None or not pa.types.is_struct(header.type):
+        return records
+    inner = dict(zip([f.name for f in header.type], header.flatten(), strict=True))
+    inner.pop("stamp", None)
+    children["header"] = structs(inner, len(records))
+    return structs(children, len(records))
 
 
 def _ranks(lanes: Sequence[Lane]) -> list[int]:
     """What makes arrival numbers of each lane's recording follow those of the one before."""
     order = {key: rank for rank, key in enumerate(sorted({lane.recording.key for lane in lanes}))}
     return [order[lane.recording.key] << _SEQ_BITS for lane in lanes]
-
-
-def _empty(plan: Plan, query: Query) -> Iterator[Block]:
-    """A block without rows for each channel: columns exist even when no message does."""
-    none = np.empty(0, np.int64)
-    for number, _ in enumerate(plan.lanes):
-        channel = np.empty(0, np.int32)
-        batch = Batch(b"", none, none, channel, none, none, none.astype(np.uint32))
-        lane = plan.lanes[number]
-        decoded = lane.codec.columns(
-            batch.buffer, batch.offset, batch.length, query.selected_fields
-        )
-        yield Block(lane.channel.topic, none, none, decoded.records, 0)
-
-
-def _expected(query: Query, plan: Plan) -> int | None:
-    """How many rows will come, when that is known before."""
-    if query.is_unthinned and query.is_unbounded and plan.chooser is None:
-        return sum(task.messages for task in plan.tasks())
-    return None
 
 
 def _check(lanes: Sequence[Lane]) -> None:
@@ -197,78 +265,57 @@ def _check(lanes: Sequence[Lane]) -> None:
             )
 
 
-def scalar_types(query: Query) -> Mapping[str, str] | None:
-    """Types of the fields asked for, if the index alone can answer; None if it cannot.
-
-    Raises:
-        UsageError: a summary of an array is asked for where the index cannot answer.
-    """
-    from hybridlog.reader import summary_type
-
-    fields = query.selected_fields
-    if fields is None:
-        return None
-    types: dict[str, str] = {}
-    summaries: list[str] = []
-    indexed = query.store.database is not None and len(query.topics) == 1
-    for lane in query.lanes():
-        if lane.is_reduced:
-            continue  # the index has of it what it has of whole messages
-        paths = {p.path: p for p in lane.codec.paths()}
-        known = {name: path.type for name, path in paths.items()}
-        for name in fields:
-            found = summary_type(name, known)
-            if found is not None:
-                summaries.append(name)
-            elif name in paths and not paths[name].array and known[name] in INDEX_TYPES:
-                found = known[name]
-            if found is None or types.setdefault(name, found) != found:
-                indexed = False
-    if summaries and not indexed:
-        raise UsageError(
-            f"{summaries[0]} stands in the index: ask for it on one topic, together with "
-            "single values only, while MongoDB is there."
-        )
-    return types if indexed else None
+# --- columns of whole topics ----------------------------------------------------------
 
 
-def _single_values(query: Query, types: Mapping[str, str]) -> Iterator[Iterable[Block]]:
-    """Blocks of single values of one topic, out of kept columns or the index.
+def _from_columns(query: Query) -> Iterator[list[Block]] | None:
+    """Blocks of single values out of kept columns; None when they cannot answer, or cost more.
 
     The first group has no rows, so that there are columns even when no message is found.
     """
-    topic = query.topics[0]
-    none = np.empty(0, np.int64)
-    yield [Block(topic, none, none, Records(_no_values(types), 0), 0)]
-    found = None
-    if query.is_unthinned:
-        with query.costing():
-            found = judged(query, topic, types, as_rows=True)
-    yield from _from_index(query, types) if found is None else _from_columns(query, types, found)
+    lanes = query.lanes()
+    types = _single_types(query, lanes)
+    if types is None or not query.is_unthinned:
+        return None
+    with query.costing():
+        found = judged(query, query.topics[0], types, as_rows=True)
+    if found is None:
+        return None
+    with_recording = "recording" in _own(query, lanes)
+    empty = list(Decoder(query, lanes).empty())
+    return chain([empty], _blocks(query, types, found, with_recording=with_recording))
 
 
-def _no_values(types: Mapping[str, str]) -> dict[str, Column]:
-    """Columns without rows."""
-    columns: dict[str, Column] = {}
-    for path, kind in types.items():
-        dtype = INDEX_TYPES[kind]
-        if kind == "string":
-            columns[path] = Strings(np.empty(0, np.uint8), np.zeros(1, np.int64))
-        elif dtype is None:
-            columns[path] = Scalars(np.empty(0, np.int64), INSTANTS[kind])
-        else:
-            columns[path] = Scalars(np.empty(0, dtype))
-    return columns
+def _single_types(query: Query, lanes: Sequence[Lane]) -> Mapping[str, str] | None:
+    """Types of the fields asked for, if columns of single values have them exactly."""
+    fields = query.selected_fields
+    if not fields or query.store.database is None or len(query.topics) != 1:
+        return None
+    types: dict[str, str] = {}
+    for lane in lanes:
+        if lane.is_reduced:
+            continue  # its fields are those of whole messages
+        if lane.channel.message_encoding not in SINGLE_READ:
+            return None
+        paths = {p.path: p for p in lane.codec.paths()}
+        for name in fields:
+            path = paths.get(name)
+            # The index holds the nearest double of a uint64.
+            if path is None or path.array or path.type not in INDEX_TYPES or path.type == "uint64":
+                return None
+            if types.setdefault(name, path.type) != path.type:
+                return None
+    return types if types and not set(_own(query, lanes)) - {"recording"} else None
 
 
-def _from_columns(
-    query: Query, types: Mapping[str, str], found: Sequence[Judged]
+def _blocks(
+    query: Query, types: Mapping[str, str], found: Sequence[Judged], *, with_recording: bool
 ) -> Iterator[list[Block]]:
     """Blocks of fields out of kept columns, in groups that are in order."""
-    if not found:
-        return
     ordered = sorted(found, key=lambda part: part.recording.key)
     parts = [(part, part.rows()) for part in ordered]
+    if not parts:
+        return
     times = [part.columns.log_time[rows] for part, rows in parts]
     owner = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
     order = np.lexsort((owner, np.concatenate(times)))  # stable: within one, by arrival
@@ -283,28 +330,30 @@ def _from_columns(
             columns: dict[str, Column] = {
                 path: take(part.columns.fields[path], rows) for path in types
             }
-            seq = part.columns.seq[rows] + (rank << _SEQ_BITS)
-            log_time = part.columns.log_time[rows]
-            group.append(Block(query.topics[0], log_time, seq, Records(columns, len(rows)), 0))
+            own = {"recording": _text(part.recording.label, len(rows))} if with_recording else {}
+            group.append(
+                Block(
+                    query.topics[0],
+                    part.columns.log_time[rows],
+                    part.columns.seq[rows] + (rank << _SEQ_BITS),
+                    own,
+                    records_array(_nested(columns, len(rows))),
+                    0,
+                )
+            )
         query.counters.messages += len(here)
         yield group
 
 
-def _from_index(query: Query, types: Mapping[str, str]) -> Iterator[list[Block]]:
-    """Blocks of the fields asked for, in groups that are in the order of the index."""
-    topic = query.topics[0]
-    projection = {"_id": 0, "_meta.t": 1, "_meta.seq": 1, **dict.fromkeys(types, 1)}
-    for raw, rows, before in query.thinned_documents(topic, projection):
-        group = []
-        # Documents that lack a field (an array too short for a summary) form parts.
-        for part in records_from_bson(raw, types):
-            chosen = np.flatnonzero(np.isin(part.rows, rows, assume_unique=True))
-            query.counters.messages += len(chosen)
-            reference, records = part.reference, part.records
-            if len(chosen) < len(reference):
-                reference, records = reference.take(chosen), take(records, chosen)
-            # Their places keep rows of one log time in the order of the index.
-            places = before + part.rows[chosen]
-            place = -places if query.is_reversed else places
-            group.append(Block(topic, reference.t, place, records, 0))
-        yield group
+def _nested(columns: Mapping[str, Column], rows: int) -> Records:
+    """Columns by dotted path as the messages that they are parts of."""
+    top = Records({}, rows)
+    for path, column in columns.items():
+        *parents, name = path.split(".")
+        inner = top
+        for parent in parents:
+            below = inner.fields.setdefault(parent, Records({}, rows))
+            assert isinstance(below, Records), "a definition has no field within a number"
+            inner = below
+        inner.fields[name] = column
+    return top

@@ -1,4 +1,15 @@
-"""Finished columns as a pandas frame."""
+"""Arrow columns as a pandas frame that every library takes.
+
+| column | in pandas |
+|---|---|
+| integers, booleans | numpy; `Int64` and so on, `boolean`, where some are missing |
+| floats | numpy; `Float64` or `Float32` where some are missing, so that NaN is no missing value |
+| times, durations | `datetime64[ns, UTC]`, `timedelta64[ns]`; NaT where missing |
+| strings, JSON text | `str`; NaN where missing |
+| bytes | `bytes` objects; None where missing |
+| arrays of numbers and booleans | read-only numpy arrays; None where missing |
+| other arrays | lists; None where missing |
+"""
 
 from __future__ import annotations
 
@@ -6,30 +17,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from hybridlog.frames.accumulate import Lists, Text, Values
-from hybridlog.frames.array_column import ArrayColumn
-from hybridlog.frames.arrow import large_text
-from hybridlog.frames.ragged import Ragged
+from hybridlog.schema.arrow_types import is_list, lengths_of, missing_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from hybridlog.frames.accumulate import Finished
+_types = pa.types
+_NAT = np.iinfo(np.int64).min
+_NOTHING: NDArray[Any] = np.empty(0)
 
 
-def frame_of(log_time: NDArray[np.int64], columns: Iterable[tuple[str, Finished]]) -> pd.DataFrame:
-    """A frame over finished columns, without copying numbers.
+def frame_of(
+    log_time: pa.ChunkedArray[Any], columns: Iterable[tuple[str, pa.ChunkedArray[Any]]]
+) -> pd.DataFrame:
+    """A frame over Arrow columns.
 
     Args:
-        log_time: int64[n], nanoseconds since the epoch, for the index.
-        columns: Names and columns of n rows.
+        log_time: For the index.
+        columns: Names and columns of as many rows.
     """
     data = {name: _array(column) for name, column in columns}
-    index = pd.DatetimeIndex(log_time.view("M8[ns]"), name="log_time", copy=False)
-    return pd.DataFrame(data, index=index.tz_localize("UTC"), copy=False)
+    index = pd.DatetimeIndex(_times(log_time), name="log_time", copy=False)
+    return pd.DataFrame(data, index=index, copy=False)
 
 
 def frame_of_intervals(
@@ -59,43 +73,114 @@ def frame_of_intervals(
     return pd.DataFrame(data)
 
 
-def _array(column: Finished) -> Any:
-    if isinstance(column, Values):
-        return _values(column)
-    if isinstance(column, Text):
-        return _string_dtype().__from_arrow__(large_text(column.rows))
-    if isinstance(column, Lists):
-        return ArrayColumn(_with_unit(column))
-    return pd.arrays.ArrowExtensionArray(column.values)
+def _array(column: pa.ChunkedArray[Any]) -> Any:
+    kind = column.type
+    if _types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind):
+        return _numbers(column)
+    if _types.is_timestamp(kind):
+        return _times(column)
+    if _types.is_duration(kind):
+        return _integers(column).view("m8[ns]")
+    if kind == pa.json_():
+        column = pa.chunked_array([chunk.storage for chunk in column.chunks], pa.string())
+        kind = column.type
+    if _types.is_string(kind) or _types.is_large_string(kind):
+        return _string_dtype().__from_arrow__(column.cast(pa.large_string()))
+    cells = np.empty(len(column), object)
+    place, shared = 0, None
+    for chunk in column.chunks:
+        rows = slice(place, place + len(chunk))
+        place += len(chunk)
+        if is_list(kind) and _is_plain(chunk):
+            shared = _fill(cells[rows], chunk, shared)
+        else:
+            cells[rows] = _objects(chunk)
+    return cells
 
 
-def _values(column: Values) -> Any:
-    values, missing = column.values, column.missing
-    if column.kind == "number":
-        return values if missing is None else _with_missing(values, missing)
-    if missing is not None:
-        values[missing] = np.iinfo(np.int64).min  # NaT
-    if column.kind == "duration":
-        return values.view("m8[ns]")
-    return pd.DatetimeIndex(values.view("M8[ns]"), copy=False).tz_localize("UTC").array
-
-
-def _with_missing(values: NDArray[Any], missing: NDArray[np.bool_]) -> Any:
-    """Floats get NaN; integers and booleans pandas' nullable arrays, to stay exact."""
-    if values.dtype.kind == "f":
-        values[missing] = np.nan
-        return values
+def _numbers(column: pa.ChunkedArray[Any]) -> Any:
+    """Numbers and booleans in numpy, or in the nullable type of the same width."""
+    if not column.null_count:
+        return column.to_numpy()
+    missing = column.is_null().to_numpy()
+    values = pc.fill_null(column, pa.scalar(0).cast(column.type)).to_numpy()
     if values.dtype.kind == "b":
         return pd.arrays.BooleanArray(values, missing)
-    return pd.arrays.IntegerArray(values, missing)
+    made = pd.arrays.FloatingArray if values.dtype.kind == "f" else pd.arrays.IntegerArray
+    return made(values, missing)
 
 
-def _with_unit(column: Lists) -> Ragged:
-    rows = column.rows
-    if column.kind == "number":
-        return rows
-    unit = "M8[ns]" if column.kind == "time" else "m8[ns]"
-    return Ragged(rows.values.view(unit), rows.start, rows.length)
+def _times(column: pa.ChunkedArray[Any]) -> Any:
+    return pd.DatetimeTZDtype("ns", "UTC").__from_arrow__(column)
+
+
+def _integers(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
+    """Durations as nanoseconds, the missing ones NaT."""
+    values = column.cast(pa.int64())
+    if values.null_count:
+        values = values.fill_null(_NAT)
+    numbers: NDArray[np.int64] = values.to_numpy()
+    return numbers
+
+
+def _is_plain(chunk: pa.Array[Any]) -> bool:
+    """Whether the elements of lists are numbers or booleans, all there."""
+    kind = chunk.type.value_type
+    plain = _types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)
+    return bool(plain) and not chunk.flatten().null_count
+
+
+def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None) -> NDArray[Any]:
+    """Fill in the arrays of a chunk; equal ones, as covariances often are, once.
+
+    Args:
+        cells: For the arrays.
+        chunk: Lists of numbers.
+        shared: The array that all rows so far are equal to, empty when they are not; None
+            at first.
+
+    Returns:
+        The same, for the next chunk.
+    """
+    values = chunk.flatten().to_numpy(zero_copy_only=False)
+    values.flags.writeable = False
+    missing = missing_of(chunk)
+    is_fixed = _types.is_fixed_size_list(chunk.type)
+    lengths = np.empty(0, np.int64) if is_fixed and missing is None else lengths_of(chunk)
+    if missing is None and (is_fixed or bool((lengths == lengths[0]).all())):
+        table = values.reshape(len(chunk), len(values) // len(chunk))
+        shared = table[0] if shared is None else shared
+        if _all_equal(table, shared):
+            cells.fill(shared)
+            return shared
+        cells[:] = list(table)
+        return _NOTHING
+    ends = np.cumsum(lengths)
+    starts = (ends - lengths).tolist()
+    cells[:] = [values[a:b] for a, b in zip(starts, ends.tolist(), strict=True)]
+    if missing is not None:
+        cells[missing] = None
+    return _NOTHING
+
+
+def _all_equal(table: NDArray[Any], row: NDArray[Any]) -> bool:
+    """Whether all rows are a row, bit by bit: NaN equals NaN, and -0.0 is not 0.0."""
+    if table.shape[1] != len(row) or not len(row):
+        return False
+    bits = table.view(f"u{table.itemsize}")
+    first = row.view(bits.dtype)
+    if not (np.array_equal(bits[0], first) and np.array_equal(bits[-1], first)):
+        return False
+    flat = bits.reshape(-1)
+    # Each row is compared with the next, flat: several times faster than row by row.
+    return np.array_equal(flat[len(row) :], flat[: -len(row)])
+
+
+def _objects(chunk: pa.Array[Any]) -> NDArray[Any]:
+    """Any values as Python objects."""
+    cells = np.empty(len(chunk), object)
+    cells[:] = chunk.to_pylist()
+    return cells
 
 
 def _string_dtype() -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -13,8 +14,9 @@ from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
@@ -38,6 +40,44 @@ class BodyGroup(NamedTuple):
     body: NDArray[np.uint8]
     error: str | None
     stamps: NDArray[np.int64] | None = None
+
+
+@dataclass(slots=True)
+class DecodedArrow:
+    """Messages as Arrow holds them: exact values, nested as the messages are.
+
+    A field that is missing and one that is null are null. Integers have their wire type,
+    those of JSON int64, or uint64 from 2^63 on. A field without a common exact type is
+    JSON text, of the type `pa.json_()`. Times are timestamp[ns, UTC], durations
+    duration[ns], protobuf `bytes` binary, arrays whole.
+
+    Attributes:
+        rows: Rows of the input that could be read, ascending.
+        records: Their fields; as many rows as `rows`.
+        unreadable: The other rows, each in one of these.
+    """
+
+    rows: NDArray[np.intp]
+    records: pa.StructArray
+    unreadable: list[Unreadable]
+
+
+@dataclass(slots=True)
+class DecodedObjects:
+    """Messages as plain objects, for JSON lines.
+
+    A field that a message lacks is not there, and one that is null is None. Times are
+    nanoseconds; bytes are bytes.
+
+    Attributes:
+        rows: Rows of the input that could be read, ascending.
+        objects: One for each of them.
+        unreadable: The other rows, each in one of these.
+    """
+
+    rows: NDArray[np.intp]
+    objects: Sequence[Mapping[str, object]]
+    unreadable: list[Unreadable]
 
 
 class Codec(Protocol):
@@ -95,6 +135,38 @@ class Codec(Protocol):
             DefinitionError: There is no definition to read them by.
         """
 
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """Messages as an Arrow struct array, arrays whole.
+
+        Numbers may be views into `buffer`, which they keep.
+
+        Args:
+            buffer: Holds the payloads.
+            offset: int64[n], where each payload starts.
+            length: int64[n], bytes of each payload.
+            fields: Dotted paths of those wanted, each with all below it; None for all.
+
+        Raises:
+            DefinitionError: There is no definition to read them by.
+        """
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """Messages as plain objects; None when every message has every field.
+
+        Args:
+            buffer: Holds the payloads.
+            offset: int64[n], where each payload starts.
+            length: int64[n], bytes of each payload.
+        """
+
 
 class OpaqueCodec:
     """Payloads that are stored and fetched as they are.
@@ -147,6 +219,26 @@ class OpaqueCodec:
             DefinitionError: Always.
         """
         raise self._refusal()
+
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """Refuses.
+
+        Raises:
+            DefinitionError: Always.
+        """
+        raise self._refusal()
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """None: there are no fields."""
+        return None
 
     def _refusal(self) -> DefinitionError:
         return DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")

@@ -159,6 +159,26 @@ def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return result
 
 
+def flatten(records: Records) -> dict[str, Column]:
+    """The leaves of records by dotted path, in the order of the definition.
+
+    A path that exists already (only names with dots in them can do that) gets trailing
+    underscores. Messages without fields have no leaf.
+    """
+    found: dict[str, Column] = {}
+    pending: list[tuple[str, Column]] = list(reversed(records.fields.items()))
+    while pending:
+        path, column = pending.pop()
+        if isinstance(column, Records):
+            inner = [(f"{path}.{name}", value) for name, value in column.fields.items()]
+            pending.extend(reversed(inner))
+            continue
+        while path in found:
+            path += "_"
+        found[path] = column
+    return found
+
+
 def header_stamps(records: Records) -> NDArray[np.int64] | None:
     """The header stamps of decoded messages, ns; None when they have no header."""
     header = records.fields.get("header")

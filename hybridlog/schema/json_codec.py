@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, cast
 
 import bson
 
-from hybridlog.schema.object_rows import body_groups, body_of, columns_of, payloads_of
+from hybridlog.schema.object_rows import (
+    arrow_of,
+    body_groups,
+    body_of,
+    columns_of,
+    objects_of,
+    payloads_of,
+    top,
+)
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
@@ -17,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.object_rows import Plain
     from hybridlog.schema.wire import Decoded
@@ -71,6 +79,31 @@ class JsonCodec:
     ) -> Decoded:
         """Fields as columns; see `object_rows.columns_of`."""
         return columns_of(_parsed, payloads_of(buffer, offset, length), fields)
+
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """Fields as Arrow arrays; see `Codec.arrow`."""
+        from hybridlog.schema.arrow_objects import objects_array
+
+        return arrow_of(
+            lambda payload: top(_parsed(payload)),
+            objects_array,
+            payloads_of(buffer, offset, length),
+            fields,
+        )
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """What the JSON texts say; see `Codec.objects`."""
+        return objects_of(
+            lambda payload: top(_parsed(payload)), payloads_of(buffer, offset, length)
+        )
 
     def _body(self, payload: memoryview) -> bytes | PayloadError:
         try:

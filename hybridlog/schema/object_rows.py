@@ -9,28 +9,37 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import bson
 import numpy as np
 from bson.errors import BSONError
 from bson.int64 import Int64
 
-from hybridlog.schema.codec import BodyGroup, error_group, nothing_decoded
+from hybridlog.schema.codec import (
+    BodyGroup,
+    DecodedArrow,
+    DecodedObjects,
+    error_group,
+    nothing_decoded,
+)
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 from hybridlog.schema.document import top_level_names
 from hybridlog.schema.summary import summarise
+from hybridlog.schema.utf8 import repaired_text
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Buffer
 
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bool | int | float | None"
+_T = TypeVar("_T")
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | float | None"
 """What a payload is made of. An `Int64` is stored as int64 whatever its value."""
 
 MAX_BYTES = 8 << 20
@@ -64,7 +73,7 @@ def body_of(value: Plain, array_limit: int) -> bytes:
         PayloadError: It cannot be a document, and why.
     """
     try:
-        fields = {_key(k): _indexed(v, array_limit, 2) for k, v in _top(value).items()}
+        fields = {_key(k): _indexed(v, array_limit, 2) for k, v in top(value).items()}
         document = bson.encode(fields)
     except (BSONError, OverflowError, ValueError, RecursionError) as error:
         raise PayloadError(f"it cannot be a document: {error}") from error
@@ -73,7 +82,7 @@ def body_of(value: Plain, array_limit: int) -> bytes:
     return document[4:-1]
 
 
-def _top(value: Plain) -> dict[str, Plain]:
+def top(value: Plain) -> dict[str, Plain]:
     """The top level of the document that a value becomes."""
     if not isinstance(value, dict):
         return {"value": value}
@@ -92,23 +101,14 @@ def _indexed(value: Plain, limit: int, depth: int) -> object:
             return _summary(value)
         return [_indexed(v, limit, depth + 1) for v in value]
     if isinstance(value, str):
-        return _text(value)
+        return repaired_text(value)
     if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
         return _double(value)
     return value
 
 
-def _text(text: str) -> str:
-    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
-    return text
-
-
 def _key(key: str) -> str:
-    return _text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
+    return repaired_text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
 
 
 def _double(value: float) -> float:
@@ -199,22 +199,63 @@ def columns_of(
         payloads: In the order of the rows.
         fields: Dotted paths of those wanted, each with all below it; None for all.
     """
+    rows, objects, unreadable = _read(plain, payloads)
+    if not objects:
+        return nothing_decoded(unreadable)
+    return Decoded(rows, _records(list(map(top, objects)), _names(fields), 1), unreadable)
+
+
+def arrow_of(
+    read: Callable[[memoryview], _T],
+    build: Callable[[Sequence[_T], Sequence[Sequence[str]] | None], pa.StructArray],
+    payloads: Iterator[memoryview],
+    fields: Collection[str] | None,
+) -> DecodedArrow:
+    """An Arrow struct array of payloads that become objects one by one.
+
+    Args:
+        read: Makes the object; raises PayloadError.
+        build: Makes an array of objects, of the paths that are wanted.
+        payloads: In the order of the rows.
+        fields: Dotted paths of those wanted, each with all below it; None for all.
+    """
+    rows, objects, unreadable = _read(read, payloads)
+    return DecodedArrow(rows, build(objects, _names(fields)), unreadable)
+
+
+def objects_of(
+    read: Callable[[memoryview], Mapping[str, Any]], payloads: Iterator[memoryview]
+) -> DecodedObjects:
+    """Payloads as the objects that they become one by one.
+
+    Args:
+        read: Makes the object; raises PayloadError.
+        payloads: In the order of the rows.
+    """
+    return DecodedObjects(*_read(read, payloads))
+
+
+def _read(
+    read: Callable[[memoryview], _T], payloads: Iterator[memoryview]
+) -> tuple[NDArray[np.intp], list[_T], list[Unreadable]]:
+    """Rows that could be read, their objects, and the rows that could not."""
     rows: list[int] = []
-    objects: list[dict[str, Plain]] = []
+    objects: list[_T] = []
     bad: dict[str, list[int]] = {}
     for row, payload in enumerate(payloads):
         try:
-            value = plain(payload)
+            objects.append(read(payload))
         except PayloadError as error:
             bad.setdefault(str(error), []).append(row)
             continue
         rows.append(row)
-        objects.append(_top(value))
     unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
-    if not rows:
-        return nothing_decoded(unreadable)
-    wanted = None if fields is None else [f.replace("[]", "").split(".") for f in fields]
-    return Decoded(np.array(rows, np.intp), _records(objects, wanted, 1), unreadable)
+    return np.array(rows, np.intp), objects, unreadable
+
+
+def _names(fields: Collection[str] | None) -> list[list[str]] | None:
+    """Dotted paths as the names they consist of."""
+    return None if fields is None else [f.replace("[]", "").split(".") for f in fields]
 
 
 def _records(
@@ -287,7 +328,7 @@ def _list_column(lists: list[list[Plain]]) -> Arrays | None:
 
 
 def _strings(texts: list[str]) -> Strings:
-    data = [_text(text).encode() for text in texts]
+    data = [repaired_text(text).encode() for text in texts]
     offset = np.zeros(len(data) + 1, np.int64)
     np.cumsum([len(each) for each in data], out=offset[1:])
     return Strings(np.frombuffer(b"".join(data), np.uint8), offset)

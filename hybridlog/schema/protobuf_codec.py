@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from importlib import import_module
 from typing import TYPE_CHECKING, cast
 
 import bson
@@ -13,23 +14,36 @@ from hybridlog.schema.document import top_level_names
 from hybridlog.schema.object_rows import (
     Duration,
     Nanoseconds,
+    arrow_of,
     body_groups,
     body_of,
     columns_of,
+    objects_of,
     payloads_of,
+    top,
+)
+from hybridlog.schema.protobuf_fields import (
+    TIMES,
+    TYPES,
+    is_map,
+    is_message,
+    is_repeated,
+    map_key,
+    nanoseconds_of,
 )
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Sequence
 
     import numpy as np
+    import pyarrow as pa
     from google.protobuf.descriptor import Descriptor, FieldDescriptor
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import Message
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.object_rows import Plain
     from hybridlog.schema.wire import Decoded
     from hybridlog_storage.messages import Buffer, Schema
@@ -37,28 +51,23 @@ if TYPE_CHECKING:
 _MAX_DEPTH = 32
 _MAX_PATHS = 10_000
 
-_TIMES = {"google.protobuf.Timestamp": "time", "google.protobuf.Duration": "duration"}
-
-# By FieldDescriptor.type, whose numbers are part of the protobuf format.
-_TYPES = {
-    1: "float64",
-    2: "float32",
-    3: "int64",
-    4: "uint64",
-    5: "int32",
-    6: "uint64",
-    7: "uint32",
-    8: "bool",
-    9: "string",
-    12: "bytes",
-    13: "uint32",
-    14: "int32",
-    15: "int32",
-    16: "int64",
-    17: "int32",
-    18: "int64",
-}
-_GROUP, _MESSAGE = 10, 11
+_STANDARD = frozenset(
+    f"google/protobuf/{name}.proto"
+    for name in (
+        "any",
+        "api",
+        "descriptor",
+        "duration",
+        "empty",
+        "field_mask",
+        "source_context",
+        "struct",
+        "timestamp",
+        "type",
+        "wrappers",
+    )
+)
+"""Protobuf's own files, which some writers leave out."""
 
 
 class ProtobufCodec:
@@ -123,6 +132,32 @@ class ProtobufCodec:
             fields,
         )
 
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """Fields as Arrow arrays of the types that the definition names; see `Codec.arrow`."""
+        from hybridlog.schema.arrow_protobuf import messages_array
+
+        def build(
+            messages: Sequence[Message], wanted: Sequence[Sequence[str]] | None
+        ) -> pa.StructArray:
+            return messages_array(self._class.DESCRIPTOR, messages, wanted)
+
+        return arrow_of(self._parsed, build, payloads_of(buffer, offset, length), fields)
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """The fields that are set, or that do not track whether they are; see `Codec.objects`."""
+        return objects_of(
+            lambda payload: top(_plain(self._parsed(payload), whole=True)),
+            payloads_of(buffer, offset, length),
+        )
+
     def _parsed(self, payload: memoryview) -> Message:
         from google.protobuf.message import DecodeError
 
@@ -185,71 +220,62 @@ def _fill(pool: DescriptorPool, data: bytes) -> None:
             raise ValueError(f"files import each other: {', '.join(sorted(waiting))[:200]}")
         for file in ready:
             for name in file.dependency:
-                if name not in added:
-                    added.add(name)
-                    _fill_standard(pool, name)
-            pool.AddSerializedFile(file.SerializeToString())
-            added.add(file.name)
+                _fill_standard(pool, name, added)
+            if file.name not in added:
+                pool.AddSerializedFile(file.SerializeToString())
+                added.add(file.name)
             del waiting[file.name]
 
 
-def _fill_standard(pool: DescriptorPool, name: str) -> None:
-    """Adds one of protobuf's own files, which some writers leave out."""
-    from google.protobuf import duration_pb2, timestamp_pb2
+def _fill_standard(pool: DescriptorPool, name: str, added: set[str]) -> None:
+    """Adds one of protobuf's own files, after the files that it imports."""
+    if name in added or name not in _STANDARD:
+        return
+    module = import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
+    for needed in module.DESCRIPTOR.dependencies:
+        _fill_standard(pool, needed.name, added)
+    pool.AddSerializedFile(module.DESCRIPTOR.serialized_pb)
+    added.add(name)
 
-    for module in (duration_pb2, timestamp_pb2):
-        if module.DESCRIPTOR.name == name:
-            pool.AddSerializedFile(module.DESCRIPTOR.serialized_pb)
 
+def _plain(message: Message, *, whole: bool = False) -> dict[str, Plain]:
+    """A message as a plain object, its fields in the order of the definition.
 
-def _plain(message: Message) -> dict[str, Plain]:
-    """A message as a plain object, its fields in the order of the definition."""
+    Args:
+        message: The message.
+        whole: `bytes` as they are, not as their length.
+    """
     found: dict[str, Plain] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
             continue
         value = getattr(message, field.name)
-        if not _is_repeated(field):
-            found[field.name] = _value(field, value)
-        elif _is_map(field):
+        if not is_repeated(field):
+            found[field.name] = _value(field, value, whole)
+        elif is_map(field):
             inner = field.message_type.fields_by_name["value"]
             # Maps have no order of their own; index documents must be reproducible.
-            found[field.name] = {_map_key(k): _value(inner, value[k]) for k in sorted(value)}
+            found[field.name] = {map_key(k): _value(inner, value[k], whole) for k in sorted(value)}
         else:
-            found[field.name] = [_value(field, v) for v in value]
+            found[field.name] = [_value(field, v, whole) for v in value]
     return found
 
 
-def _value(field: FieldDescriptor, value: object) -> Plain:
-    if field.type in {_MESSAGE, _GROUP}:
-        kind = _TIMES.get(field.message_type.full_name)
+def _value(field: FieldDescriptor, value: object, whole: bool) -> Plain:  # noqa: FBT001
+    if is_message(field):
+        kind = TIMES.get(field.message_type.full_name)
         if kind is not None:
             return _nanoseconds(cast("Message", value), kind)
-        return _plain(cast("Message", value))
+        return _plain(cast("Message", value), whole=whole)
     if isinstance(value, bytes):
-        return {"n": Int64(len(value))}
-    if _TYPES[field.type] in {"uint32", "int64", "uint64"}:
+        return value if whole else {"n": Int64(len(value))}
+    if TYPES[field.type] in {"uint32", "int64", "uint64"}:
         return Int64(cast("int", value))
     return cast("Plain", value)
 
 
 def _nanoseconds(message: Message, kind: str) -> Nanoseconds:
-    seconds, nanos = (getattr(message, name) for name in ("seconds", "nanos"))
-    return (Duration if kind == "duration" else Nanoseconds)(seconds * 10**9 + nanos)
-
-
-def _map_key(key: object) -> str:
-    return str(key).lower() if isinstance(key, bool) else str(key)
-
-
-def _is_repeated(field: FieldDescriptor) -> bool:
-    # Up to protobuf 5 there is only the label, from 7 on only the property.
-    repeated = getattr(field, "is_repeated", None)
-    return field.label == field.LABEL_REPEATED if repeated is None else bool(repeated)
-
-
-def _is_map(field: FieldDescriptor) -> bool:
-    return field.type == _MESSAGE and bool(field.message_type.GetOptions().map_entry)
+    return (Duration if kind == "duration" else Nanoseconds)(nanoseconds_of(message))
 
 
 def _add_paths(
@@ -265,16 +291,16 @@ def _add_paths(
         if len(found) >= _MAX_PATHS:
             return
         path = prefix + name
-        array = within_array or _is_repeated(field)
-        inner = field.message_type if field.type in {_MESSAGE, _GROUP} else None
-        if inner is not None and _is_map(field):
+        array = within_array or is_repeated(field)
+        inner = field.message_type if is_message(field) else None
+        if inner is not None and is_map(field):
             found.append(FieldPath(path, "map", within_array))
             continue
-        kind = _TYPES[field.type] if inner is None else _TIMES.get(inner.full_name, inner.full_name)
-        found.append(FieldPath(path, f"{kind}[]" if _is_repeated(field) else kind, array))
-        if inner is None or kind in _TIMES.values():
+        kind = TYPES[field.type] if inner is None else TIMES.get(inner.full_name, inner.full_name)
+        found.append(FieldPath(path, f"{kind}[]" if is_repeated(field) else kind, array))
+        if inner is None or kind in TIMES.values():
             continue
         within = [*above, message.full_name]
         if inner.full_name not in within and len(within) < _MAX_DEPTH:
-            dot = "[]." if _is_repeated(field) else "."
+            dot = "[]." if is_repeated(field) else "."
             _add_paths(found, inner, path + dot, within, within_array=array)

@@ -21,7 +21,7 @@ import numpy as np
 from bson.errors import BSONError
 
 from hybridlog.schema.codec import codec_for, nothing_decoded
-from hybridlog.schema.object_rows import body_groups, payloads_of
+from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
 from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import REDUCED, Channel
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup
+    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Buffer
 
@@ -132,6 +132,34 @@ class ReducedCodec:
         """No row can be read."""
         rows = np.arange(len(offset))
         return nothing_decoded([Unreadable(rows, _GIVEN_UP)] if len(rows) else [])
+
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """What the index documents hold, as Arrow arrays; see `Codec.arrow`.
+
+        Integers are int64, and arrays over the limit are summaries.
+        """
+        from hybridlog.schema.arrow_objects import objects_array
+
+        return arrow_of(_fields, objects_array, payloads_of(buffer, offset, length), fields)
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """What the index documents hold."""
+        return objects_of(_fields, payloads_of(buffer, offset, length))
+
+
+def _fields(payload: memoryview) -> dict[str, object]:
+    body = _body(payload)
+    if isinstance(body, PayloadError):
+        raise body
+    return _document(body)
 
 
 def _document(body: bytes) -> dict[str, object]:

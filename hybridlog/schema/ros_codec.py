@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import bson
 import numpy as np
 
-from hybridlog.schema.codec import BodyGroup, error_group
+from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects, error_group
 from hybridlog.schema.column import header_stamps
 from hybridlog.schema.definition import (
     ArrayOf,
@@ -122,6 +122,25 @@ class RosCodec:
         """Fields as columns; see `Codec.columns`."""
         reader = self._reader if fields is None else self._selecting(frozenset(fields))
         return reader.read(buffer, offset, length)
+
+    def arrow(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None,
+    ) -> DecodedArrow:
+        """Fields as Arrow arrays over the columns; see `Codec.arrow`."""
+        from hybridlog.schema.arrow_columns import records_array
+
+        decoded = self.columns(buffer, offset, length, fields)
+        return DecodedArrow(decoded.rows, records_array(decoded.records), decoded.unreadable)
+
+    def objects(
+        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
+    ) -> DecodedObjects | None:
+        """None: every message has every field."""
+        return None
 
     def _reader_of(self, fields: frozenset[str]) -> WireReader:
         return WireReader(self._type, self._wire, fields)

@@ -30,6 +30,15 @@ def repaired(strings: Strings) -> Strings:
     return Strings(np.frombuffer(b"".join(cells), np.uint8), offset)
 
 
+def repaired_text(text: str) -> str:
+    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
+    return text
+
+
 def _valid(data: NDArray[np.uint8], offset: NDArray[np.int64]) -> bool:
     """Whether every string is UTF-8: all bytes are, and none starts within a character."""
     starts = offset[:-1]

@@ -1,0 +1,169 @@
+"""Builds one table from the decoded messages of many chunks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.frames.columns import chunked, flat, in_order, with_summaries
+from hybridlog.frames.names import FIELD, arranged, free_name
+from hybridlog.schema.arrow_columns import TIME, numbers
+from hybridlog.schema.arrow_types import common_type, converted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import pandas as pd
+    from numpy.typing import NDArray
+
+
+class Block(NamedTuple):
+    """Decoded messages of one topic.
+
+    Attributes:
+        topic: Their topic.
+        log_time: int64[n], ns.
+        order: int64[n], orders messages of the same log time.
+        own: Columns of ours besides the log time, n rows each.
+        records: n rows.
+        size: Bytes of their payloads.
+    """
+
+    topic: str
+    log_time: NDArray[np.int64]
+    order: NDArray[np.int64]
+    own: Mapping[str, pa.Array[Any]]
+    records: pa.StructArray
+    size: int
+
+
+class Named(NamedTuple):
+    """A column and its name.
+
+    Attributes:
+        name: Of the column.
+        field: Path of its field where that is another, else None.
+        values: The column.
+    """
+
+    name: str
+    field: str | None
+    values: pa.ChunkedArray[Any]
+
+
+class TableBuilder:
+    """Collects blocks and hands them over as one table.
+
+    Nested messages become dotted columns (`pose.position.x`). A column that a block lacks
+    is null there; one whose type changes gets the common exact type
+    (`schema/arrow_types.py`). Messages of a topic are made alike before they are made
+    flat, so that a table does not depend on how its messages are spread over chunks.
+
+    Args:
+        fields: Paths that were asked for; None for all fields.
+    """
+
+    def __init__(self, fields: Sequence[str] | None = None) -> None:
+        self._fields = fields
+        self._blocks: list[Block] = []
+        self._rows = 0
+
+    def __len__(self) -> int:
+        """Rows so far."""
+        return self._rows
+
+    def append(self, block: Block) -> None:
+        """Add a block. Its arrays are kept, not copied."""
+        self._blocks.append(block)
+        self._rows += len(block.log_time)
+
+    def to_arrow(self) -> pa.Table:
+        """The table, sorted by log time and order.
+
+        Returns:
+            The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire
+            type; times are timestamp[ns, UTC], durations duration[ns], strings string,
+            arrays fixed_size_list when the definition fixes their length and list
+            otherwise.
+        """
+        names: list[pa.Field] = []
+        columns = []
+        for name, field, values in self._columns():
+            metadata = None if field is None else {FIELD: field}
+            names.append(pa.field(name, values.type, metadata=metadata))
+            columns.append(values)
+        table = pa.Table.from_arrays(columns, schema=pa.schema(names))
+        return table.select(arranged(table.column_names, self._fields))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The frame, sorted by log time and order; see `frame.py` for its types."""
+        from hybridlog.frames.frame import frame_of
+
+        columns = self._columns()
+        log_time = next(columns).values
+        frame = frame_of(log_time, ((name, values) for name, _, values in columns))
+        names = list(frame.columns)
+        wanted = arranged(names, self._fields)
+        return frame if wanted == names else frame[wanted]
+
+    def _columns(self) -> Iterator[Named]:
+        """All columns, log time first; each is released once it is handed over."""
+        blocks, self._blocks, self._rows = self._blocks, [], 0
+        blocks.sort(key=_beginning)
+        order = _order(blocks)
+        times = [numbers(block.log_time, "time") for block in blocks]
+        yield Named("log_time", None, _ordered(times, TIME, order))
+        own = list(dict.fromkeys(name for block in blocks for name in block.own))
+        for name in own:
+            arrays = [block.own[name] for block in blocks]
+            yield Named(name, None, _ordered(arrays, common_type(arrays), order))
+        parts = self._flat(blocks)
+        lengths = [len(block.log_time) for block in blocks]
+        del blocks
+        taken = {"log_time", *own}
+        for path in dict.fromkeys(path for part in parts for path in part):
+            name = free_name(path, taken)
+            taken.add(name)
+            found = [part.pop(path, None) for part in parts]
+            kind = common_type([array for array in found if array is not None])
+            arrays = [
+                pa.nulls(rows, kind) if array is None else converted(array, kind)
+                for array, rows in zip(found, lengths, strict=True)
+            ]
+            yield Named(name, path if name != path else None, _ordered(arrays, kind, order))
+
+    def _flat(self, blocks: Sequence[Block]) -> list[dict[str, pa.Array[Any]]]:
+        """The leaves of each block, those of a topic made alike."""
+        topics: dict[str, list[pa.StructArray]] = {}
+        for block in blocks:
+            topics.setdefault(block.topic, []).append(block.records)
+        kinds = {topic: common_type(records) for topic, records in topics.items()}
+        return [
+            with_summaries(flat(converted(block.records, kinds[block.topic])), self._fields)
+            for block in blocks
+        ]
+
+
+def _beginning(block: Block) -> tuple[int, int]:
+    return (int(block.log_time[0]), int(block.order[0])) if len(block.log_time) else (-1, -1)
+
+
+def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
+    """The order of the rows by log time, None when they lie in it."""
+    if not blocks:
+        return None
+    time = np.concatenate([block.log_time for block in blocks])
+    order = np.concatenate([block.order for block in blocks])
+    later = time[1:] > time[:-1]
+    if bool((later | ((time[1:] == time[:-1]) & (order[1:] >= order[:-1]))).all()):
+        return None
+    return np.lexsort((order, time))
+
+
+def _ordered(
+    arrays: Sequence[pa.Array[Any]], kind: pa.DataType, order: NDArray[np.intp] | None
+) -> pa.ChunkedArray[Any]:
+    column = chunked(arrays, kind)
+    return column if order is None else in_order(column, order)

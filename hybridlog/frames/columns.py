@@ -1,0 +1,168 @@
+"""Nested messages as flat columns: `pose.position.x`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.frames.names import summary_of
+from hybridlog.schema.arrow_columns import OFFSET_LIMIT, numbers, structs
+from hybridlog.schema.arrow_types import is_list, lengths_of, missing_of, with_values
+from hybridlog.schema.column import Scalars
+from hybridlog.schema.summary import summarise
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from numpy.typing import NDArray
+
+_types = pa.types
+
+
+def flat(records: pa.StructArray) -> dict[str, pa.Array[Any]]:
+    """The leaves of messages by dotted path, in the order of the definition.
+
+    A field of a message that is null is null. A message without fields has no leaf. A path
+    that exists already (only names with dots in them can do that) gets underscores.
+    """
+    leaves: dict[str, pa.Array[Any]] = {}
+    pending = _children("", records)
+    while pending:
+        path, array = pending.pop()
+        if _types.is_struct(array.type):
+            pending.extend(_children(f"{path}.", array))
+            continue
+        while path in leaves:
+            path += "_"
+        leaves[path] = _with_fields(array)
+    return leaves
+
+
+def _children(prefix: str, array: pa.StructArray) -> list[tuple[str, pa.Array[Any]]]:
+    """The fields of a struct array, last first."""
+    names = (prefix + field.name for field in array.type)
+    return list(zip(names, array.flatten(), strict=True))[::-1]
+
+
+def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
+    """The array with `true` for messages without fields, which few formats can hold."""
+    if not _has_empty(array.type):
+        return array
+    if is_list(array.type):
+        return with_values(array, _with_fields(array.flatten()))
+    missing = missing_of(array)
+    if not array.type.num_fields:
+        return pa.array(np.ones(len(array), np.bool_), mask=missing)
+    children = zip(array.type, array.flatten(), strict=True)
+    return structs({f.name: _with_fields(child) for f, child in children}, len(array), missing)
+
+
+def _has_empty(kind: pa.DataType) -> bool:
+    """Whether a type has structs without fields in it."""
+    if _types.is_struct(kind):
+        return not kind.num_fields or any(_has_empty(field.type) for field in kind)
+    return is_list(kind) and _has_empty(kind.value_type)
+
+
+def with_summaries(
+    leaves: dict[str, pa.Array[Any]], asked: Collection[str] | None
+) -> dict[str, pa.Array[Any]]:
+    """The leaves with the summaries that are asked for (`ranges.min`).
+
+    An array that only its summaries are asked of is left out.
+
+    Args:
+        leaves: By dotted path.
+        asked: Paths that are asked for; None for all fields.
+    """
+    wanted = [path.replace("[]", "") for path in asked or ()]
+    found = {}
+    for path in wanted:
+        summary = summary_of(path)
+        if summary is not None and path not in leaves:
+            array = leaves.get(summary[0])
+            made = None if array is None else summary_array(array, summary[1])
+            if made is not None:
+                found[path] = made
+    if not found:
+        return leaves
+    arrays = {path.rpartition(".")[0] for path in found}
+    unasked = {a for a in arrays if not any(_covers(path, a) for path in wanted)}
+    return {path: a for path, a in leaves.items() if path not in unasked} | found
+
+
+def _covers(path: str, field: str) -> bool:
+    return path == field or field.startswith(f"{path}.")
+
+
+def summary_array(array: pa.Array[Any], what: str) -> pa.Array[Any] | None:
+    """One summary of each row; None when it is no array of which there is one."""
+    if _types.is_binary(array.type) or _types.is_large_binary(array.type):
+        return pc.binary_length(array).cast(pa.int64()) if what == "n" else None
+    if not is_list(array.type):
+        return None
+    missing = missing_of(array)
+    counts = lengths_of(array)
+    if what == "n":
+        return _numbers(counts, missing)
+    values = array.flatten()
+    kind = values.type
+    if not (_types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)):
+        # The type of the elements of arrays that are all empty is unknown.
+        return pa.nulls(len(array), pa.float64()) if _types.is_null(kind) else None
+    offset = np.zeros(len(counts) + 1, np.int64)
+    if values.null_count:
+        there = values.is_valid().to_numpy(zero_copy_only=False)
+        seen = np.concatenate(([0], np.cumsum(there)))
+        ends = np.cumsum(counts)
+        counts = seen[ends] - seen[ends - counts]
+        values = values.drop_null()
+    np.cumsum(counts, out=offset[1:])
+    made = summarise(Scalars(values.to_numpy(zero_copy_only=False)), offset)
+    return _numbers(getattr(made, what), ~made.has)
+
+
+def _numbers(values: NDArray[Any], missing: NDArray[np.bool_] | None) -> pa.Array[Any]:
+    return numbers(values) if missing is None else pa.array(values, mask=missing)
+
+
+def in_order(column: pa.ChunkedArray[Any], order: NDArray[np.intp]) -> pa.ChunkedArray[Any]:
+    """The rows of a column in another order.
+
+    Strings and lists whose elements are more than 32-bit offsets reach come in pieces.
+    """
+    kind = column.type
+    size = _elements(column)
+    if size <= OFFSET_LIMIT:
+        return column.take(pa.array(order))
+    wide = column.cast(_large(kind))
+    count = max(1, len(order) * (OFFSET_LIMIT // 4) // size)
+    pieces: list[pa.Array[Any]] = []
+    for begin in range(0, len(order), count):
+        part = wide.take(pa.array(order[begin : begin + count]))
+        pieces.extend(part.cast(kind).chunks)
+    return pa.chunked_array(pieces, type=kind)
+
+
+def _elements(column: pa.ChunkedArray[Any]) -> int:
+    """Most elements, or bytes, at one level of a column of strings or lists."""
+    kind = column.type
+    if _types.is_string(kind) or _types.is_binary(kind):
+        return sum(pc.sum(pc.binary_length(chunk)).as_py() or 0 for chunk in column.chunks)
+    if _types.is_list(kind) or _types.is_fixed_size_list(kind):
+        return sum(len(chunk.flatten()) for chunk in column.chunks)
+    return 0
+
+
+def _large(kind: pa.DataType) -> pa.DataType:
+    if is_list(kind):
+        return pa.large_list(kind.value_type)
+    return pa.large_binary() if _types.is_binary(kind) else pa.large_string()
+
+
+def chunked(arrays: Iterable[pa.Array[Any]], kind: pa.DataType) -> pa.ChunkedArray[Any]:
+    """Arrays of one type as one column, without empty pieces."""
+    return pa.chunked_array([array for array in arrays if len(array)], type=kind)

@@ -1,0 +1,108 @@
+"""Columns of the wire reader as Arrow arrays, without copying numbers."""
+
+# Where stubs for pyarrow are installed, they know too little of its buffers.
+# mypy: disable-error-code="no-any-return, arg-type, call-overload, return-value, assignment"
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.schema.column import Column, Records, Scalars, Strings
+from hybridlog.schema.utf8 import repaired
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+TIME = pa.timestamp("ns", "UTC")
+DURATION = pa.duration("ns")
+OFFSET_LIMIT = 2**31 - 1
+"""Largest offset of Arrow's plain strings and lists."""
+
+
+def array_of(column: Column) -> pa.Array[Any]:
+    """One chunk's column as an Arrow array, nested as it is.
+
+    Strings and lists of more than 2^31 elements get 64-bit offsets.
+    """
+    if isinstance(column, Scalars):
+        return numbers(column.values, column.kind)
+    if isinstance(column, Strings):
+        return _strings(repaired(column))
+    if isinstance(column, Records):
+        return records_array(column)
+    values = array_of(column.values)
+    if column.width is not None and isinstance(column.values, Scalars):
+        return fixed_lists(values, column.width, len(column))
+    return lists(values, column.offset)
+
+
+def records_array(records: Records) -> pa.StructArray:
+    """Records as a struct array: one row a message."""
+    return structs({name: array_of(c) for name, c in records.fields.items()}, records.rows)
+
+
+def numbers(
+    values: NDArray[Any], kind: Literal["number", "time", "duration"] = "number"
+) -> pa.Array[Any]:
+    """Numbers, booleans or times without nulls."""
+    if values.dtype == np.bool_:
+        return pa.array(values)
+    if not (values.flags.c_contiguous and values.flags.aligned):
+        values = values.copy()
+    arrow = {"time": TIME, "duration": DURATION}.get(kind) or pa.from_numpy_dtype(values.dtype)
+    return pa.Array.from_buffers(arrow, len(values), [None, pa.py_buffer(values)])
+
+
+def structs(
+    fields: Mapping[str, pa.Array[Any]], rows: int, missing: NDArray[np.bool_] | None = None
+) -> pa.StructArray:
+    """Fields side by side, also when there are none.
+
+    Args:
+        fields: Arrays of `rows` rows.
+        rows: Number of rows.
+        missing: bool[rows], which rows are null.
+    """
+    kind = pa.struct([pa.field(name, array.type) for name, array in fields.items()])
+    return pa.Array.from_buffers(kind, rows, [_validity(missing)], children=list(fields.values()))
+
+
+def lists(
+    values: pa.Array[Any], offset: NDArray[np.int64], missing: NDArray[np.bool_] | None = None
+) -> pa.Array[Any]:
+    """Lists: row i has the values `offset[i]:offset[i + 1]`."""
+    if int(offset[-1]) > OFFSET_LIMIT:
+        kind, places = pa.large_list(values.type), offset
+    else:
+        kind, places = pa.list_(values.type), offset.astype(np.int32)
+    buffers = [_validity(missing), pa.py_buffer(places)]
+    return pa.Array.from_buffers(kind, len(offset) - 1, buffers, children=[values])
+
+
+def fixed_lists(values: pa.Array[Any], width: int, rows: int) -> pa.Array[Any]:
+    """Lists of one length."""
+    kind = pa.list_(values.type, width)
+    return pa.Array.from_buffers(kind, rows, [None], children=[values])
+
+
+def _strings(strings: Strings) -> pa.Array[Any]:
+    low, high = int(strings.offset[0]), int(strings.offset[-1])
+    if high - low > OFFSET_LIMIT:
+        kind, places = pa.large_string(), strings.offset - low
+    else:
+        kind, places = pa.string(), (strings.offset - low).astype(np.int32)
+    data = np.ascontiguousarray(strings.data[low:high])
+    buffers = [None, pa.py_buffer(places), pa.py_buffer(data)]
+    return pa.Array.from_buffers(kind, len(strings), buffers)
+
+
+def _validity(missing: NDArray[np.bool_] | None) -> pa.Buffer | None:
+    """Arrow's bitmap of the rows that are there."""
+    if missing is None or not missing.any():
+        return None
+    return pa.py_buffer(np.packbits(~missing, bitorder="little"))

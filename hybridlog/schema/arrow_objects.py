@@ -1,0 +1,164 @@
+"""Python objects as Arrow arrays: the exact values of JSON and protobuf messages.
+
+A value that is missing and one that is null are both null in Arrow. A column of one kind
+of value has that type. A column without a common exact type is JSON text
+(`pa.json_()`): values of different kinds, integers beyond 64 bits, and fractions beside
+integers that a double would round.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.schema.arrow_columns import DURATION, TIME, lists, structs
+from hybridlog.schema.plain import MAX_DEPTH, json_text
+from hybridlog.schema.utf8 import repaired_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+EXACT = 1 << 53
+"""A double holds every integer up to this, and not the next one."""
+MAX_NAMES = 10_000
+"""Objects within a message that have more different names are JSON text."""
+_INT64, _UINT64 = np.iinfo(np.int64), np.iinfo(np.uint64)
+
+
+def objects_array(
+    objects: Sequence[Mapping[str, Any]], wanted: Sequence[Sequence[str]] | None
+) -> pa.StructArray:
+    """Messages as a struct array.
+
+    Args:
+        objects: One a row.
+        wanted: Paths of the fields that are wanted; None for all.
+    """
+    return cast("pa.StructArray", _structs(objects, wanted, 1))
+
+
+def values_array(
+    values: Sequence[Any], wanted: Sequence[Sequence[str]] | None = None, depth: int = 1
+) -> pa.Array[Any]:
+    """Values of any kind as one array, None as null.
+
+    Args:
+        values: Objects, lists, strings, bytes, numbers, booleans, None.
+        wanted: Paths within objects that are wanted; None for all.
+        depth: Levels above these values.
+    """
+    kinds = {_kind(kind) for kind in set(map(type, values))} - {type(None)}
+    array: pa.Array[Any] | None = None
+    if not kinds:
+        return pa.nulls(len(values))
+    if kinds <= {int, float}:
+        array = _numbers(values, kinds)
+    elif len(kinds) == 1 and depth < MAX_DEPTH:
+        kind = kinds.pop()
+        if kind is dict:
+            array = _structs(values, wanted, depth + 1)
+        elif kind is list:
+            array = _lists(values, wanted, depth + 1)
+        elif kind is str:
+            array = _strings(values)
+        elif kind is bool or kind is bytes:
+            array = pa.array(values, pa.bool_() if kind is bool else pa.binary())
+    return json_array(values) if array is None else array
+
+
+def times_array(values: Sequence[int | None], kind: str) -> pa.Array[Any]:
+    """Times or durations in nanoseconds; JSON text when 64 bits do not hold them."""
+    present = [value for value in values if value is not None]
+    if present and not (_INT64.min <= min(present) and max(present) <= _INT64.max):
+        return json_array(values)
+    return pa.array(values, pa.int64()).cast(TIME if kind == "time" else DURATION)
+
+
+def json_array(values: Sequence[Any]) -> pa.Array[Any]:
+    """Values as JSON text, None as null."""
+    texts = [None if value is None else json_text(value) for value in values]
+    return pa.ExtensionArray.from_storage(pa.json_(), pa.array(texts, pa.string()))
+
+
+def missing_rows(values: Sequence[object]) -> NDArray[np.bool_] | None:
+    """Rows that are None; None when there are none."""
+    if None not in values:
+        return None
+    return np.fromiter((value is None for value in values), np.bool_, len(values))
+
+
+def offsets_of(rows: Sequence[Sequence[object] | None]) -> NDArray[np.int64]:
+    """Places of the elements of each row, int64[n + 1]."""
+    offset = np.zeros(len(rows) + 1, np.int64)
+    np.cumsum([0 if row is None else len(row) for row in rows], out=offset[1:])
+    return offset
+
+
+def _kind(kind: type) -> type:
+    """The JSON kind of a Python type: `Int64` of BSON is an integer."""
+    for plain in (bool, int, float, str, dict, list, bytes):
+        if issubclass(kind, plain):
+            return plain
+    return kind
+
+
+def _numbers(values: Sequence[Any], kinds: set[type]) -> pa.Array[Any] | None:
+    integers = [value for value in values if isinstance(value, int)]
+    low, high = (min(integers), max(integers)) if integers else (0, 0)
+    if float in kinds:
+        if low < -EXACT or high > EXACT:
+            return None
+        return pa.array([None if v is None else float(v) for v in values], pa.float64())
+    if low >= _INT64.min and high <= _INT64.max:
+        return pa.array(values, pa.int64())
+    return pa.array(values, pa.uint64()) if low >= 0 and high <= _UINT64.max else None
+
+
+def _strings(values: Sequence[str | None]) -> pa.Array[Any]:
+    try:
+        return pa.array(values, pa.string())
+    except UnicodeEncodeError:
+        return pa.array([None if v is None else repaired_text(v) for v in values], pa.string())
+
+
+def _lists(
+    values: Sequence[list[Any] | None], wanted: Sequence[Sequence[str]] | None, depth: int
+) -> pa.Array[Any]:
+    elements = [element for row in values if row is not None for element in row]
+    items = values_array(elements, wanted, depth)
+    return lists(items, offsets_of(values), missing_rows(values))
+
+
+def _structs(
+    values: Sequence[Mapping[str, Any] | None], wanted: Sequence[Sequence[str]] | None, depth: int
+) -> pa.Array[Any] | None:
+    columns: dict[str, list[Any]] = {}
+    for row, value in enumerate(values):
+        for name in value or ():
+            column = columns.get(name)
+            if column is None:
+                if wanted is not None and not any(path[0] == name for path in wanted):
+                    continue
+                column = columns[name] = [None] * len(values)
+                if len(columns) > MAX_NAMES and depth > 1:
+                    return None
+            column[row] = value[name]  # type: ignore[index]
+    arrays: dict[str, pa.Array[Any]] = {}
+    for name, column in columns.items():
+        plain = repaired_text(name)
+        while plain in arrays:
+            plain += "_"
+        arrays[plain] = values_array(column, below(wanted, name), depth)
+    return structs(arrays, len(values), missing_rows(values))
+
+
+def below(wanted: Sequence[Sequence[str]] | None, name: str) -> Sequence[Sequence[str]] | None:
+    """What is wanted of a field that is wanted; None for all."""
+    if wanted is None:
+        return None
+    rest = [path[1:] for path in wanted if path[0] == name]
+    return None if [] in [list(path) for path in rest] else rest

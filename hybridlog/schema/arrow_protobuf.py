@@ -1,0 +1,142 @@
+"""Protobuf messages as Arrow arrays, of the types that their definition names.
+
+`bytes` are binary, lists of messages lists of structs, `Timestamp` and `Duration` times.
+A map is a struct with a field for each key. A field that tracks its presence and is not
+set is null.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import pyarrow as pa
+
+from hybridlog.schema.arrow_columns import lists, structs
+from hybridlog.schema.arrow_objects import below, missing_rows, offsets_of, times_array
+from hybridlog.schema.document import top_level_names
+from hybridlog.schema.protobuf_fields import (
+    TIMES,
+    TYPES,
+    is_map,
+    is_message,
+    is_repeated,
+    map_key,
+    nanoseconds_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from google.protobuf.descriptor import Descriptor, FieldDescriptor
+    from google.protobuf.message import Message
+
+    Wanted = Sequence[Sequence[str]] | None
+
+_ARROW = {
+    "string": pa.string(),
+    "bytes": pa.binary(),
+    "bool": pa.bool_(),
+    **{f"float{bits}": pa.type_for_alias(f"float{bits}") for bits in (32, 64)},
+    **{
+        f"{sign}int{bits}": pa.type_for_alias(f"{sign}int{bits}")
+        for sign in ("", "u")
+        for bits in (32, 64)
+    },
+}
+_MAX_UNSET = 10_000
+"""Fields of messages that no row has and that get a type all the same."""
+
+
+def messages_array(
+    descriptor: Descriptor, messages: Sequence[Message], wanted: Wanted
+) -> pa.StructArray:
+    """Messages of one type as a struct array.
+
+    Args:
+        descriptor: Their type.
+        messages: One a row.
+        wanted: Paths of the fields that are wanted; None for all.
+    """
+    return cast("pa.StructArray", _Builder().messages(descriptor, messages, wanted, ()))
+
+
+class _Builder:
+    """Builds the arrays of one call, and bounds what a definition alone can unfold to."""
+
+    def __init__(self) -> None:
+        self._unset = 0
+
+    def messages(
+        self,
+        descriptor: Descriptor,
+        messages: Sequence[Message | None],
+        wanted: Wanted,
+        above: tuple[str, ...],
+    ) -> pa.Array[Any]:
+        """Messages of one type; null where one is None, or in all rows of an unset recursion."""
+        missing = missing_rows(messages)
+        if above and (missing is None or missing.all()) and not any(messages):
+            self._unset += len(descriptor.fields)
+            if descriptor.full_name in above or self._unset > _MAX_UNSET:
+                return pa.nulls(len(messages))
+        within = (*above, descriptor.full_name)
+        names = [field.name for field in descriptor.fields]
+        arrays: dict[str, pa.Array[Any]] = {}
+        spelled = names if above else top_level_names(names)
+        for name, field in zip(spelled, descriptor.fields, strict=True):
+            if wanted is None or any(path[0] == name for path in wanted):
+                arrays[name] = self._field(field, messages, below(wanted, name), within)
+        return structs(arrays, len(messages), missing)
+
+    def _field(
+        self,
+        field: FieldDescriptor,
+        messages: Sequence[Message | None],
+        wanted: Wanted,
+        above: tuple[str, ...],
+    ) -> pa.Array[Any]:
+        name = field.name
+        if not is_repeated(field):
+            has_presence = field.has_presence
+            values = [
+                None if m is None or (has_presence and not m.HasField(name)) else getattr(m, name)
+                for m in messages
+            ]
+            return self._values(field, values, wanted, above)
+        rows = [None if message is None else getattr(message, name) for message in messages]
+        if is_map(field):
+            return self._map(field, rows, wanted, above)
+        elements = [element for row in rows if row is not None for element in row]
+        items = self._values(field, elements, wanted, above)
+        return lists(items, offsets_of(rows), missing_rows(rows))
+
+    def _map(
+        self,
+        field: FieldDescriptor,
+        rows: Sequence[Mapping[Any, Any] | None],
+        wanted: Wanted,
+        above: tuple[str, ...],
+    ) -> pa.Array[Any]:
+        inner = field.message_type.fields_by_name["value"]
+        arrays: dict[str, pa.Array[Any]] = {}
+        for key in sorted({key for row in rows if row is not None for key in row}):
+            name = map_key(key)
+            if wanted is None or any(path[0] == name for path in wanted):
+                values = [row[key] if row is not None and key in row else None for row in rows]
+                arrays[name] = self._values(inner, values, below(wanted, name), above)
+        return structs(arrays, len(rows), missing_rows(rows))
+
+    def _values(
+        self,
+        field: FieldDescriptor,
+        values: Sequence[Any],
+        wanted: Wanted,
+        above: tuple[str, ...],
+    ) -> pa.Array[Any]:
+        """One value a row."""
+        if not is_message(field):
+            return pa.array(values, _ARROW[TYPES[field.type]])
+        kind = TIMES.get(field.message_type.full_name)
+        if kind is None:
+            return self.messages(field.message_type, values, wanted, above)
+        return times_array([None if v is None else nanoseconds_of(v) for v in values], kind)

@@ -1,0 +1,39 @@
+"""Plain Python values as JSON text."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from hybridlog.schema.utf8 import repaired_text
+
+MAX_DEPTH = 100
+"""Values that are nested deeper are JSON text in tables."""
+
+
+def json_text(value: object) -> str:
+    """A value as compact JSON, with NaN and infinities as strings, as protobuf writes them."""
+    try:
+        text = json.dumps(
+            value, ensure_ascii=False, allow_nan=False, separators=(",", ":"), default=str
+        )
+    except ValueError:
+        return json_text(without_nan(value))
+    except RecursionError:
+        text = json.dumps(f"nested deeper than {MAX_DEPTH}")
+    return repaired_text(text)
+
+
+def without_nan(value: Any) -> Any:
+    """The value with `"NaN"`, `"Infinity"` and `"-Infinity"`, for which JSON has no number."""
+    if isinstance(value, float):
+        if math.isnan(value):
+            return "NaN"
+        if math.isinf(value):
+            return "Infinity" if value > 0 else "-Infinity"
+    elif isinstance(value, dict):
+        return {name: without_nan(item) for name, item in value.items()}
+    elif isinstance(value, list):
+        return [without_nan(item) for item in value]
+    return value

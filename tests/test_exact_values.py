@@ -1,0 +1,482 @@
+"""Values of messages in every output, against what other readers say of the same files."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import math
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+
+import hybridlog as hl
+from hybridlog.cli.fetch import write
+from hybridlog_storage.errors import TopicError
+from hybridlog_storage.messages import Channel, Schema
+
+CASES = Path(__file__).parent / "cases"
+LOGS = [
+    "json_int64_missing.mcap",
+    "json_optional_keys.mcap",
+    "uint64_extremes.mcap",
+    "foxglove_protobuf.mcap",
+    "clouds_mixed_empty.mcap",
+    "z_dup_stamp.bag",
+]
+TABLES = ["arrow", "parquet", "csv", "npz"]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("values") / "store", create=True) as opened:
+        for name in LOGS:
+            opened.record(CASES / name)
+        # A second recording of one of the topics.
+        opened.record(CASES / "json_optional_keys.mcap", name="again", again=True)
+        with opened.start("made") as made:
+            record_made(made)
+        yield opened
+
+
+def record_made(recorder: Any) -> None:
+    """Two topics whose fields are called as columns of ours are."""
+    text = b"Header header\nuint32 seq\nstring recording\nfloat64 log_time\nint64[] many\n" + (
+        b"=" * 80 + b"\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+    )
+    channel = Channel("/own", "ros1", Schema("p/Own", "ros1msg", text), {}, True)
+    plain = Channel("/plain", "ros1", Schema("p/Plain", "ros1msg", b"float32[] r\nstring s"))
+    for n in range(10):
+        many = struct.pack(f"<I{n}q", n, *((1 << 62) + k for k in range(n)))
+        payload = struct.pack("<III", n, 7, 8 + n) + struct.pack("<I", 1) + b"f"
+        payload += struct.pack("<I", 100 + n) + struct.pack("<I", 2) + b"re"
+        payload += struct.pack("<d", 0.5) + many
+        recorder.write(channel, payload, log_time=1000 + n, publish_time=500 + n, sequence=40 + n)
+        floats = struct.pack("<I3f", 3, n, math.inf, math.nan)
+        recorder.write(plain, floats + struct.pack("<I", 0), log_time=1000 + n)
+
+
+def payloads(name: str, topic: str) -> list[bytes]:
+    with (CASES / name).open("rb") as file:
+        return [m.data for _, c, m in make_reader(file).iter_messages(topics=[topic])]
+
+
+def written(query: Any, form: str) -> bytes:
+    stream = io.BytesIO()
+    write(query, form, stream, quiet=True)
+    return stream.getvalue()
+
+
+def json_lines(query: Any) -> list[dict[str, Any]]:
+    lines = written(query, "jsonl").decode().splitlines()
+    return [json.loads(line, parse_constant=pytest.fail) for line in lines]
+
+
+def parquet(query: Any) -> pa.Table:
+    return pq.read_table(io.BytesIO(written(query, "parquet")))
+
+
+def csv_rows(query: Any) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(written(query, "csv").decode(), newline="")))
+
+
+def flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, inner in value.items():
+        if isinstance(inner, dict) and inner:
+            found |= flat(inner, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = inner
+    return found
+
+
+# --- JSON -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("log", "topic"),
+    [
+        *(("json_int64_missing.mcap", topic) for topic in ("/j", "/k", "/a")),
+        *(("json_optional_keys.mcap", topic) for topic in ("/opt", "/ints", "/ints2", "/mix")),
+    ],
+)
+def test_json_lines_are_the_messages(store: hl.Store, log: str, topic: str) -> None:
+    query = store.topic(topic).in_recording(log.split(".", maxsplit=1)[0])
+    rows = json_lines(query)
+    wanted = [flat(json.loads(payload)) for payload in payloads(log, topic)]
+    for row, want in zip(rows, wanted, strict=True):
+        assert row.pop("topic") == topic
+        del row["log_time_ns"]
+        assert row == want  # the same fields, no more: missing is absent, null is null
+        assert list(map(type, row.values())) == list(map(type, want.values()))
+
+
+def test_json_integers_are_exact_in_every_output(store: hl.Store) -> None:
+    query = store.topic("/j")
+    wanted = [1700000000123456789, None, 1700000000123456790]
+    ids = [9007199254740993, None, None]
+    for table in (query.to_arrow(), parquet(query)):
+        assert table["t_ns"].type == pa.int64()
+        assert table["t_ns"].to_pylist() == wanted
+        assert table["id"].to_pylist() == ids
+    frame = query.to_pandas()
+    assert str(frame["t_ns"].dtype) == "Int64"
+    assert [None if v is pd.NA else v for v in frame["t_ns"]] == wanted
+    assert [row["id"] for row in csv_rows(query)] == ["9007199254740993", "", ""]
+    arrays = np.load(io.BytesIO(written(query, "npz")))
+    assert arrays["id"][0] == ids[0]
+    assert arrays["id.valid"].tolist() == [True, False, False]
+
+
+def test_missing_null_empty_nan_and_false_are_five_things(store: hl.Store) -> None:
+    query = store.topic("/opt").in_recording("json_optional_keys")
+    for table in (query.to_arrow(), parquet(query)):
+        assert table["err"].to_pylist() == [None, "x", None, None]
+        assert table["ok"].to_pylist() == [None, True, None, None]
+        assert table["list"].to_pylist() == [None, [1, 2], None, None]
+        assert table["temp"].to_pylist() == [1.5, 2.5, None, 3.0]
+        assert table["n"].to_pylist() == [None, 9007199254740993, 3, None]
+    frame = query.to_pandas()
+    assert frame["ok"].dtype == "boolean"
+    assert frame["err"].isna().tolist() == [True, False, True, True]
+    assert frame["list"].isna().tolist() == [True, False, True, True]
+    rows = csv_rows(query)
+    assert [row["ok"] for row in rows] == ["", "true", "", ""]
+    assert [row["list"] for row in rows] == ["", "[1, 2]", "", ""]
+
+
+def test_odd_values_stay_apart(tmp_path: Path) -> None:
+    texts = [
+        b'{"f": NaN, "s": "", "l": [], "b": false, "i": 0}',
+        b'{"f": null, "s": null, "l": null, "b": null, "i": null}',
+        b"{}",
+        b'{"f": 1.5, "s": "x", "l": [null], "b": true, "i": 1, "m": {}}',
+    ]
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("x") as recorder:
+            for n, text in enumerate(texts):
+                recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
+        query = store.topic("/o")
+        rows = json_lines(query)
+        for row in rows:
+            del row["log_time_ns"], row["topic"]
+        assert rows[0] == {"f": "NaN", "s": "", "l": [], "b": False, "i": 0}
+        assert rows[1] == dict.fromkeys("fslbi")
+        assert rows[2] == {}
+        assert rows[3] == {"f": 1.5, "s": "x", "l": [None], "b": True, "i": 1, "m": {}}
+        for table in (query.to_arrow(), parquet(query)):
+            for name in "fslbi":
+                assert table[name].is_null().to_pylist() == [False, True, True, False]
+            assert math.isnan(table["f"][0].as_py())
+            assert table["s"][0].as_py() == ""
+            assert table["l"].to_pylist() == [[], None, None, [None]]
+        frame = query.to_pandas()
+        assert frame["f"].dtype == "Float64"
+        assert frame["f"].isna().tolist() == [False, True, True, False]
+        assert math.isnan(frame["f"].iloc[0])
+        assert frame["s"].iloc[0] == ""
+        assert frame["b"].iloc[0] == np.False_
+        text = written(query.fields("f", "s", "l", "b", "i"), "csv").decode().splitlines()
+        cells = [line.split(",", 1)[1] for line in text]
+        assert cells == [
+            '"f","s","l","b","i"',
+            'nan,"","[]",false,0',
+            ",,,,",
+            ",,,,",
+            '1.5,"x","[null]",true,1',
+        ]
+
+
+def test_values_of_several_types_are_json_text(store: hl.Store) -> None:
+    query = store.topic("/mix").in_recording("json_optional_keys")
+    wanted = [json.loads(payload)["v"] for payload in payloads("json_optional_keys.mcap", "/mix")]
+    for table in (query.to_arrow(), parquet(query)):
+        assert [json.loads(text) for text in table["v"].to_pylist()] == wanted
+    assert [json.loads(text) for text in query.to_pandas()["v"]] == wanted
+    assert [json.loads(row["v"]) for row in csv_rows(query)] == wanted
+    assert query.to_arrow().schema.field("v").type == pa.json_()
+
+
+def test_a_late_key_and_a_late_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hybridlog.export import tables
+    from hybridlog.frames import answer
+
+    monkeypatch.setattr(tables, "HELD_BYTES", 0)
+    monkeypatch.setattr(answer, "_BLOCK_ROWS", 1)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("x") as recorder:
+            for n in range(3000):
+                value: Any = n if n < 2990 else {"k": n}
+                message = {"v": value} | ({"late": 1} if n > 2995 else {})
+                text = json.dumps(message).encode()
+                recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
+        query = store.topic("/o")
+        for form, read in (("parquet", parquet), ("csv", csv_rows)):
+            found = read(query)
+            assert (found.num_rows if form == "parquet" else len(found)) == 3000
+        values = [json.loads(text) for text in parquet(query)["v"].to_pylist()]
+        assert values[0] == 0
+        assert values[-1] == {"k": 2999}
+
+
+# --- ROS --------------------------------------------------------------------------------
+
+
+def test_unsigned_extremes(store: hl.Store) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with (CASES / "uint64_extremes.mcap").open("rb") as file:
+        ((schema, _, first), *others) = list(make_reader(file).iter_messages())
+    types.register(get_types_from_msg(schema.data.decode(), schema.name))
+    raw = [first.data, *(message.data for _, _, message in others)]
+    messages: list[Any] = [types.deserialize_cdr(data, schema.name) for data in raw]
+    wanted = [int(message.big) for message in messages]
+    query = store.topic("/zoo")
+    for chosen in (query, query.fields("big"), query.fields("big", "bigs")):
+        assert chosen.to_pandas()["big"].tolist() == wanted
+        assert chosen.to_arrow()["big"].to_pylist() == wanted
+        assert parquet(chosen)["big"].to_pylist() == wanted
+        assert [int(row["big"]) for row in csv_rows(chosen)] == wanted
+        assert [row["big"] for row in json_lines(chosen)] == wanted
+    arrays = [[int(v) for v in message.bigs] for message in messages]
+    assert query.to_arrow()["bigs"].to_pylist() == arrays
+    assert [cell.tolist() for cell in query.to_pandas()["bigs"]] == arrays
+    assert [row["bigs"] for row in json_lines(query)] == arrays
+    summary = query.fields("bigs.max", "arr.min", "arr.n", "bigs").to_pandas()
+    assert summary["bigs.max"].tolist() == [max(cell) for cell in arrays]
+    assert summary["arr.n"].tolist() == [len(message.arr) for message in messages]
+
+
+def test_floats_that_are_no_numbers(store: hl.Store) -> None:
+    row = json_lines(store.topic("/plain"))[2]
+    assert row["r"] == [2.0, "Infinity", "NaN"]
+    assert row["s"] == ""
+    table = parquet(store.topic("/plain"))
+    assert math.isnan(table["r"][0].as_py()[2])
+
+
+def test_empty_clouds(store: hl.Store) -> None:
+    frame = store.topic("/c").to_pandas()
+    sizes = [len(cell) for cell in frame["data"]]
+    assert sizes[0] == 0
+    assert max(sizes) > 0
+    assert frame["data"].iloc[0].dtype == np.uint8
+
+
+# --- protobuf ---------------------------------------------------------------------------
+
+
+def test_protobuf_is_whole_in_every_output(store: hl.Store) -> None:
+    from mcap_protobuf.decoder import DecoderFactory
+
+    with (CASES / "foxglove_protobuf.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        clouds = [d.decoded_message for d in reader.iter_decoded_messages(topics=["/pc"])]
+    query = store.topic("/pc")
+    data = [cloud.data for cloud in clouds]
+    fields = [[(f.name, f.offset, f.type) for f in cloud.fields] for cloud in clouds]
+    for table in (query.to_arrow(), parquet(query)):
+        assert table["data"].type == pa.binary()
+        assert table["data"].to_pylist() == data
+        assert table["point_stride"].type == pa.uint32()
+        assert [[tuple(f.values()) for f in row] for row in table["fields"].to_pylist()] == fields
+    frame = query.to_pandas()
+    assert frame["data"].tolist() == data
+    assert [[tuple(f.values()) for f in row] for row in frame["fields"]] == fields
+    encoded = [base64.b64encode(value).decode() for value in data]
+    assert [row["data"] for row in csv_rows(query)] == encoded
+    rows = json_lines(query)
+    assert [row["data"] for row in rows] == encoded
+    assert [[tuple(f.values()) for f in row["fields"]] for row in rows] == fields
+    assert rows[0]["timestamp"] == clouds[0].timestamp.ToNanoseconds()
+    sizes = query.fields("data.n", "fields.n", "frame_id")
+    assert sizes.to_pandas()["data.n"].tolist() == [len(value) for value in data]
+    assert [row["data.n"] for row in json_lines(sizes)] == [len(value) for value in data]
+    assert "data" not in json_lines(sizes)[0]
+    assert sizes.to_arrow()["fields.n"].to_pylist() == [len(row) for row in fields]
+
+
+# --- names ------------------------------------------------------------------------------
+
+
+def test_a_field_called_topic_and_the_topic(store: hl.Store) -> None:
+    from rosbags.rosbag1 import Reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC)
+    with Reader(CASES / "z_dup_stamp.bag") as reader:
+        for connection in reader.connections:
+            types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        seen: list[tuple[str, int, Any]] = [
+            (connection.topic, time, types.deserialize_ros1(raw, connection.msgtype))
+            for connection, time, raw in reader.messages()
+        ]
+    names = {topic for topic, _, message in seen if hasattr(message, "topic")}
+    assert names
+    for topic in names:
+        wanted: list[Any] = [message.topic for name, _, message in seen if name == topic]
+        query = store.topic(topic).in_recording("z_dup_stamp")
+        both = query.fields("topic")
+        table = both.to_arrow()
+        assert table["topic"].to_pylist() == [topic] * len(wanted)
+        assert table["topic_"].to_pylist() == wanted
+        assert table.schema.field("topic_").metadata == {b"hybridlog.field": b"topic"}
+        assert parquet(query)["topic_"].to_pylist() == wanted
+        assert [float(row["topic_"]) for row in csv_rows(query)] == wanted
+        rows = json_lines(query)
+        assert [(row["topic"], row["topic_"]) for row in rows] == [(topic, w) for w in wanted]
+        frame = query.to_pandas()
+        assert frame["topic_"].tolist() == wanted
+    everything = store.all_topics().in_recording("z_dup_stamp").to_pandas()
+    assert everything["topic"].tolist() == [topic for topic, _, _ in seen]
+
+
+def test_columns_of_ours(store: hl.Store) -> None:
+    query = store.topic("/own").fields("publish_time", "stamp", "sequence", "recording", "many.n")
+    table = query.to_arrow()
+    assert table.column_names == [
+        *("log_time", "publish_time", "stamp", "sequence", "recording", "recording_", "many.n")
+    ]
+    assert table["publish_time"].cast(pa.int64()).to_pylist() == [500 + n for n in range(10)]
+    assert table["stamp"].cast(pa.int64()).to_pylist() == [7 * 10**9 + 8 + n for n in range(10)]
+    assert table["sequence"].to_pylist() == [40 + n for n in range(10)]
+    assert table["recording"].to_pylist() == ["made"] * 10
+    assert table["recording_"].to_pylist() == ["re"] * 10
+    assert list(query.to_pandas().columns) == table.column_names[1:]
+    rows = json_lines(query)
+    assert rows[3]["publish_time"] == 503
+    assert rows[3]["stamp"] == 7 * 10**9 + 11
+    assert rows[3]["recording"] == "made"
+    assert rows[3]["recording_"] == "re"
+    assert [row["sequence"] for row in csv_rows(query)] == [str(40 + n) for n in range(10)]
+    # A field of the topic is meant where there is one.
+    assert store.topic("/own").fields("seq").to_arrow()["seq"].to_pylist() == [
+        100 + n for n in range(10)
+    ]
+    whole = store.topic("/own").to_arrow()
+    assert whole["log_time"].cast(pa.int64()).to_pylist() == [1000 + n for n in range(10)]
+    assert whole["log_time_"].to_pylist() == [0.5] * 10
+    plain = store.topic("/plain").fields("seq", "stamp", "s").to_arrow()
+    assert plain["seq"].to_pylist() == sorted(plain["seq"].to_pylist())
+    assert plain["stamp"].null_count == 10
+    bag = store.topic("/d").in_recording("z_dup_stamp").fields("publish_time").to_arrow()
+    assert bag["publish_time"].null_count == bag.num_rows
+    with pytest.raises(TopicError, match="arrival"):
+        store.topic("/plain").fields("arrival")
+
+
+def test_recording_is_a_column_when_there_are_several(store: hl.Store) -> None:
+    both = store.topic("/opt")
+    labels = ["json_optional_keys"] * 4 + ["again"] * 4
+    for table in (both.to_arrow(), parquet(both)):
+        assert sorted(table["recording"].to_pylist()) == sorted(labels)
+    assert sorted(row["recording"] for row in json_lines(both)) == sorted(labels)
+    assert sorted(both.to_pandas()["recording"]) == sorted(labels)
+    one = both.in_recording("again")
+    assert "recording" not in one.to_arrow().column_names
+    assert "recording" not in json_lines(one)[0]
+    ours = one.fields("recording", "n").to_arrow()
+    assert ours.column_names == ["log_time", "recording", "n"]
+
+
+def test_a_json_field_called_as_a_column_of_ours(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("x") as recorder:
+            for n in range(3):
+                text = json.dumps({"seq": 10 * n, "stamp": "a"}).encode()
+                recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
+        query = store.topic("/o").fields("seq")
+        assert query.to_arrow().to_pydict()["seq_"] == [0, 10, 20]
+        assert query.to_arrow()["seq"].to_pylist() == sorted(query.to_arrow()["seq"].to_pylist())
+        assert [row["seq_"] for row in json_lines(query)] == [0, 10, 20]
+        assert "seq_" not in store.topic("/o").to_arrow().column_names
+
+
+# --- other libraries --------------------------------------------------------------------
+
+EVERY = [
+    *("/j", "/k", "/a", "/opt", "/ints", "/ints2", "/mix"),
+    *("/zoo", "/cam", "/raw", "/pc", "/log", "/c", "/own", "/plain"),
+]
+
+
+@pytest.fixture(scope="module", params=EVERY)
+def frame(request: pytest.FixtureRequest, store: hl.Store) -> pd.DataFrame:
+    found = store.topic(request.param).to_pandas()
+    assert len(found)
+    return found
+
+
+def test_duckdb_reads_a_frame(frame: pd.DataFrame) -> None:
+    rows = frame.reset_index()
+    assert duckdb.sql("select count(*) from rows").fetchall() == [(len(rows),)]
+    for name in rows.columns:
+        found = duckdb.sql(f'select count("{name}") from rows').fetchall()
+        assert found == [(int(rows[name].notna().sum()),)]
+
+
+def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None:
+    for number, topic in enumerate(EVERY):
+        rows = store.topic(topic).to_arrow()
+        path = tmp_path / f"{number}.parquet"
+        path.write_bytes(written(store.topic(topic), "parquet"))
+        one = duckdb.sql("select * from rows").fetchall()
+        assert len(one) == rows.num_rows
+        assert len(duckdb.sql(f"select * from '{path}'").fetchall()) == rows.num_rows
+        assert pl.read_parquet(path).height == rows.num_rows
+        assert pl.from_arrow(rows).shape[0] == rows.num_rows
+
+
+def test_a_frame_comes_back_from_parquet(frame: pd.DataFrame) -> None:
+    file = io.BytesIO()
+    frame.to_parquet(file)
+    back = pd.read_parquet(file)
+    assert back.index.equals(frame.index)
+    assert list(back.columns) == list(frame.columns)
+    for name in frame.columns:
+        assert back[name].isna().tolist() == frame[name].isna().tolist()
+        if not isinstance(frame[name].iloc[0], np.ndarray | list):
+            assert str(back[name].tolist()) == str(frame[name].tolist())
+
+
+def test_frames_are_merged(frame: pd.DataFrame) -> None:
+    other = frame.iloc[1:].copy()
+    merged = pd.merge_asof(
+        frame,
+        other,
+        left_index=True,
+        right_index=True,
+        suffixes=("", ".other"),
+        direction="forward",
+    )
+    assert len(merged) == len(frame)
+
+
+def test_frames_are_resampled(frame: pd.DataFrame) -> None:
+    with np.errstate(invalid="ignore"):  # infinities of both signs have no mean
+        mean = frame.resample("1s").mean(numeric_only=True)
+    numbers = frame.select_dtypes("number", exclude="timedelta").columns
+    assert set(numbers) <= set(mean.columns)
+
+
+def test_arrays_explode_and_stack(store: hl.Store) -> None:
+    frame = store.topic("/plain").to_pandas()
+    exploded = frame["r"].explode()
+    assert len(exploded) == 30
+    assert exploded.iloc[3] == 1.0
+    assert np.stack(frame["r"]).shape == (10, 3)
+    assert np.stack(frame["r"]).dtype == np.float32
+    points = store.topic("/zoo").to_pandas()["points"].explode()
+    assert points.iloc[0]["x"] == 1.0
