@@ -3,7 +3,9 @@
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
-  recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
+  recordings/<label>/   one recording: journal, segments; writer.lock while it is written
+  tables/               derived: fields of topics as Parquet
+  tables.part/          tables that are being written
   catalog.sqlite        derived: which recordings, channels and chunks there are
   mongod/               derived: data of the embedded MongoDB
 ```
