@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.maintenance import tables as making
 from hybridlog.tables import answers, reader
-from hybridlog.tables.fields import FieldShape, UnfitError, joined, records_of
+from hybridlog.tables.fields import FieldShape, UnfitError, alike, joined, records_of
 from hybridlog.tables.reader import Tables, TopicTable, _merged
 from hybridlog_storage.errors import StoreError
 from tests.tables.conftest import SMALL_CHUNKS
@@ -595,8 +595,19 @@ def test_columns_that_a_piece_lacks_are_null() -> None:
     ]
 
 
-@pytest.mark.parametrize("other", [pa.string(), pa.float64(), pa.int32(), pa.list_(pa.int64())])
+@pytest.mark.parametrize("other", [pa.string(), pa.float64(), pa.uint64(), pa.list_(pa.int64())])
 def test_types_without_a_common_one(other: Any) -> None:
     one = struct([{"a": 1}], a=pa.int64())
+    two = pa.StructArray.from_arrays([pa.nulls(0, other)], names=["a"])
     with pytest.raises(UnfitError):
-        joined([one, pa.StructArray.from_arrays([pa.nulls(1, other)], names=["a"])])
+        alike([one, two], by_type=True)
+
+
+def test_values_without_a_common_type_are_json() -> None:
+    one = struct([{"a": 1}], a=pa.int64())
+    two = struct([{"a": "x"}, {"a": None}], a=pa.string())
+    found = joined([one, two]).field("a")
+    assert found.type == pa.json_()
+    assert found.storage.to_pylist() == ["1", '"x"', None]
+    wide = joined([struct([{"a": 1}], a=pa.int8()), one])
+    assert wide.type.field("a").type == pa.int64()
