@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-
 from hybridlog.query.column_filter import column_filter
+
 from hybridlog.schema.column import Scalars
 
 ORDERS = {
