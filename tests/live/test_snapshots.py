@@ -15,7 +15,7 @@ import hybridlog as hl
 from hybridlog.live.control_server import request
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import BufferedMessage, Ring
-from hybridlog.live.snapshots import SnapshotOptions, Trigger
+from hybridlog.live.snapshots import SnapshotOptions, Trigger, _happened, _Watch
 from hybridlog.losses import Cause
 from hybridlog.marks import MARKS
 from hybridlog.query.predicate.parser import parse
@@ -259,7 +259,7 @@ def test_a_trigger_fires_on_whole_and_exact_messages(
     numbers = [1, 18364758544493064721, 18364758544493064722, 2]
     watches = (_Watch("it", to_bool(parse(where), None), frozenset({"a", "id"})),)
     for index, (number, array) in enumerate(zip(numbers, arrays, strict=True)):
-        held = Held(channel, spell(number, array), 0, None, 0)
+        held = BufferedMessage(channel, spell(number, array), 0, None, 0)
         assert list(_happened(watches, held)) == (["it"] if index in fires else [])
 
 
