@@ -56,7 +56,7 @@ def test_every_path_runs(prepared: Path) -> None:
     assert (found.skipped, found.failed) == ({}, {})
     kinds = {name.partition("[")[0] for name in found.timed}
     assert kinds == {
-        *("transcode", "few", "gather", "append", "write", "pack", "insert"),
+        *("transcode", "few", "table", "append", "write", "pack", "insert"),
         *("plan", "plan_first", "fetch", "moment", "again", "first", "decode", "columns"),
     }
     assert {f"transcode[{kind}]" for kind in ("pose", "imu", "scan", "image", "tf")} <= set(
