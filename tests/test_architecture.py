@@ -60,6 +60,7 @@ ALLOWED = {
         "hybridlog.schema.arrow_objects",
         "hybridlog.schema.arrow_protobuf",
         "hybridlog.schema.arrow_types",
+        "hybridlog.schema.stamps",
         "hybridlog.query",
         "hybridlog.tables",
     ),
