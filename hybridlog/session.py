@@ -33,6 +33,7 @@ from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.tables.reader import TopicTable
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -406,6 +407,12 @@ class Session:
                 reader = SegmentReader(path / f"{number:06d}.mcap", number)
                 self._segments[key] = reader
             return reader
+
+    def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
+        """The table of a topic, made again if it is missing; None if there can be none."""
+        from hybridlog.maintenance.tables import made_for
+
+        return made_for(self.directory, recording, topic, self.tables)
 
     # The end.
 

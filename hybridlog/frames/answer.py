@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
-    from hybridlog.query.question import Question, RecordedChannel
+    from hybridlog.query.question import Part, Question, RecordedChannel
 
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
@@ -56,10 +56,16 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
 def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
     builder = TableBuilder(question.fields)
-    plan = planner.scan_plan()
-    decoder = Decoder(planner, plan.channels)
     for block in Decoder(planner, planner.channels()).empty():
         builder.append(block)
+    parts = planner.parts()
+    if _come_from_tables(planner, parts):
+        for part in parts:
+            for block in _table_blocks(planner, part):
+                builder.append(block)
+        return builder
+    plan = planner.scan_plan()
+    decoder = Decoder(planner, plan.channels)
     for run in planner.unordered(plan) if question.returns_all else planner.runs(plan):
         for block in decoder.blocks(run):
             builder.append(block)
@@ -72,10 +78,15 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
     The type of a column may change from table to table where no definition fixes it.
     """
     question = planner.question
-    plan = planner.scan_plan()
-    decoder = Decoder(planner, plan.channels)
-    decoded = (decoder.blocks(run) for run in planner.runs(plan))
-    groups = chain([Decoder(planner, planner.channels()).empty()], decoded)
+    groups: Iterator[Iterable[Block]]
+    parts = planner.parts()
+    if len(parts) == 1 and not question.reverse and _come_from_tables(planner, parts):
+        groups = ([block] for block in _table_blocks(planner, parts[0]))
+    else:
+        plan = planner.scan_plan()
+        decoder = Decoder(planner, plan.channels)
+        groups = (decoder.blocks(run) for run in planner.runs(plan))
+    groups = chain([Decoder(planner, planner.channels()).empty()], groups)
     builder, size = TableBuilder(question.fields), 0
     given = False
     for group in groups:
@@ -89,6 +100,40 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
             size += block.size
     if len(builder) or not given:
         yield _finished(builder, question)
+
+
+def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
+    """Whether tables hold all that is asked for."""
+    question = planner.question
+    if not question.returns_all or not parts:
+        return False
+    fields = _fields_of(planner)
+    if not set(_own(planner)) <= {"topic", "recording"} or (fields is not None and not fields):
+        return False
+    return all(planner.reads_tables(part, fields) for part in parts)
+
+
+def _fields_of(planner: Planner) -> list[str] | None:
+    """The fields asked for, without the names of our own columns; None for all."""
+    fields = planner.question.fields
+    if fields is None:
+        return None
+    own = {"log_time", *_own(planner)}
+    return [path for path in fields if path not in own]
+
+
+def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
+    """The messages of a part from its table, in order."""
+    (rank,) = _ranks(planner.channels(), part.channels[:1])
+    none = np.empty(0, np.int64)
+    # Tables have lists where a definition fixes the length.
+    kind = part.channels[0].codec.arrow(b"", none, none, _fields_of(planner)).records.type
+    for found in planner.values(part, _fields_of(planner)):
+        rows = len(found.log_time)
+        planner.counters.messages += rows
+        names = {"topic": part.topic, "recording": part.recording.label}
+        own = {name: _text(names[name], rows) for name in _own(planner)}
+        yield Block(part.topic, found.log_time, found.seq + rank, own, found.records.cast(kind), 0)
 
 
 def schema_of(planner: Planner) -> pa.Schema | None:

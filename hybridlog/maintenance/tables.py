@@ -10,12 +10,15 @@ import numpy as np
 
 from hybridlog.tables.layout import (
     IN_TABLES,
+    IN_TOPIC,
+    NO_TABLE,
     OWN_FILE_ROWS,
     PARTS,
     TABLES,
     parts_folder,
     recording_folder,
     table_schema,
+    topic_folder,
 )
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import files
@@ -25,6 +28,7 @@ from hybridlog_storage.segment_reader import SegmentReader
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.chunk_table import ChunkTable
@@ -96,6 +100,38 @@ def make(
     except StoreError:
         return False
     return True
+
+
+def made_for(
+    directory: StoreDirectory, entry: RecordingEntry, topic: str, tables: Tables
+) -> TopicTable | None:
+    """The table of a topic that a question needs, made again if it is missing or damaged.
+
+    A topic for which no table can be made is noted, so that it is tried once.
+
+    Args:
+        directory: The store.
+        entry: The recording, as the catalog has it.
+        topic: Full name.
+        tables: Finds the tables.
+    """
+    found = tables.of(entry, topic)
+    if found is not None or entry.status == "open" or not directory.is_writable:
+        return found
+    note = recording_folder(directory.path, entry.id) / topic_folder(topic) / NO_TABLE
+    state = ",".join(f"{number}:{entry.digests[number]}" for number in sorted(entry.digests))
+    with suppress(OSError, StoreError):
+        if files.read_file(note, len(state) + 1, depth=IN_TOPIC) == state.encode():
+            return None
+    if not make(directory, entry, {topic}):
+        return None
+    tables.forget(entry, topic)
+    found = tables.of(entry, topic)
+    if found is None:
+        with suppress(OSError, StoreError):
+            files.make_folders(note.parent, depth=IN_TOPIC - 1)
+            files.write_file(note, state.encode(), depth=IN_TOPIC)
+    return found
 
 
 def _chunks(

@@ -132,7 +132,17 @@ class Planner:
         """For each message of a part, whether it matches, in order."""
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
+        """Whether the fields of the messages of a part come from its table."""
+        if self._choose(part, Need.VALUES, fields)[0] is not self._tables:
+            return False
+        try:
+            self._tables.check(part)
+        except _RETRIED:
+            return False
+        return True
+
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the messages of a part that match, in order."""
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
@@ -214,7 +224,7 @@ class Planner:
         self.session.database_for("A MongoDB filter")
         raise DatabaseError("No engine answers this question.")
 
-    def _choose(self, part: Part, need: Need, fields: Collection[str] = ()) -> list[Engine]:
+    def _choose(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> list[Engine]:
         """The engines that can answer, the cheapest first.
 
         Raises:
@@ -269,7 +279,7 @@ class Planner:
         part: Part,
         need: Need,
         ask: Callable[[Engine], Iterator[_T]],
-        fields: Collection[str] = (),
+        fields: Collection[str] | None = (),
     ) -> Iterator[_T]:
         """Items of the cheapest engine; of the next one if it fails before its first item."""
         failure: Exception | None = None

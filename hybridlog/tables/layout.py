@@ -37,6 +37,8 @@ PARTS: Final = "tables.part"
 SMALL: Final = "small"
 """Folder of a recording's tables that holds topics of few rows."""
 SUFFIX: Final = ".parquet"
+NO_TABLE: Final = "no-table"
+"""File in the folder of a topic for which no table can be made."""
 OWN_FILE_ROWS: Final = 1000
 """Rows from which a topic has a file of its own."""
 IN_TABLES: Final = 2

@@ -375,6 +375,12 @@ class Tables:
         self._remember(key, found, generation)
         return found
 
+    def forget(self, recording: RecordingEntry, topic: str) -> None:
+        """Look for the table again when it is asked for next."""
+        with self._lock:
+            self._found.pop((recording.id, topic), None)
+            self._small.clear()
+
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """A table was found to be damaged when it was read: there is none from now on."""
         self._remember((recording.id, topic), None, self._generation)

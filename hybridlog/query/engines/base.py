@@ -69,13 +69,13 @@ class Engine(Protocol):
     and calls only what the cost was asked for.
     """
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """Seconds that the answer takes, about; None if the engine cannot give it.
 
         Args:
             part: The part of the question.
             need: What is wanted.
-            fields: Paths of the fields wanted, for `Need.VALUES`.
+            fields: Paths of the fields wanted, for `Need.VALUES`; None for all.
         """
 
     def count(self, parts: Sequence[Part]) -> int:
@@ -84,7 +84,7 @@ class Engine(Protocol):
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """For each message of the part's topic and time, whether it matches."""
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the messages that match."""
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
@@ -98,7 +98,7 @@ class Counting:
         """Not answered here: `cost` says None."""
         raise NotImplementedError
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Not answered here: `cost` says None."""
         raise NotImplementedError
 

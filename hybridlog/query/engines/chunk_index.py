@@ -46,7 +46,7 @@ class ChunkIndex:
         self._session = session
         self._counters = counters
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """For counts and times by log time; it grows with the number of chunks in the range."""
         if part.predicate is not None or not part.is_by_log_time:
             return None
@@ -93,7 +93,7 @@ class ChunkIndex:
         time = time[inside]
         yield Outcomes(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Not answered here: `cost` says None."""
         raise NotImplementedError
 

@@ -52,7 +52,7 @@ class Mongo:
         self._counters = counters
         self._undecided: dict[Part, int] = {}
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
         if need is Need.VALUES or self._session.database is None:
             return None
@@ -133,7 +133,7 @@ class Mongo:
                 no = self._keys(part, collection, joined(condition, {"$nor": [own]}))
             yield from _merged(yes, no)
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Not answered here: `cost` says None."""
         raise NotImplementedError
 

@@ -37,7 +37,7 @@ class PayloadScan:
         self._session = session
         self._counters = counters
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By bytes and messages; None if only MongoDB understands the predicate."""
         if part.predicate is not None and not can_decide(part.predicate):
             return None
@@ -67,7 +67,7 @@ class PayloadScan:
                     self._counters.unreadable += found.unreadable
             yield Outcomes(run.batch.log_time, run.seq, holds)
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Read the messages that match in order and decode the fields."""
         plan = self.plan([part])
         for run in ChunkScan(plan, self._session.segment).runs():

@@ -16,6 +16,7 @@ from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import ChunkTask
@@ -44,12 +45,17 @@ class TablesEngine:
         self._counts: dict[Part, int] = {}
         self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] = ()) -> float | None:
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
-        table = self._session.tables.of(part.recording, part.topic)
-        if table is None or not part.is_by_log_time:
+        if not part.is_by_log_time:
             return None
         asks_fields = part.predicate is not None or need is Need.VALUES
+        if asks_fields:
+            table = self._session.table(part.recording, part.topic)
+        else:
+            table = self._session.tables.of(part.recording, part.topic)
+        if table is None:
+            return None
         if table.reduced and asks_fields:
             return None  # tables have no fields of reduced messages
         if part.predicate is not None and not can_decide(part.predicate):
@@ -57,7 +63,7 @@ class TablesEngine:
         if need is Need.VALUES and not _are_whole(part, fields):
             return None
         own = ("ref",) if need is Need.SELECTION else ()
-        wanted = {*_paths(table, part), *(fields if need is Need.VALUES else ())}
+        wanted = _wanted(table, part, fields if need is Need.VALUES else ())
         return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
 
     def count(self, parts: Sequence[Part]) -> int:
@@ -82,14 +88,13 @@ class TablesEngine:
         for rows, holds in self._rows(part):
             yield Outcomes(rows.t, rows.seq, holds)
 
-    def values(self, part: Part, fields: Collection[str]) -> Iterator[Values]:
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows of which the predicate holds, in order."""
         self.check(part)
-        paths = [path.replace("[]", "") for path in fields]
-        for rows, holds in self._rows(part, paths):
+        for rows, holds in self._rows(part, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
             if len(chosen):
-                yield Values(chosen.t, chosen.seq, chosen.records)
+                yield Values(chosen.t, chosen.seq, _only(chosen.records, fields))
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """Places of the rows of which the predicate holds."""
@@ -122,7 +127,7 @@ class TablesEngine:
         }
 
     def _rows(
-        self, part: Part, fields: Collection[str] = (), own: Collection[str] = ()
+        self, part: Part, fields: Collection[str] | None = (), own: Collection[str] = ()
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of the part's time with the outcome for each.
 
@@ -137,9 +142,10 @@ class TablesEngine:
         columns = {*own, "state"} if table.unreadable else {*own}
         if part.predicate is not None and "_meta.pub" in part.predicate.fields():
             columns.add("pub")
-        self._counters.bytes_read += int(table.size({*_paths(table, part), *fields}, own))
+        paths = _wanted(table, part, fields)
+        self._counters.bytes_read += int(table.size(paths, own) * min(part.share * 1.2, 1.0))
         try:
-            for rows in table.scan({*_paths(table, part), *fields}, own=columns, spans=spans):
+            for rows in table.scan(paths, own=columns, spans=spans):
                 yield rows, self._holds(part, rows)
         except StoreError:
             self._session.tables.reject(part.recording, part.topic)
@@ -178,6 +184,36 @@ def _paths(table: TopicTable, part: Part) -> set[str]:
             path = path.rpartition(".")[0]
         found.add(path)
     return found
+
+
+def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> set[str] | None:
+    """Columns to read: those of the predicate and those asked for; None for all."""
+    if fields is None:
+        return None
+    return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}
+
+
+def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructArray:
+    """The records without what only the predicate is about."""
+    if fields is None:
+        return records
+    return _pruned(records, [path.replace("[]", "").split(".") for path in fields])
+
+
+def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.StructArray:
+    import pyarrow as pa
+
+    names, columns = [], []
+    for field, column in zip(records.type, records.flatten(), strict=True):
+        below = [path[1:] for path in paths if path[0] == field.name]
+        if not below:
+            continue
+        is_whole = any(not path for path in below) or not pa.types.is_struct(field.type)
+        names.append(field.name)
+        columns.append(column if is_whole else _pruned(column, below))
+    if not names:
+        return pa.array([{}] * len(records), pa.struct([]))
+    return pa.StructArray.from_arrays(columns, names=names)
 
 
 def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
