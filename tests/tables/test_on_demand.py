@@ -1,0 +1,116 @@
+"""A question makes the tables that it needs, once, and frames come from them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import tables as making
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog_storage.messages import Channel, Schema
+
+SECOND = 10**9
+MIXED = Channel("/mixed", "json", None)
+IMU = Channel(
+    "/imu", "ros1", Schema("pkg/Imu", "ros1msg", b"float64 x\nuint64 n\nfloat64[3] a\nstring s")
+)
+
+
+def payload(number: int) -> bytes:
+    text = f"m{number}".encode()
+    head = np.array([number / 2 if number % 5 else np.nan]).tobytes()
+    whole = np.array([2**63 + number], np.uint64).tobytes()
+    array = np.arange(3, dtype=np.float64).tobytes()
+    return head + whole + array + len(text).to_bytes(4, "little") + text
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        with opened.start("log") as recording:
+            for number in range(1500):
+                recording.write(IMU, payload(number), log_time=number * SECOND)
+                if number < 5:
+                    value = [1, "a", None, {"b": 1}, [2]][number]
+                    text = json.dumps({"v": value, "n": number}).encode()
+                    recording.write(MIXED, text, log_time=number * SECOND)
+        yield opened
+
+
+def files(store: hl.Store) -> list[str]:
+    return sorted(p.name for p in (store.directory.path / "tables").rglob("*.parquet"))
+
+
+@pytest.mark.parametrize("fault", ["removed", "cut", "flipped"])
+def test_a_table_is_made_again_for_a_question(store: hl.Store, fault: str) -> None:
+    before = files(store)
+    assert before
+    path = store.directory.path / "tables"
+    if fault == "removed":
+        shutil.rmtree(path)
+    for file in path.rglob("*.parquet") if fault != "removed" else ():
+        data = bytearray(file.read_bytes())
+        if fault == "cut":
+            del data[len(data) // 2 :]
+        else:
+            data[len(data) // 2] ^= 1
+        file.write_bytes(data)
+    store.refresh()
+    query = store.topic("/imu").where(f"n >= {2**63 + 1000}")
+    assert query.count() == 500
+    assert [m.log_time_ns for m in query.limit(1)] == [1000 * SECOND]
+    assert set(files(store)) <= set(before)
+    # Another process finds the table, and reads no chunk.
+    with hl.open(store.directory.path) as other:
+        again = other.topic("/imu").where(f"n >= {2**63 + 1000}")
+        assert again.count() == 500
+        assert again.counters.chunks_read == again.counters.documents_read == 0
+
+
+def test_a_topic_without_a_table_is_tried_once(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[set[str]] = []
+    monkeypatch.setattr(making, "make", lambda _, __, topics: made.append(topics) or True)
+    shutil.rmtree(store.directory.path / "tables")
+    for _ in range(2):
+        store.refresh()
+        assert store.topic("/imu").where("x > 1").count() > 0
+    assert made == [{"/imu"}]
+
+
+def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    for query in (
+        store.topic("/imu"),
+        store.topic("/imu").fields("n", "s"),
+        store.topic("/imu").where("x > 100").fields("a", "n"),
+        store.topic("/imu").between(10 * SECOND, 20 * SECOND).fields("x"),
+        store.topic("/imu").where("s ~ '^m1[0-9]$'").reverse(),
+    ):
+        table, frame = query.to_arrow(), query.to_pandas()
+        assert query.counters.chunks_read == 0
+        assert query.counters.messages == table.num_rows == len(frame) == query.count()
+        streamed = sum(part.num_rows for part in query.to_tables())
+        assert streamed == table.num_rows
+        with monkeypatch.context() as patch:
+            patch.setattr(TablesEngine, "cost", lambda *_: None)
+            decoded = query.to_arrow()
+            assert query.counters.chunks_read > 0
+        assert table.schema == decoded.schema
+        assert repr(table.to_pylist()) == repr(decoded.to_pylist())  # NaN is NaN
+
+
+def test_mixed_json_is_decided_on_the_messages(store: hl.Store) -> None:
+    query = store.topic("/mixed")
+    assert query.where("v == 1").count() == 1
+    assert query.where("v == 'a'").count() == 1
+    assert query.where("v == '1'").count() == 0
+    assert query.where("v == null").count() == 1
+    assert query.where("v == 2").count() == 1
+    assert query.where("v.b == 1").count() == 1
