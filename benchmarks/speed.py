@@ -40,6 +40,7 @@ from hybridlog_storage.mongod import EmbeddedMongod
 Size = Callable[[int, int], int]
 ROUNDS = 3
 SEED = 1
+TIMEOUT_S = 600.0
 PEAK_LIMIT = 400_000_000
 GROWTH_LIMIT = 1.15
 """A longer log may add a sixth to the peak: buffers that happen to be full at once."""
@@ -360,20 +361,21 @@ def bench_memory_of_record(
         bag = inputs(f"{kind}-{count}.bag", lambda p, n=count: write(p, n, SEED))
         arguments = {"bag": str(bag), "store": str(tmp_path / str(times))}
         side = "benchmarks.speed:record_side"
-        found = benchmark.pedantic(run_side, (side, arguments), rounds=1) if times == 2 else None
-        found = found or run_side(side, arguments)
+        job = (side, arguments, tmp_path, TIMEOUT_S)
+        found = benchmark.pedantic(run_side, job, rounds=1) if times == 2 else run_side(*job)
         assert found["messages"] == count
         peaks.append(found["peak_rss"])
     benchmark.extra_info["peak_rss"] = peaks
     _see_that_it_fits(peaks)
 
 
-def bench_memory_of_slices(drive: Drive, benchmark: Any) -> None:
+def bench_memory_of_slices(drive: Drive, tmp_path: Path, benchmark: Any) -> None:
     """Peak memory of a process that reads a slice."""
     path = str(drive.store.directory.path)
     peaks = []
     for start in drive.starts[:ROUNDS]:
-        found = run_side("benchmarks.speed:slice_side", {"store": path, "start": start})
+        side, arguments = "benchmarks.speed:slice_side", {"store": path, "start": start}
+        found = run_side(side, arguments, tmp_path, TIMEOUT_S)
         assert found["messages"] == 20
         peaks.append(found["peak_rss"])
     benchmark.extra_info["peak_rss"] = peaks

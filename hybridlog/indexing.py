@@ -14,7 +14,8 @@ import numpy as np
 
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.column import STAMP, header_stamps
+from hybridlog.schema.column import STAMP
+from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.collection_names import collection_of
@@ -226,10 +227,9 @@ def _read_stamps(codec: Codec, batch: Batch, told: _Told) -> None:
     rows = told.without_stamps()
     if len(rows):
         left = batch.take(rows)
-        decoded = codec.columns(left.buffer, left.offset, left.length, {STAMP})
-        stamps = header_stamps(decoded.records)
-        if stamps is not None:
-            told.stamped(rows[decoded.rows], stamps)
+        stamped, stamps = stamps_of(codec, left)
+        if len(stamped):
+            told.stamped(rows[stamped], stamps)
 
 
 def _spans(values: NDArray[np.int64], begins: NDArray[np.intp]) -> Iterator[tuple[int, int]]:

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 from tests.mutate import Mutant
 
-AGREEMENT = "tests/query/test_agreement.py"
+AGREEMENT = "tests/query/predicate/test_agreement.py"
+MASK = "tests/query/predicate/test_to_mask.py"
 JSON_ARRAYS = f"{AGREEMENT}::test_what_json_arrays_answer"
 MISSED = "tests/test_faults.py::test_each_message_that_is_missing_in_the_index_is_counted"
 INTERVALS = "tests/query/test_intervals.py"
@@ -23,67 +24,96 @@ def _of(file: str, *mutants: tuple[str, str, str, str]) -> Iterator[Mutant]:
 
 MUTANTS = [
     *_of(
-        "hybridlog/query/evaluate.py",
-        (
-            "short-arrays-have-no-n",
-            "    if stat is not None:\n        found.extend(",
-            '    if stat is not None and stat != "n":\n        found.extend(',
-            JSON_ARRAYS,
-        ),
+        "hybridlog/query/predicate/to_bool.py",
         (
             "true-is-no-number-in-a-summary",
-            "[value * 1 for value in values",
-            "[value for value in values",
+            "value * 1  # True counts as 1",
+            "value",
             f"{AGREEMENT}::test_of_ros_messages",
         ),
         (
             "triggers-ignore-types",
-            "stat = types.statistic(node.field.parts)",
-            "stat = FieldTypes.of(None).statistic(node.field.parts)",
+            "stat = self.types.statistic(parts)",
+            "stat = FieldTypes.of(None).statistic(parts)",
             f"{AGREEMENT}::test_of_ros_messages",
         ),
         (
-            "summaries-have-no-elements",
-            "            values.extend(leaf[end] for leaf in leaves if _is_summary(leaf))\n",
+            "infinities-are-in-order",
+            "if element and isinstance(found, float) and math.isinf(found):",
+            "if False:",
+            f"{AGREEMENT}::test_of_ros_messages",
+        ),
+        (
+            "a-field-called-n-is-no-field",
+            'if stat == "n":\n        return not any(',
+            'if stat == "n":\n        return True or not any(',
+            JSON_ARRAYS,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/predicate/to_mongo.py",
+        (
+            "long-json-arrays-have-no-elements",
+            "            self._of_extremes(asked, order, bounds),\n",
             "",
             JSON_ARRAYS,
         ),
         (
-            "the-mean-is-rounded-twice",
-            "return math.fsum((*values, *rests))",
-            "return math.fsum(values)",
-            f"{AGREEMENT}::test_of_json",
-        ),
-        ("letters-of-all-scripts", "re.ASCII if", "re.NOFLAG if", f"{AGREEMENT}::test_of_patterns"),
-    ),
-    *_of(
-        "hybridlog/query/mongo_filter.py",
-        (
-            "long-json-arrays-have-no-elements",
-            "if _is_number(value) and order in _EXTREMES:",
-            'if _is_number(value) and order == "<=":',
-            JSON_ARRAYS,
-        ),
-        (
             "arrays-in-arrays-have-no-elements",
-            "    if isinstance(asked.parts[-1], str):\n        return found",
-            "    if asked.parts:\n        return found",
+            "if isinstance(asked.parts[-1], str) or not self._types.is_open(asked):",
+            "if asked.parts:",
             JSON_ARRAYS,
         ),
         (
-            "a-field-called-n-is-a-count",
-            'each = {"$not": [{"$and"',
-            'each = {"$or": [True, {"$and"',
-            JSON_ARRAYS,
+            "negation-keeps-what-is-certain",
+            'return _Pair({"$nor": [pair.certain]}, {"$nor": [pair.possible]})',
+            'return _Pair({"$nor": [pair.possible]}, {"$nor": [pair.certain]})',
+            f"{AGREEMENT}::test_of_ros_messages",
+        ),
+        (
+            "large-integers-are-not-rounded",
+            'return _Bounds({"$lte": near}, {"$lt": near})',
+            'return _Bounds({"$lt": near}, {"$lt": near})',
+            f"{AGREEMENT}::test_of_ros_messages",
         ),
     ),
     *_of(
-        "hybridlog/query/tokens.py",
+        "hybridlog/query/predicate/to_mask.py",
+        (
+            "a-null-is-missing",
+            "        possible[leaves.rows] = True\n            if leaves.is_hidden",
+            "        possible[leaves.rows[_valid(leaves.values)]] = True\n            if leaves.is_hidden",
+            f"{MASK}::test_nulls",
+        ),
+        (
+            "floats-as-narrow-as-the-column",
+            "numbers.astype(np.float64, copy=False)",
+            "numbers",
+            MASK,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/predicate/numbers.py",
+        (
+            "integers-meet-the-other-neighbour",
+            '(math.ceil if order in {"<", ">="} else math.floor)',
+            '(math.floor if order in {"<", ">="} else math.ceil)',
+            MASK,
+        ),
+        (
+            "doubles-meet-the-other-neighbour",
+            "near if near < value else",
+            "near if near > value else",
+            MASK,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/predicate/tokens.py",
         (
             "any-element-of-any-element",
             "if is_element and of_any:",
             "if False:",
-            "tests/query/test_where.py::test_errors_point_at_the_place",
+            "tests/query/predicate/test_language.py::test_errors_point_at_the_place",
         ),
     ),
     *_of(

@@ -32,11 +32,9 @@ def test_every_benchmark_runs_and_its_answers_agree(name: str, paths: int, tmp_p
 
 
 def test_a_side_that_fails_says_why(tmp_path: Path) -> None:
+    arguments = {"bag": str(tmp_path / "nosuch"), "store": str(tmp_path / "store")}
     with pytest.raises(SideError, match="nosuch"):
-        run_side(
-            "benchmarks.speed:record_side",
-            {"bag": str(tmp_path / "nosuch"), "store": str(tmp_path / "store")},
-        )
+        run_side("benchmarks.speed:record_side", arguments, tmp_path, 60.0)
 
 
 def test_logs_are_what_they_say_and_the_same_again(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.cli.fetch import write
+from hybridlog.cli.write_answer import write_answer
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -74,7 +74,7 @@ def payloads(name: str, topic: str) -> list[bytes]:
 
 def written(query: Any, form: str) -> bytes:
     stream = io.BytesIO()
-    write(query, form, stream, quiet=True)
+    write_answer(query, form, stream, quiet=True)
     return stream.getvalue()
 
 

@@ -122,7 +122,8 @@ def test_a_count_reads_no_payload(store: hl.Store, robot: Truth) -> None:
     assert near.count() == sum(
         SECOND <= m.log_time - start_of(store) < 2 * SECOND for m in robot["/base/scan"]
     )
-    assert near.counters.chunks_read == near.counters.bytes_read == 0
+    assert near.counters.chunks_read == near.counters.documents_read == 0
+    assert 0 < near.counters.bytes_read < 5000  # columns of the table
 
 
 def start_of(store: hl.Store, recording: str = "robot") -> int:
@@ -204,7 +205,7 @@ def test_a_predicate_reads_only_chunks_with_an_answer(store: hl.Store, robot: Tr
     query = store.topic("/base/scan").where(f"header.seq == {wanted}")
     assert [m.raw for m in query] == [robot["/base/scan"][40].raw]
     assert query.counters.chunks_read == 1
-    assert query.counters.documents_read == 1
+    assert query.counters.documents_read == 0
 
 
 def test_no_message_reads_no_chunk(store: hl.Store) -> None:

@@ -12,11 +12,10 @@ import numpy as np
 
 from benchmarks import usage
 from benchmarks.backends.base import Backend
-from benchmarks.harness.child import ChildError, run_child
 from benchmarks.harness.counters import Counters
 from benchmarks.loads.base import Load
 from benchmarks.samples import Status
-from benchmarks.side import Values, warm_cache
+from benchmarks.side import SideError, Values, run_side, warm_cache
 
 Intake = Literal["threads", "single"]
 
@@ -120,8 +119,8 @@ def run(
         timeout = 3 * load.duration_s / setting.speed + _START_S
     warm_cache([load.payloads])
     try:
-        values = run_child("benchmarks.harness.logger:log", arguments, directory, timeout)
-    except ChildError as error:
+        values = run_side("benchmarks.harness.logger:log", arguments, directory, timeout)
+    except SideError as error:
         values = {"status": "failed", "reason": str(error)}
     status, reason = values.pop("status"), values.pop("reason")
     if "peak_rss" in values:
@@ -132,8 +131,8 @@ def run(
     values["disk_bytes"] = usage.disk_bytes(data)
     try:
         limit_s = _COUNT_S if status == "ok" else _COUNT_FAILED_S
-        found = run_child("benchmarks.harness.logger:count", common, directory, limit_s)
-    except ChildError as error:
+        found = run_side("benchmarks.harness.logger:count", common, directory, limit_s)
+    except SideError as error:
         found = {"status": "failed", "reason": str(error)}
     if status == "ok" and found["status"] != "ok":
         status, reason = "failed", f"opened again, it cannot be counted: {found['reason']}"

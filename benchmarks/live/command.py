@@ -10,14 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.documents import replace_section
 from benchmarks.live.cases import CASES, Row
 from benchmarks.live.recorders import rosbag
 from benchmarks.machine import describe
 from benchmarks.side import SideError
 from benchmarks.studies.runs import step
-
-DOCS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 
 
 def main(arguments: list[str]) -> int:
@@ -45,7 +42,12 @@ def main(arguments: list[str]) -> int:
             except SideError as error:
                 print(f"{name} failed: {error}", file=sys.stderr)
                 failed = True
-    _give(header, rows, chosen)
+    table = markdown(header, rows)
+    if chosen.out is not None:
+        chosen.out.mkdir(parents=True, exist_ok=True)
+        lines = [json.dumps(header), *(json.dumps(row._asdict()) for row in rows)]
+        (chosen.out / "live.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(table)
     return int(failed or not all(row.holds for row in rows if row.recorder == "hybridlog"))
 
 
@@ -53,17 +55,6 @@ def _run(name: str, work: Path, rows: list[Row], *, quick: bool) -> None:
     case = CASES[name]
     with step(f"{name}: {case.about}"):
         rows.extend(case.run(work, quick))
-
-
-def _give(header: dict[str, Any], rows: list[Row], chosen: argparse.Namespace) -> None:
-    lines = [json.dumps(header), *(json.dumps(row._asdict()) for row in rows)]
-    table = markdown(header, rows)
-    if chosen.out is not None:
-        chosen.out.mkdir(parents=True, exist_ok=True)
-        (chosen.out / "live.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    if chosen.write_docs:
-        replace_section(DOCS, "live", table)
-    print("\n".join(lines) if chosen.json else table)
 
 
 def markdown(header: dict[str, Any], rows: list[Row]) -> str:
@@ -107,10 +98,4 @@ def _parser() -> argparse.ArgumentParser:
         "--work", type=Path, metavar="DIR", help="where recordings go; 30 GB must be free"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write live.jsonl")
-    parser.add_argument("--json", action="store_true", help="JSON lines instead of a table")
-    parser.add_argument(
-        "--write-docs",
-        action="store_true",
-        help=f"put the table into {DOCS.parent.name}/{DOCS.name}",
-    )
     return parser

@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.harness.child import ChildError, run_child
 from benchmarks.harness.run import Outcome
 from benchmarks.questions.base import SLOW_TIMES
 from benchmarks.samples import Sample
-from benchmarks.side import warm_cache
+from benchmarks.side import SideError, run_side, warm_cache
 from benchmarks.studies.runs import Context, run_directory, step
 
 if TYPE_CHECKING:
@@ -114,8 +113,8 @@ def _run(
             **arguments,
         }
         try:
-            values = run_child(side, given, directory, context.timeout_s or TIMEOUT_S)
-        except ChildError as error:
+            values = run_side(side, given, directory, context.timeout_s or TIMEOUT_S)
+        except SideError as error:
             values = {"status": "failed", "reason": str(error)}
         told = results.read_bytes() if results.is_file() else b""
     # The last line of a side that was ended may be cut off.

@@ -1,6 +1,6 @@
 """The process in which one backend is filled, opened again, and asked.
 
-Sides, run by `benchmarks.harness.child.run_child`. Each result is written to a file as
+Sides, run by `benchmarks.side.run_side`. Each result is written to a file as
 soon as it is known, so that those of a side that is ended are kept.
 """
 

@@ -1,41 +1,152 @@
-"""What PostgreSQL and SQLite are asked in the same words.
-
-`field` gives the expression of a field by its path, as the indexes have it.
-"""
+"""What PostgreSQL and SQLite are asked in the same words, as their indexes want them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-Field: TypeAlias = Callable[[str], str]
+from benchmarks.questions.base import (
+    ARM,
+    ERROR,
+    GRIPPER,
+    ROSOUT,
+    VIEWPOINT,
+    Asker,
+    Reading,
+    checked,
+    whole_minutes,
+    windows_before,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
 
 
-def closings(table: str, field: Field) -> str:
-    """How often the gripper was closed."""
-    return f"SELECT COUNT(*) FROM {table} WHERE {field('position')} = 0"
+class Sql:
+    """A connection, and how its system writes a field, a table and a value."""
+
+    mark: ClassVar[str] = "?"
+    column: ClassVar[str]
+
+    @abstractmethod
+    def rows(self, query: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """What a query answers."""
+
+    @abstractmethod
+    def field(self, path: str, table: str = "") -> str:
+        """The expression of a field, as the indexes have it."""
+
+    @abstractmethod
+    def name(self, topic: str) -> str:
+        """Quoted name of the table of a topic."""
+
+    @property
+    def time(self) -> str:
+        """Expression of a row's time."""
+        return self.field("_meta.t")
+
+    def number(self, query: str, values: Sequence[object] = ()) -> int:
+        """The one number that a query answers."""
+        return int(self.rows(query, values)[0][0])
+
+    def count(self, topic: str, condition: str, values: Sequence[object] = ()) -> int:
+        """How many rows of a topic fulfil a condition."""
+        query = f"SELECT COUNT(*) FROM {self.name(topic)} WHERE {condition}"
+        return self.number(query, values)
 
 
-def behind(table: str, field: Field) -> str:
-    """How many viewpoints lie behind the robot."""
-    return f"SELECT COUNT(*) FROM {table} WHERE {field('position.x')} <= 0"
+class SqlAsker(Sql, Asker):
+    """All questions; systems replace those for which they have other words."""
+
+    front: ClassVar[str] = ""
+    """Before the viewpoint's x in Q4."""
+
+    def closings(self) -> int:
+        return self.count(GRIPPER, f"{self.field('position')} = 0")
+
+    def behind(self) -> int:
+        return self.count(VIEWPOINT, f"{self.field('position.x')} <= 0")
+
+    def in_region(self) -> int:
+        x, y, z = (self.field(f"pose.position.{axis}") for axis in "xyz")
+        return self.count(ARM, f"{z} > 1 AND {y} > -0.5 AND {y} < 0.5 AND {x} > 0.5 AND {x} < 1")
+
+    def grasps(self, half_ns: int) -> int:
+        mine, theirs = self.field("_meta.t", "a"), self.field("_meta.t", "b")
+        return self.number(
+            f"SELECT COUNT(*) FROM {self.name(GRIPPER)} a "
+            f"WHERE {self.field('position', 'a')} = 0 AND EXISTS ("
+            f"SELECT 1 FROM {self.name(VIEWPOINT)} b "
+            f"WHERE {theirs} > {mine} - {self.mark} AND {theirs} < {mine} + {self.mark} "
+            f"AND {self.front}{self.field('position.x', 'b')} >= 0)",
+            [half_ns, half_ns],
+        )
+
+    def positions(self) -> list[float]:
+        x, y, z = (self.field(f"position.{axis}") for axis in "xyz")
+        query = f"SELECT {x}, {y}, {z} FROM {self.name(VIEWPOINT)} WHERE {x} <= 0"
+        return sums(self.rows(query))
+
+    @abstractmethod
+    def pose(self) -> str:
+        """Expression of a viewpoint as a whole."""
+
+    def closed(self) -> str:
+        """Condition that a command closes the gripper."""
+        return f"{self.field('position')} = 0"
+
+    def changes(self) -> int:
+        return self.number(changes(self.name(VIEWPOINT), self.time, self.pose()))
+
+    def closed_minutes(self) -> list[int]:
+        found = self.rows(closed(self.name(GRIPPER), self.time, self.closed()))
+        return checked(whole_minutes((begin, end) for begin, end in found))
+
+    def before_errors(self) -> int:
+        level = self.field("level")
+        query = f"SELECT {self.time} FROM {self.name(ROSOUT)} WHERE {level} = {ERROR}"
+        windows = windows_before(row[0] for row in self.rows(query))
+        within = f"{self.time} >= {self.mark} AND {self.time} < {self.mark}"
+        return sum(self.count(topic, within, w) for topic in self.topics for w in windows)
 
 
-def in_region(table: str, field: Field) -> str:
-    """How many arm poses lie in the paper's box."""
-    x, y, z = (field(f"pose.position.{axis}") for axis in "xyz")
-    return (
-        f"SELECT COUNT(*) FROM {table} WHERE {z} > 1 "
-        f"AND {y} > -0.5 AND {y} < 0.5 AND {x} > 0.5 AND {x} < 1"
-    )
+class SqlReading(Sql, Reading):
+    """By the expression of the time, on which an indexed system has an index."""
 
+    ranges: ClassVar[str]
+    """Expression of the ranges of a scan, or of a message that has them."""
 
-def positions(table: str, field: Field) -> str:
-    """Coordinates of the viewpoints behind the robot."""
-    x, y, z = (field(f"position.{axis}") for axis in "xyz")
-    return f"SELECT {x}, {y}, {z} FROM {table} WHERE {x} <= 0"
+    @abstractmethod
+    def loaded(self, value: Any) -> dict[str, Any]:
+        """A row's message."""
+
+    def loaded_ranges(self, value: Any) -> Any:
+        """Ranges, from what `ranges` gives."""
+        return self.loaded(value)["ranges"]
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        within = f"{self.time} >= {self.mark} AND {self.time} < {self.mark} ORDER BY {self.time}"
+        return self._ranges(topic, within, [begin, end])
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        until = f"{self.time} <= {self.mark} ORDER BY {self.time} DESC LIMIT 1"
+        found: NDArray[np.float32] = self._ranges(topic, until, [time])[0]
+        return found
+
+    def table(self, topic: str) -> pd.DataFrame:
+        import pandas as pd
+
+        query = f"SELECT {self.column} FROM {self.name(topic)} ORDER BY {self.time}"
+        return pd.json_normalize([self.loaded(row[0]) for row in self.rows(query)])
+
+    def _ranges(self, topic: str, condition: str, values: Sequence[object]) -> NDArray[np.float32]:
+        query = f"SELECT {self.ranges} FROM {self.name(topic)} WHERE {condition}"
+        rows = self.rows(query, values)
+        return np.array([self.loaded_ranges(row[0]) for row in rows], np.float32)
 
 
 def changes(table: str, time: str, pose: str) -> str:

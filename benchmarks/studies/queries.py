@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from benchmarks.loads.base import Load
 
 STUDY = "queries"
-_VERSION = 1
+_VERSION = 2
 """Goes up when the generator makes other messages from the same seed."""
 _SIDE = "benchmarks.questions.sides:ask"
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from benchmarks.loads.base import Load
 
 STUDY = "reading"
-_VERSION = 1
+_VERSION = 2
 _SIDE = "benchmarks.questions.sides:read"
 _USUAL_MEASURES = ("first_ms", "ms", "total_ms", "answer")
 

@@ -32,7 +32,7 @@ CHOSEN = (
 """Those of them that are published unless others are asked for: lasers, many small
 messages, large point clouds, many topics."""
 
-_VERSION = 1
+_VERSION = 2
 """Goes up when a generator makes other messages from the same seed."""
 _LEAST_HCR_S = 60.0
 _LEAST_S = 0.1

@@ -15,6 +15,7 @@ from hybridlog.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.schema.column import STAMP
+from hybridlog.schema.stamps import stamp_array
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
 
@@ -165,7 +166,7 @@ class Decoder:
         records, good = decoded.records, decoded.rows
         stamps = None
         if "stamp" in self._own:
-            stamps = _stamps(records)
+            stamps = stamp_array(records)
             records = _without_stamp(records, self._chosen)
         if len(good) < len(batch):
             batch, seq = batch.take(good), seq[good]
@@ -239,16 +240,6 @@ def _to_decode(
         if summary is not None and is_summary(path, known):
             wanted.add(summary[0])
     return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
-
-
-def _stamps(records: pa.StructArray) -> pa.Array[Any] | None:
-    """The header stamps of messages; None when they have none."""
-    found: pa.Array[Any] = records
-    for name in STAMP.split("."):
-        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
-            return None
-        found = found.flatten()[found.type.get_field_index(name)]
-    return found if found.type == TIME else None
 
 
 def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.StructArray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.column import STAMP, header_stamps
+from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
 
@@ -337,13 +337,8 @@ class ChunkScan:
             times = np.full(len(batch), -1, np.int64)
             for index in distinct(channel[mask]).tolist():
                 rows = np.flatnonzero(mask & (channel == index))
-                part = batch.take(rows)
-                decoded = self._plan.channels[index].codec.columns(
-                    part.buffer, part.offset, part.length, {STAMP}
-                )
-                stamps = header_stamps(decoded.records)
-                if stamps is not None:
-                    times[rows[decoded.rows]] = stamps
+                stamped, stamps = stamps_of(self._plan.channels[index].codec, batch.take(rows))
+                times[rows[stamped]] = stamps
         return (times >= begin) & (times < end)
 
     def _split(

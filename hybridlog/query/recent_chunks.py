@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hybridlog.query.plan import ChunkKey
+    from hybridlog.query.chunk_scan import ChunkKey
     from hybridlog_storage.chunk import StoredChunk
 
 _MOST_BYTES = 32 << 20

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from hybridlog.schema.column import Records
-from hybridlog.schema.wire import Decoded, Unreadable
+from hybridlog.schema.wire import Unreadable
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
@@ -126,25 +125,6 @@ class Codec(Protocol):
             DefinitionError: It has no definition.
         """
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> Decoded:
-        """Decode fields into columns, with whole arrays.
-
-        Args:
-            buffer: Holds the payloads.
-            offset: int64[n], where each payload starts.
-            length: int64[n], bytes of each payload.
-            fields: Dotted paths of the fields to read, each with all below it; None for all.
-
-        Raises:
-            DefinitionError: They have no definition.
-        """
-
     def arrow(
         self,
         buffer: Buffer,
@@ -220,20 +200,6 @@ class OpaqueCodec:
         """
         raise self._refusal()
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> Decoded:
-        """Raise, since the payload cannot be decoded.
-
-        Raises:
-            DefinitionError: Always.
-        """
-        raise self._refusal()
-
     def arrow(
         self,
         buffer: Buffer,
@@ -261,8 +227,3 @@ class OpaqueCodec:
 def error_group(rows: NDArray[np.intp], error: str) -> BodyGroup:
     """The group of unreadable payloads."""
     return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
-
-
-def nothing_decoded(unreadable: list[Unreadable]) -> Decoded:
-    """The columns for rows of which none could be read."""
-    return Decoded(np.empty(0, np.intp), Records({}, 0), unreadable)

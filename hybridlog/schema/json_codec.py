@@ -12,7 +12,6 @@ from hybridlog.schema.object_rows import (
     arrow_of,
     body_groups,
     body_of,
-    columns_of,
     objects_of,
     payloads_of,
     top,
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.object_rows import Plain
-    from hybridlog.schema.wire import Decoded
     from hybridlog_storage.messages import Buffer
 
 
@@ -73,16 +71,6 @@ class JsonCodec:
             PayloadError: It is not JSON.
         """
         return _parsed(memoryview(payload))
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> Decoded:
-        """Fields as columns; see `object_rows.columns_of`."""
-        return columns_of(_parsed, payloads_of(buffer, offset, length), fields)
 
     def arrow(
         self,

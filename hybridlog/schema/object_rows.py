@@ -7,7 +7,6 @@ the rules of `document.py` to it.
 
 from __future__ import annotations
 
-import json
 import math
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -21,13 +20,12 @@ from hybridlog.schema.codec import (
     DecodedArrow,
     DecodedObjects,
     error_group,
-    nothing_decoded,
 )
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
+from hybridlog.schema.column import Scalars
 from hybridlog.schema.document import top_level_names
 from hybridlog.schema.summary import summarise
 from hybridlog.schema.utf8 import repaired_text
-from hybridlog.schema.wire import Decoded, Unreadable
+from hybridlog.schema.wire import Unreadable
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
@@ -180,31 +178,6 @@ def body_groups(bodies: Iterator[bytes | PayloadError]) -> Iterator[BodyGroup]:
         yield error_group(np.array(rows, np.intp), text)
 
 
-# --- columns --------------------------------------------------------------------------
-
-
-def columns_of(
-    plain: Callable[[memoryview], Plain],
-    payloads: Iterator[memoryview],
-    fields: Collection[str] | None,
-) -> Decoded:
-    """Columns of payloads that are decoded to objects one by one.
-
-    Numbers are float64 (NaN for a missing field), int64 or bool; missing strings and lists
-    are empty. Other fields (of changing type, lists of objects) become a string column of
-    JSON.
-
-    Args:
-        plain: Decodes a payload; raises PayloadError.
-        payloads: In the order of the rows.
-        fields: Dotted paths of the fields to read, each with all below it; None for all.
-    """
-    rows, objects, unreadable = _read(plain, payloads)
-    if not objects:
-        return nothing_decoded(unreadable)
-    return Decoded(rows, _records(list(map(top, objects)), _names(fields), 1), unreadable)
-
-
 def arrow_of(
     read: Callable[[memoryview], _T],
     build: Callable[[Sequence[_T], Sequence[Sequence[str]] | None], pa.StructArray],
@@ -256,79 +229,3 @@ def _read(
 def _names(fields: Collection[str] | None) -> list[list[str]] | None:
     """Dotted paths as the names they consist of."""
     return None if fields is None else [f.replace("[]", "").split(".") for f in fields]
-
-
-def _records(
-    objects: Sequence[dict[str, Plain]], wanted: list[list[str]] | None, depth: int
-) -> Records:
-    columns: dict[str, Column] = {}
-    for name in dict.fromkeys(key for each in objects for key in each):
-        below: list[list[str]] | None = None
-        if wanted is not None:
-            below = [path[1:] for path in wanted if path[0] == name]
-            if not below:
-                continue
-            if [] in below:
-                below = None
-        columns[name] = _column([each.get(name) for each in objects], below, depth)
-    return Records(columns, len(objects))
-
-
-def _column(values: list[Plain], wanted: list[list[str]] | None, depth: int) -> Column:
-    given = [v for v in values if v is not None]
-    if given and depth < MAX_DEPTH and all(isinstance(v, dict) for v in given):
-        inner = [v if isinstance(v, dict) else {} for v in values]
-        return _records(inner, wanted, depth + 1)
-    column: Column | None = None
-    if given and all(isinstance(v, _NUMBERS) for v in given):
-        column = _number_column(values, given)
-    elif given and all(isinstance(v, list) for v in given):
-        column = _list_column([v if isinstance(v, list) else [] for v in values])
-    elif given and all(isinstance(v, str) for v in given):
-        column = _strings([v if isinstance(v, str) else "" for v in values])
-    return _strings([_json(v) for v in values]) if column is None else column
-
-
-def _json(value: Plain) -> str:
-    try:
-        return json.dumps(value)
-    except RecursionError:
-        return json.dumps(f"nested deeper than {MAX_DEPTH}")
-
-
-def _number_column(values: Sequence[Plain], given: Sequence[Plain]) -> Scalars | None:
-    if all(isinstance(v, Nanoseconds) and _INT64_MIN <= v <= _INT64_MAX for v in given):
-        times = np.array([0 if v is None else v for v in values], np.int64)
-        return Scalars(times, "duration" if isinstance(given[0], Duration) else "time")
-    if len(given) < len(values):
-        if all(isinstance(v, bool) for v in given):
-            return None
-        values = [math.nan if v is None else v for v in values]
-    numbers = _numbers(values)
-    assert numbers is not None
-    return Scalars(_narrowed(numbers))
-
-
-def _narrowed(numbers: NDArray[Any]) -> NDArray[Any]:
-    """One type for all numbers except int64, so that column types rarely change."""
-    return numbers.astype(np.float64) if numbers.dtype == np.uint64 else numbers
-
-
-def _list_column(lists: list[list[Plain]]) -> Arrays | None:
-    elements = [v for each in lists for v in each]
-    offset = np.zeros(len(lists) + 1, np.int64)
-    np.cumsum([len(each) for each in lists], out=offset[1:])
-    numbers = _numbers(elements)
-    if numbers is not None:
-        return Arrays(Scalars(_narrowed(numbers)), offset)
-    texts = [v for v in elements if isinstance(v, str)]
-    if len(texts) == len(elements):
-        return Arrays(_strings(texts), offset)
-    return None
-
-
-def _strings(texts: list[str]) -> Strings:
-    data = [repaired_text(text).encode() for text in texts]
-    offset = np.zeros(len(data) + 1, np.int64)
-    np.cumsum([len(each) for each in data], out=offset[1:])
-    return Strings(np.frombuffer(b"".join(data), np.uint8), offset)

@@ -17,7 +17,6 @@ from hybridlog.schema.object_rows import (
     arrow_of,
     body_groups,
     body_of,
-    columns_of,
     objects_of,
     payloads_of,
     top,
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
 
     from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
     from hybridlog.schema.object_rows import Plain
-    from hybridlog.schema.wire import Decoded
     from hybridlog_storage.messages import Buffer, Schema
 
 _MAX_DEPTH = 32
@@ -121,20 +119,6 @@ class ProtobufCodec:
             PayloadError: The payload is not of this type.
         """
         return self._parsed(memoryview(payload))
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> Decoded:
-        """Fields as columns; see `object_rows.columns_of`."""
-        return columns_of(
-            lambda payload: _plain(self._parsed(payload)),
-            payloads_of(buffer, offset, length),
-            fields,
-        )
 
     def arrow(
         self,

@@ -19,9 +19,7 @@ import bson
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.codec import nothing_decoded
 from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
-from hybridlog.schema.wire import Decoded, Unreadable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import REDUCED, Channel
 
@@ -124,17 +122,6 @@ class ReducedCodec:
         """
         remains = remains_of(payload)
         raise PayloadError(f"{_GIVEN_UP} ({remains.size} bytes, SHA-256 {remains.sha256.hex()})")
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> Decoded:
-        """No row can be read."""
-        rows = np.arange(len(offset))
-        return nothing_decoded([Unreadable(rows, _GIVEN_UP)] if len(rows) else [])
 
     def arrow(
         self,

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import Scalars
 from hybridlog.schema.summary import summarise
 from hybridlog.tables.layout import ORIGINAL, column_names
@@ -157,7 +158,7 @@ def joined(pieces: Sequence[Array]) -> Array:
     """Columns one after the other, of the type that holds them all.
 
     A column that a piece lacks is null there. Where one piece has summaries of an array, all
-    have.
+    have. Values without a common exact type become JSON text.
 
     Raises:
         UnfitError: There is no such type.
@@ -166,38 +167,73 @@ def joined(pieces: Sequence[Array]) -> Array:
     return pa.concat_arrays(pieces) if len(pieces) > 1 else pieces[0]
 
 
-def alike(pieces: Sequence[Array]) -> list[Array]:
-    """Columns of the type that holds them all; see `joined`."""
+def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
+    """Columns of the type that holds them all.
+
+    Args:
+        pieces: The columns.
+        by_type: Whether all values of their types have to fit, not only these.
+
+    Raises:
+        UnfitError: There is no such type.
+    """
     kind = pieces[0].type if pieces else None
     if all(piece.type == kind for piece in pieces):
         return list(pieces)
-    for piece in pieces[1:]:
-        kind = _common(kind, piece.type)
-    return [_as(piece, kind) for piece in pieces]
+    kind = _common(pieces, by_type=by_type)
+    try:
+        return [_as(piece, kind) for piece in pieces]
+    except (pa.ArrowException, NotImplementedError) as error:
+        raise UnfitError(str(error)) from error
 
 
-def _common(one: Any, other: Any) -> Any:
-    """The type that values of two types have in common."""
-    if one == other or pa.types.is_null(other):
-        return one
-    if pa.types.is_null(one):
-        return other
-    if _is_summary(one) and _is_array(other):
-        return one
-    if _is_summary(other) and _is_array(one):
-        return other
-    if pa.types.is_struct(one) and pa.types.is_struct(other):
-        fields = {field.name: field for field in _fields(one)}
-        for field in _fields(other):
-            known = fields.get(field.name)
-            if known is not None and known.metadata != field.metadata:
+def _common(arrays: Sequence[Array], *, by_type: bool) -> Any:
+    """The type that values of several arrays have in common."""
+    arrays = [array for array in arrays if not pa.types.is_null(array.type)] or [arrays[0]]
+    first = arrays[0].type
+    if all(array.type == first for array in arrays):
+        return first
+    kinds = [array.type for array in arrays]
+    summaries = [array for array in arrays if _is_summary(array.type)]
+    if summaries and all(_is_summary(kind) or _is_array(kind) for kind in kinds):
+        if len(summaries) == len(arrays):
+            return _common_struct(arrays, by_type=by_type)
+        return _common(
+            [array if _is_summary(array.type) else _summarised(array) for array in arrays],
+            by_type=by_type,
+        )
+    if all(map(pa.types.is_struct, kinds)):
+        return _common_struct(arrays, by_type=by_type)
+    if all(map(_is_list, kinds)):
+        return pa.list_(_common([_elements(array) for array in arrays], by_type=by_type))
+    if by_type and not _widens(kinds):
+        raise UnfitError(f"{', '.join(map(str, kinds))} have no common type")
+    return common_type(arrays)
+
+
+def _common_struct(arrays: Sequence[Array], *, by_type: bool) -> Any:
+    fields: dict[str, Any] = {}
+    found: dict[str, list[Array]] = {}
+    for array in arrays:
+        for number, field in enumerate(_fields(array.type)):
+            known = fields.setdefault(field.name, field)
+            if known.metadata != field.metadata:
                 raise UnfitError(f"{field.name} stands for two fields")
-            kind = field.type if known is None else _common(known.type, field.type)
-            fields[field.name] = field.with_type(kind)
-        return pa.struct(list(fields.values()))
-    if _is_list(one) and _is_list(other):
-        return pa.list_(_common(one.value_type, other.value_type))
-    raise UnfitError(f"{one} and {other} have no common type")
+            found.setdefault(field.name, []).append(array.field(number))
+    return pa.struct(
+        [field.with_type(_common(found[name], by_type=by_type)) for name, field in fields.items()]
+    )
+
+
+def _widens(kinds: Sequence[Any]) -> bool:
+    """Whether all values of some types fit one of them, or a wider one."""
+    if all(map(pa.types.is_integer, kinds)):
+        signed = any(map(pa.types.is_signed_integer, kinds))
+        return not (signed and pa.uint64() in kinds)
+    texts = (pa.types.is_string, pa.types.is_large_string)
+    return all(map(pa.types.is_floating, kinds)) or all(
+        any(is_text(kind) for is_text in texts) for kind in kinds
+    )
 
 
 def _as(array: Array, kind: Any) -> Array:
@@ -207,9 +243,8 @@ def _as(array: Array, kind: Any) -> Array:
     if pa.types.is_null(array.type):
         return pa.nulls(len(array), kind)
     if _is_summary(kind) and _is_array(array.type):
-        found = _bytes_summary(array) if not _is_list(array.type) else _summary(array)
-        return _as(found, kind)
-    if pa.types.is_struct(kind):
+        return _as(_summarised(array), kind)
+    if pa.types.is_struct(kind) and pa.types.is_struct(array.type):
         names = [field.name for field in _fields(array.type)]
         columns = [
             _as(array.field(names.index(field.name)), field.type)
@@ -218,9 +253,13 @@ def _as(array: Array, kind: Any) -> Array:
             for field in _fields(kind)
         ]
         return _struct_of(columns, _fields(kind), len(array), _missing(array))
-    if _is_list(kind):
+    if _is_list(kind) and _is_list(array.type):
         return _with_elements(array, _as(_elements(array), kind.value_type), plain=True)
-    return array.cast(kind)
+    return converted(array, kind)
+
+
+def _summarised(array: Array) -> Array:
+    return _summary(array) if _is_list(array.type) else _bytes_summary(array)
 
 
 def _fields(kind: Any) -> list[Any]:

@@ -405,6 +405,8 @@ def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
 
 
 def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Array[Any]]]:
+    if isinstance(array, pa.ExtensionArray):  # JSON text
+        array = array.storage
     if pa.types.is_struct(array.type):
         for number in range(array.type.num_fields):
             inner = array.type.field(number)

@@ -259,7 +259,7 @@ class TopicTable:
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
         named = [part.file.schema.field(top) for top in columns]
         records = _records(list(columns.values()), named, part.rows)
-        return TableRows(t, seq, ours, alike([kind, records])[1])
+        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
 
     def _chosen(
         self, file: ParquetFileReader, paths: Collection[str] | None, own: Collection[str]
@@ -295,7 +295,7 @@ class TopicTable:
             kept = [field for field in fields if field is not None]
             columns = [pa.nulls(0, field.type) for field in kept]
             found.append(_records(columns, kept, 0))
-        first = alike(found)[0]
+        first = alike(found, by_type=True)[0]
         return first.slice(0, 0)
 
 

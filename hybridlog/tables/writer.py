@@ -67,7 +67,6 @@ _ROW = 64  # bytes that a row takes besides its fields
 _RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
 _OPEN_FILES = 128  # unfinished files at a time
 _WHOLE, _REDUCED, _UNREADABLE = 0, 1, 2  # places in `STATES`
-_READABLE: Final = frozenset({"ros1", "cdr"})
 _log = logging.getLogger(__name__)
 
 
@@ -228,6 +227,7 @@ class _File:
         for begin, end in self._write(table):
             first, last = ((int(time[row]), int(seq[row])) for row in (begin, end - 1))
             self.bounds.append((end - begin, *first, *last))
+        self._count(topic, pieces)
 
     def write_together(self, topics: Mapping[str, list[_Piece]]) -> None:
         """Write the rows of several topics, one topic after the other.
@@ -249,6 +249,16 @@ class _File:
         ]
         for begin, end in self._write(pa.concat_tables(tables)):
             self.bounds.append((end - begin, 0, 0, 0, 0))
+        for name, pieces in topics.items():
+            self._count(name, pieces)
+
+    def _count(self, topic: str, pieces: list[_Piece]) -> None:
+        """Rows of a topic were written."""
+        self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
+        self.segments.update(piece.segment for piece in pieces)
+        for piece in pieces:
+            self.reduced += piece.rows if piece.state == _REDUCED else 0
+            self.unreadable += sum(len(rows) for rows, _ in piece.errors)
 
     def _write(self, table: Any) -> Iterator[tuple[int, int]]:
         """Write row groups; yields first rows, and those behind the last."""
@@ -278,11 +288,6 @@ class _File:
 
         from hybridlog.tables.fields import joined
 
-        self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
-        self.segments.update(piece.segment for piece in pieces)
-        for piece in pieces:
-            self.reduced += piece.rows if piece.state == _REDUCED else 0
-            self.unreadable += sum(len(rows) for rows, _ in piece.errors)
         messages = _Messages.joined([piece.messages for piece in pieces])
         segment = np.repeat(
             np.array([piece.segment for piece in pieces], np.int32),
@@ -694,7 +699,8 @@ class TableWriter:
         self._write_small()
         folder = recording_folder(self._root, self._recording)
         for name in incomplete:
-            files.remove_tree(folder / topic_folder(name), depth=IN_TOPIC - 1)
+            with suppress(FileNotFoundError):
+                files.remove_tree(folder / topic_folder(name), depth=IN_TOPIC - 1)
         for name, finished in self._finished.items():
             self._exchange(folder / name, finished)
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.live import cases
 from benchmarks.live.cases import CASES, Row, _recorded
-from benchmarks.live.command import DOCS, main, markdown
+from benchmarks.live.command import main, markdown
 from benchmarks.live.recorders import Kept
 from benchmarks.live.talker import Load
 
@@ -68,5 +68,3 @@ def test_help_names_every_case(capsys: pytest.CaptureFixture[str]) -> None:
     assert leaving.value.code == 0
     said = capsys.readouterr().out
     assert all(name in said for name in CASES)
-    text = DOCS.read_text(encoding="utf-8")
-    assert text.count("<!-- live -->\n") == text.count("<!-- /live -->\n") == 1

@@ -156,7 +156,10 @@ def test_mongodb_and_hybridlog_are_asked_with_the_same_indexes(tmp_path: Path) -
     assert ("position.x", "_meta.inserted_at") in found[0][VIEWPOINT]
 
 
-@pytest.mark.parametrize("name", ["mcap", "bagfile", "sqlite_json1", "hybridlog"])
+@pytest.mark.parametrize(
+    "name",
+    ["mcap", "bagfile", "mongo_json", "postgres_tuned", "sqlite_udf", "sqlite_json1", "hybridlog"],
+)
 def test_what_is_read_is_what_was_published(name: str, work: Path, tmp_path: Path) -> None:
     kind = able(name)
     asked = context(tmp_path, work, backends={name: kind})

@@ -15,9 +15,11 @@ import hybridlog as hl
 from hybridlog.live.control_server import request
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import BufferedMessage, Ring
-from hybridlog.live.snapshots import SnapshotOptions, Trigger
+from hybridlog.live.snapshots import SnapshotOptions, Trigger, _happened, _Watch
 from hybridlog.losses import Cause
 from hybridlog.marks import MARKS
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import TEXT, Speaker, scan, scan_channel, text, text_channel
@@ -217,6 +219,48 @@ def test_a_trigger_counts_the_elements_of_any_array(
         assert bool(robot.recorder._target._reasons) is (second >= 2)
     robot.recorder.stop()
     assert store.topic("/parts").where(where).count() == 2
+
+
+WIDE = Schema("test_msgs/Wide", "ros1msg", b"uint64 id\nfloat64[] a\n")
+
+
+@pytest.mark.parametrize(
+    ("channel", "spell"),
+    [
+        (
+            Channel("/wide", "json", None),
+            lambda number, a: json.dumps({"id": number, "a": a}).encode(),
+        ),
+        (
+            Channel("/wide", "ros1", WIDE),
+            lambda number, a: struct.pack(f"<QI{len(a)}d", number, len(a), *a),
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    ("where", "fires"),
+    [
+        ("a == 7", [1, 3]),
+        ("a[35] == 7", [3]),
+        ("a != 7", [0, 2]),
+        ("a < 1", [0, 2, 3]),
+        ("a.max >= 7", [1, 3]),
+        ("id == 18364758544493064721", [1]),
+        ("id > 18364758544493064721", [2]),
+    ],
+)
+def test_a_trigger_fires_on_whole_and_exact_messages(
+    channel: Channel,
+    spell: Callable[[int, list[float]], bytes],
+    where: str,
+    fires: list[int],
+) -> None:
+    arrays = [[0.5], [7.0], [0.5] * 40, [*[0.5] * 35, 7.0, 8.0]]
+    numbers = [1, 18364758544493064721, 18364758544493064722, 2]
+    watches = (_Watch("it", to_bool(parse(where), None), frozenset({"a", "id"})),)
+    for index, (number, array) in enumerate(zip(numbers, arrays, strict=True)):
+        held = BufferedMessage(channel, spell(number, array), 0, None, 0)
+        assert list(_happened(watches, held)) == (["it"] if index in fires else [])
 
 
 def test_fields_of_the_ring_can_be_watched(store: hl.Store) -> None:

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
@@ -87,6 +88,12 @@ def many(store: hl.Store) -> hl.Store:
     """200 messages, a second apart, in about twenty chunks; counted by chunks."""
     recorded(store, {"a": [(n, "/state", {"s": 0, "name": PADDING}) for n in range(200)]})
     return store
+
+
+@pytest.fixture(autouse=True)
+def without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the chunk index and MongoDB answer."""
+    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
 
 
 def segment_of(store: hl.Store) -> Path:

@@ -573,9 +573,10 @@ def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
     query = plain.topic("/state").where("s == 1")
     for _ in range(2):
         query.intervals()
-        assert query.counters.documents_read == 10
+        assert query.counters.documents_read == 0
         assert query.counters.elapsed_s > 0
-        assert query.counters.bytes_read == query.counters.chunks_read == 0
+        assert 0 < query.counters.bytes_read < 5000
+        assert query.counters.chunks_read == 0
     query.changes("s", "x")
     assert query.counters.chunks_read == 1
     near = plain.topic("/state").before(query, "1s")

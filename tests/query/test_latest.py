@@ -121,7 +121,7 @@ def test_a_message_chosen_by_the_index_costs_something_too(many: hl.Store) -> No
     query = many.topic("/state").where("n < 5")
     assert query.at("end").fields["n"] == 4
     cost = query.counters
-    assert (cost.messages, cost.documents_read, cost.chunks_read) == (1, 5, 1)
+    assert (cost.messages, cost.documents_read, cost.chunks_read) == (1, 0, 1)
     assert cost.payload_bytes > 0
     assert cost.bytes_read > 0
     assert cost.elapsed_s > 0

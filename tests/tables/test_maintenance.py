@@ -125,7 +125,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     shutil.rmtree(path / TABLES)
     (path / PARTS / f"r{entry.id}").mkdir(parents=True)
     (path / PARTS / f"r{entry.id}" / "1.parquet").write_bytes(b"PAR1 half")
-    few.disconnect()
+    few.session.disconnect()
     few.refresh()
     few.connect()
     assert contents(few) == before

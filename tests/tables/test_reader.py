@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.maintenance import tables as making
-from hybridlog.tables import answers, reader
-from hybridlog.tables.fields import FieldShape, UnfitError, joined, records_of
+from hybridlog.tables import reader
+from hybridlog.tables.fields import FieldShape, UnfitError, alike, joined, records_of
 from hybridlog.tables.reader import Tables, TopicTable, _merged
 from hybridlog_storage.errors import StoreError
+from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import BASE, SECOND, decoded, varied, write_log
 from tests.tables.test_writer import compare, topics_of
@@ -211,7 +212,7 @@ DAMAGE = [garble, garble_footer, cut, empty, delete, be_a_folder, be_a_pipe, lea
 
 def count(store: hl.Store, tables: Tables, topic: str) -> int | None:
     (entry,) = store.recordings()
-    return answers.count(tables, entry, topic, mask=is_positive, fields=["i8"])
+    return ask.count(tables, entry, topic, mask=is_positive, fields=["i8"])
 
 
 def is_positive(records: Any) -> Any:
@@ -257,10 +258,10 @@ def test_damage_that_is_met_while_reading(recorded: hl.Store, tables: Tables) ->
     content = bytearray(path.read_bytes())
     content[: len(content) - 20_000] = bytes(len(content) - 20_000)
     path.write_bytes(content)
-    assert answers.count(tables, entry, "/large", mask=is_positive, fields=["i8"]) is None
+    assert ask.count(tables, entry, "/large", mask=is_positive, fields=["i8"]) is None
     assert tables.of(entry, "/large") is None  # from now on
     tables.invalidate()
-    found = answers.rows(tables, entry, "/large", fields=None)
+    found = ask.rows(tables, entry, "/large", fields=None)
     if found is not None:
         with pytest.raises(StoreError, match="damaged"):
             list(found)
@@ -435,17 +436,17 @@ def test_answers(
         for m in decoded(recorded, "log", topic)
         if holds(m.value) and (spans is None or any(a <= m.t < b for a, b in spans))
     ]
-    found = answers.count(tables, entry, topic, mask=of, fields=fields, spans=spans)
+    found = ask.count(tables, entry, topic, mask=of, fields=fields, spans=spans)
     assert found == len(want)
     assert want or topic != "/large"
-    rows = answers.rows(
+    rows = ask.rows(
         tables, entry, topic, mask=of, fields=[*fields, "header.seq"], own=["ref"], spans=spans
     )
     assert rows is not None
     blocks = list(rows)
     assert [seq for block in blocks for seq in block.seq.tolist()] == [m.seq for m in want]
     assert all_of(iter(blocks), "header.seq") == [m.value.header.seq for m in want]
-    assert answers.count(tables, entry, topic, spans=spans) == sum(
+    assert ask.count(tables, entry, topic, spans=spans) == sum(
         spans is None or any(a <= m.t < b for a, b in spans)
         for m in decoded(recorded, "log", topic)
     )
@@ -453,10 +454,10 @@ def test_answers(
 
 def test_what_a_predicate_cannot_tell(recorded: hl.Store, tables: Tables) -> None:
     (entry,) = recorded.recordings()
-    assert answers.count(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
-    assert answers.rows(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
-    assert answers.count(tables, entry, "/nowhere") is None
-    assert answers.rows(tables, entry, "/nowhere") is None
+    assert ask.count(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
+    assert ask.rows(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
+    assert ask.count(tables, entry, "/nowhere") is None
+    assert ask.rows(tables, entry, "/nowhere") is None
 
 
 def test_no_predicate_holds_of_an_unreadable_message(store: hl.Store, tmp_path: Path) -> None:
@@ -469,8 +470,8 @@ def test_no_predicate_holds_of_an_unreadable_message(store: hl.Store, tmp_path: 
     def everything(records: Any) -> Any:
         return np.ones(len(records), np.bool_)
 
-    assert answers.count(tables, entry, "/a", mask=everything, fields=["i8"]) == 25
-    assert answers.count(tables, entry, "/a") == 50
+    assert ask.count(tables, entry, "/a", mask=everything, fields=["i8"]) == 25
+    assert ask.count(tables, entry, "/a") == 50
 
 
 # --- fields ---------------------------------------------------------------------------
@@ -595,8 +596,19 @@ def test_columns_that_a_piece_lacks_are_null() -> None:
     ]
 
 
-@pytest.mark.parametrize("other", [pa.string(), pa.float64(), pa.int32(), pa.list_(pa.int64())])
+@pytest.mark.parametrize("other", [pa.string(), pa.float64(), pa.uint64(), pa.list_(pa.int64())])
 def test_types_without_a_common_one(other: Any) -> None:
     one = struct([{"a": 1}], a=pa.int64())
+    two = pa.StructArray.from_arrays([pa.nulls(0, other)], names=["a"])
     with pytest.raises(UnfitError):
-        joined([one, pa.StructArray.from_arrays([pa.nulls(1, other)], names=["a"])])
+        alike([one, two], by_type=True)
+
+
+def test_values_without_a_common_type_are_json() -> None:
+    one = struct([{"a": 1}], a=pa.int64())
+    two = struct([{"a": "x"}, {"a": None}], a=pa.string())
+    found = joined([one, two]).field("a")
+    assert found.type == pa.json_()
+    assert found.storage.to_pylist() == ["1", '"x"', None]
+    wide = joined([struct([{"a": 1}], a=pa.int8()), one])
+    assert wide.type.field("a").type == pa.int64()

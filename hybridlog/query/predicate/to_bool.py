@@ -210,7 +210,8 @@ class _Reader:
         if self.types.known:
             # The types list the array, not its elements.
             return not element and ".".join(names) in self.types.arrays
-        return self.summarised and value.keys() in _SUMMARIES
+        counts = isinstance(value.get("n"), int)
+        return self.summarised and counts and value.keys() in _SUMMARIES
 
     def _reach(
         self, value: object, parts: _Parts, names: _Names, *, element: bool = False
@@ -274,7 +275,10 @@ def _hidden(
     yield _Hidden(
         summary.get("min"),
         summary.get("max"),
-        surely=not parts or (len(parts) == 1 and (isinstance(first, int) or first == "n")),
+        # Without types, it may also be a message that has a field `n`.
+        surely=not parts
+        or parts == ("n",)
+        or (booleans is not None and len(parts) == 1 and isinstance(first, int)),
         elements=not parts,
         numeric=numeric,
         booleans=booleans,

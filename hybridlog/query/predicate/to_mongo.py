@@ -287,6 +287,10 @@ class _Compiler:
         found = _Pair(found.possible, {"$and": [found.certain, self._unambiguous(array, stat)]})
         lists = [self._of_open_lists(array, stat, order, value) for value in values]
         lists += self._named_by_numbers(array)
+        if stat == "n":
+            # A list in a list may be a summary, which has an `n` and is no message with one.
+            summaries: Filter = {array.path: {"$type": "array"}, asked.path: {"$exists": True}}
+            lists.append(_perhaps(summaries))
         return _any_of([found, *lists, *self._behind_summaries(asked)])
 
     def _of_open_lists(self, array: Field, stat: Stat, order: str, value: Value) -> _Pair:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from pymongo.collection import Collection
 
@@ -257,7 +257,11 @@ even_paths = [
 ]
 
 SLOW = settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    max_examples=15,
+    phases=[Phase.explicit, Phase.generate],  # to shrink is to ask MongoDB for minutes
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=True,
 )
 
 
@@ -270,6 +274,9 @@ SLOW = settings(
 @example([{"a": [[1, 2], [3]]}, {"a": [{"0": 1}]}], ["a[0] == 1", "a[0][1] == 2", "a[0].n == 2"])
 @example([{"a": [2**53 + 1] * 3}], ["a.max == 9007199254740993", "a.mean > 9007199254740992"])
 @example([{"a": [1, "x"] * 20}, {"a": {"n": 40}}], ["a == 1", "a > 0", "a.n == 40", "a.b missing"])
+@example([{"a": [[1, 0, 0, -1, 1], None]}, {"a": [[1] * 5]}], ["a.n == 2", "a.n in [1]", "a.n > 4"])
+@example([{"a": [[0, 1, 2, 3]]}, {"a": {"0": [1] * 5}}], ["a.max != 1", "a[0].n exists"])
+@example([{"m": {"n": {}}}, {"m": {"n": 4}}], ["m.`0` missing", "`m`.`0` missing", "m[1] exists"])
 @example([{"a": [{"n": 1}] * 40}], ["a.n >= 40", "a.n == 1", "a.min missing"])
 def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
     codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
@@ -379,7 +386,15 @@ ros_paths = [
 def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]) -> None:
     codec = ros_codec()
     types = {path.path: path.type for path in codec.paths()}
-    ask(messages, [codec.fields(serialised(message)) for message in messages], questions, types)
+    asked = [*questions, *ROS_QUESTIONS]
+    ask(messages, [codec.fields(serialised(message)) for message in messages], asked, types)
+
+
+ROS_QUESTIONS = [
+    *("m.n == 1", "m[0].n > 0", "m.q.n >= 4", "names.n == 1", "flags.mean > 0.5", "flags == true"),
+    *("a > 1", "a < 0", "not a > 1", "a != 1", "not m.v == 1", "a == inf", "k[4] == 1"),
+    *("w.max >= 9223372036854775809", "u < 9223372036854775809", "w == 9223372036854775809"),
+]
 
 
 STORE = oracle("demo/msg/Whole", DEFINITION)

@@ -1,0 +1,88 @@
+"""Patterns of RE2: linear in time, one meaning in Arrow and in memory."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pytest
+
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.regex import RegexError, compile_regex, is_literal
+from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.to_mongo import to_mongo
+
+JOINTS = "joint_{0}: pos=-1.503 vel=0.204 temp=9{0} state=ok;"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "found"),
+    [
+        ("(a+)+$", [False] * 5),
+        ("(a|a)*b", [False] * 5),
+        (r"pos=.*vel=.*temp=9\d.*state=bad|FAULT", [True] * 5),
+        ("joint_.*pos=.*vel=.*temp=.*error|FAULT code", [True] * 5),
+        ("(?i)pos=.*temp=.*overheat|fault", [True] * 5),
+        (r"joint_\d+: .*temp=\d+ .*state=(bad|err)|FAULT", [True] * 5),
+        (r"FAULT code=\d+$", [True] * 5),
+        ("pos=.*vel=.*temp=.*state=.*FAULT code=18", [False] * 5),
+    ],
+)
+def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) -> None:
+    lines = [
+        " ".join(JOINTS.format(n % 10) for n in range(count)) + " FAULT code=17"
+        for count in (5, 20, 80, 160, 2_000)
+    ]
+    for operator, expected in (("~", found), ("!~", [not each for each in found])):
+        predicate = parse(f's {operator} "{pattern}"')
+        test = to_bool(predicate)
+        assert [test({"s": line}) for line in lines] == expected
+        mask = to_mask(predicate, None, pa.table({"s": lines}))
+        assert mask is not None
+        assert mask.tolist() == expected
+        assert not to_mongo(predicate, {"s": "string"}).is_exact
+
+
+@pytest.mark.parametrize(
+    ("pattern", "is_exact"),
+    [
+        ("slip", True),
+        ("^gripper: ", True),
+        ("é 😀", True),
+        ("^", False),
+        ("a.c", False),
+        ("slip$", False),  # MongoDB finds it before a last end of line, too
+        (r"a\d", False),
+        ("a|b", False),
+        ("(?i)a", False),
+        ("a{2}", False),
+        ("^^a", False),
+    ],
+)
+def test_mongodb_matches_plain_text_only(pattern: str, *, is_exact: bool) -> None:
+    assert is_literal(pattern) is is_exact
+    assert to_mongo(parse(f"s ~ '{pattern}'"), {"s": "string"}).is_exact is is_exact
+
+
+@pytest.mark.parametrize(
+    ("pattern", "place", "reason"),
+    [
+        ("ab(?=c)", 2, "looking around"),
+        (r"(a)\1", 3, "back references"),
+        (r"é\C", 1, "byte"),
+        ("é[b-a]", 2, "character class range"),
+        ("(", 0, "missing"),
+        ("a" * 1001, 1000, "longer than 1000"),
+        ("\ud800", 0, "Unicode"),
+    ],
+)
+def test_refused(pattern: str, place: int, reason: str) -> None:
+    with pytest.raises(RegexError, match=reason) as caught:
+        compile_regex(pattern)
+    assert caught.value.position == place
+
+
+def test_strings_that_are_no_unicode() -> None:
+    test = to_bool(parse("s ~ '^.$'"))
+    assert test({"s": "\ud800"})
+    assert to_bool(parse("s == '\N{REPLACEMENT CHARACTER}'"))({"s": "\ud800"})
+    assert compile_regex(r"\Q\C\E").search(r"a\Cb")

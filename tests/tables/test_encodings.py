@@ -1,0 +1,103 @@
+"""Tables of messages in JSON and protobuf."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow.parquet as pq
+
+import hybridlog as hl
+from hybridlog.tables import writer as writing
+from hybridlog.tables.reader import Tables
+from hybridlog_storage.messages import Schema
+from tests.tables.conftest import SMALL_CHUNKS
+from tests.tables.logs import BASE, write_log
+
+
+def record(store: hl.Store, path: Path, values: Sequence[Any], topic: str = "/a") -> None:
+    said = [(BASE + n, topic, json.dumps(value).encode()) for n, value in enumerate(values)]
+    schema = Schema("any", "jsonschema", b"{}")
+    write_log(path / "log.mcap", said, {topic: ("json", schema)})
+    store.record(path / "log.mcap", name="log", settings=SMALL_CHUNKS)
+
+
+def rows(store: hl.Store, topic: str = "/a") -> list[dict[str, Any]] | None:
+    (entry,) = store.recordings()
+    table = Tables(store.directory.path).of(entry, topic)
+    if table is None:
+        return None
+    return [row for block in table.scan(None) for row in block.records.to_pylist()]
+
+
+def test_json(store: hl.Store, tmp_path: Path) -> None:
+    values = [
+        {"n": 2**53 + 1, "yes": True, "list": [1.5, 2.5], "s": {"t": None, "T": "x"}},
+        {"n": 2, "list": []},
+        {"yes": False, "s": {"T": ""}, "n": None},
+    ] * 400
+    record(store, tmp_path, values)
+    found = rows(store)
+    assert found is not None
+    assert [row["n"] for row in found[:3]] == [2**53 + 1, 2, None]
+    assert [row["yes"] for row in found[:3]] == [True, None, False]
+    assert [row["list"] for row in found[:3]] == [[1.5, 2.5], [], None]
+    assert [row["s"] and row["s"]["T"] for row in found[:3]] == ["x", None, ""]
+    assert len(found) == 1200
+    files = str(store.directory.path / "tables/*/topic=a/*.parquet")
+    query = "select count(*) from read_parquet(?) where n = 9007199254740993"
+    assert duckdb.execute(query, [files]).fetchone() == (400,)
+
+
+def test_json_of_mixed_types(store: hl.Store, tmp_path: Path) -> None:
+    record(store, tmp_path, [{"a": 1}, {"a": "x"}, {"a": {"b": 2}}, {}])
+    found = rows(store)
+    assert found is not None
+    assert [row["a"] and json.loads(row["a"]) for row in found] == [1, "x", {"b": 2}, None]
+
+
+def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, monkeypatch: Any) -> None:
+    """A file has one type: what comes later goes to another one, and all is one table."""
+    monkeypatch.setattr(writing, "_PENDING", 1)
+    monkeypatch.setattr(writing, "_LEFT", 0)
+    monkeypatch.setattr(writing, "_ARENA", 1)
+    values = [{"a": n} if n < 1000 else {"a": n, "b": str(n)} for n in range(2000)]
+    record(store, tmp_path, values)
+    assert len(list((store.directory.path / "tables").glob("*/topic=a/*.parquet"))) == 2
+    found = rows(store)
+    assert found == [{"a": n, "b": None if n < 1000 else str(n)} for n in range(2000)]
+
+
+def test_json_whose_types_change_has_files_and_no_answer(
+    store: hl.Store, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(writing, "_PENDING", 1)
+    monkeypatch.setattr(writing, "_LEFT", 0)
+    monkeypatch.setattr(writing, "_ARENA", 1)
+    record(store, tmp_path, [{"a": n if n < 1000 else str(n)} for n in range(2000)])
+    files = list((store.directory.path / "tables").glob("*/topic=a/*.parquet"))
+    assert sum(pq.read_metadata(path).num_rows for path in files) == 2000
+    assert rows(store) is None
+    assert store.topic("/a").count() == 2000
+
+
+def test_json_that_is_none(store: hl.Store, tmp_path: Path) -> None:
+    said = [(BASE, "/a", b"{"), (BASE + 1, "/a", b'{"n": 1}')]
+    write_log(tmp_path / "log.mcap", said, {"/a": ("json", Schema("x", "jsonschema", b"{}"))})
+    store.record(tmp_path / "log.mcap", name="log")
+    assert rows(store) == [{"n": None}, {"n": 1}]
+    (entry,) = store.recordings()
+    table = Tables(store.directory.path).of(entry, "/a")
+    assert table is not None
+    assert table.unreadable == 1
+
+
+def test_a_field_that_breaks_parquet_costs_only_its_topic(store: hl.Store, tmp_path: Path) -> None:
+    record(store, tmp_path, [{"a.b": 1, "a": {"b": 2}, "": 3, "ä\0": 4}])
+    found = rows(store)
+    assert found is None or found[0]["a.b"] == 1
+    assert store.topic("/a").count() == 1
+    assert store.verify().findings == []
