@@ -40,20 +40,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Backpressure:
-    """What whoever cannot wait asks of segments and index.
+    """Settings of a live recording, which cannot wait for compression, disk and index.
 
     Attributes:
-        hurry: Says whether there is more than can be handed over. Only chunks that shrink to
-            little are compressed then.
-        behind: Says whether there is so much more that the index waits, falls behind, and
-            reads back later from the segments what is no longer in memory.
-        has_room: Says whether so many bytes of chunks may wait for the index in memory.
-        next_chunk_size: Gives the bytes at which a chunk closes that is opened now.
-        spare: Processors for what can wait: to pack a chunk, where there is no hurry, and to
-            make documents and tables of one.
-        on_written: Called, on another thread, when less waits for the disk. Whoever appends
-            never waits, and looks at `writer.waiting` instead.
-        renew: Gives another connection to the index when one has failed.
+        hurry: Returns whether writing is behind. Then only chunks that shrink to a fifth are
+            compressed.
+        behind: Returns whether writing is so far behind that indexing pauses; it later reads
+            chunks back from the segments.
+        has_room: Returns whether this many bytes of chunks may wait for the index in memory.
+        next_chunk_size: Returns the size in bytes of the next chunk.
+        spare: Semaphore of the processors for packing without hurry, and for making documents
+            and tables.
+        on_written: Called on another thread when less content waits for the disk. `append`
+            then never waits; its caller watches `writer.waiting`.
+        renew: Returns a new connection to the index after one has failed.
     """
 
     hurry: Callable[[], bool]

@@ -134,7 +134,7 @@ class Store:
 
     @property
     def repairs(self) -> RepairReport:
-        """What was repaired when the store was opened."""
+        """Repairs made when the store was opened."""
         return self.session.repairs
 
     # The index.
@@ -151,7 +151,7 @@ class Store:
 
     @property
     def index_place(self) -> str:
-        """Where the index is, in words; MongoDB is not asked."""
+        """Description of the index's place; does not connect to MongoDB."""
         return self.session.connection.place
 
     def connect(self) -> Database:

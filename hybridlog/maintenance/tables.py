@@ -163,7 +163,7 @@ def chunks_with(entry: RecordingEntry, table: ChunkTable, topics: Collection[str
 
 
 def damage(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, str]:
-    """What is wrong with the tables that are there, by topic. Reads every byte of them."""
+    """Problems of the existing tables, by topic. Reads every byte of them."""
     from hybridlog.tables.reader import Tables
 
     tables = Tables(directory.path)

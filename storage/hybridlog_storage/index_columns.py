@@ -51,7 +51,7 @@ class KeyColumns:
         return KeyColumns(self.time[rows], self.recording[rows], self.seq[rows])
 
     def place_after(self, time: int, seq: int) -> int:
-        """How many keys of one recording, in order, are not after a place."""
+        """Number of sorted keys of one recording that are not after a place."""
         low = int(np.searchsorted(self.time, time, "left"))
         high = int(np.searchsorted(self.time, time, "right"))
         return low + int(np.searchsorted(self.seq[low:high], seq, "right"))
@@ -59,7 +59,7 @@ class KeyColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceColumns:
-    """Where the payloads of messages lie.
+    """Positions of the payloads of messages.
 
     Attributes:
         segment: int64[n], number of the segment.
@@ -97,7 +97,7 @@ def key_columns(batch: bytes) -> KeyColumns:
 
 
 def reference_columns(batch: bytes) -> ReferenceColumns:
-    """Where the payloads of messages lie, in document order.
+    """Positions of the payloads of messages, in document order.
 
     Args:
         batch: Documents one after the other, projected to `REFERENCE`.
