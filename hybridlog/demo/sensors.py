@@ -117,7 +117,8 @@ class Camera:
         stretch = 1 / np.cos(self._angle)
         px = x.astype(np.float32) + self._away * (np.cos(angle) * stretch).astype(np.float32)
         py = y.astype(np.float32) + self._away * (np.sin(angle) * stretch).astype(np.float32)
-        material = ((px >= 0) & (px <= WIDTH) & (py >= 0) & (py <= DEPTH)) + 2 * (self._slope < 0)
+        inside = (px >= 0) & (px <= WIDTH) & (py >= 0) & (py <= DEPTH)
+        material = inside + np.uint8(2) * (self._slope < 0)
         shade = np.repeat(0.55 + 0.45 / (1 + self._away**2 / 30), self.width, axis=1)
         rays = np.repeat(x, self.width), np.repeat(y, self.width), angle
         walls, things = plan.cast(*rays, plan.tall), plan.cast(*rays, ~plan.tall)
@@ -132,9 +133,9 @@ class Camera:
             # A dark skirting board where a surface meets the floor.
             light = light * np.where(z < 0.08, np.float32(0.55), np.float32(1))
             shade[:, columns] = np.where(drawn, light, shade[:, columns])
-            material[:, columns] = np.where(drawn, number, material[:, columns])
+            material[:, columns] = np.where(drawn, np.uint8(number), material[:, columns])
         palette = _PALETTE if self.channels == 3 else (_PALETTE @ _GREY)[:, None]
-        flat = np.asarray(palette[material] * shade[:, :, None], np.float32).ravel()
+        flat = np.asarray(palette.take(material, axis=0) * shade[:, :, None], np.float32).ravel()
         flat += 2.0 * rng.standard_normal(flat.size, np.float32)
         return np.asarray(np.clip(flat, 0, 255).astype(np.uint8))
 

@@ -82,9 +82,10 @@ def write_bag(
     path = Path(path)
     speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types(ros))
     names = [topic.name for topic in TOPICS]
-    for name in sorted(set(topics or ()).difference(names)):
+    wanted = set(names if topics is None else topics)
+    for name in sorted(wanted.difference(names)):
         raise TopicError(f"the robot has no topic {name}; it has {', '.join(names)}")
-    chosen = [t for t in TOPICS if topics is None or t.name in set(topics)]
+    chosen = [topic for topic in TOPICS if topic.name in wanted]
     if path.exists() or path.is_symlink():
         raise UsageError(f"{path} exists already; remove it or choose another name")
     if ros == 2 and compression != "none":
