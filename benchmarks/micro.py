@@ -108,9 +108,6 @@ def read(bag: Path, topic: str, limit: int) -> Stream:
         bag: One of the bags.
         topic: One of its topics.
         limit: Most messages.
-
-    Raises:
-        StopIteration: There is no such topic.
     """
     with Reader(bag) as reader:
         connection = next(c for c in reader.connections if c.topic == topic)

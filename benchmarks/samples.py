@@ -69,10 +69,6 @@ class Journal:
 
     Args:
         directory: Made when it is not there.
-
-    Raises:
-        ValueError: What lies there is no journal; the message names the line.
-        OSError: It cannot be read.
     """
 
     def __init__(self, directory: Path) -> None:

@@ -60,9 +60,6 @@ def run_side(
 
     Returns:
         What the function returned, and `peak_rss`, bytes.
-
-    Raises:
-        SideError: It crashed, or was ended.
     """
     output, errors = directory / "side.out", directory / "side.err"
     environment = {

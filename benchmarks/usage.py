@@ -107,11 +107,7 @@ def working_below(directory: Path, program: str) -> tuple[int, ...]:
 
 
 def wait_for_mongods(directory: Path) -> None:
-    """Wait until no mongod with its data below a directory is left.
-
-    Raises:
-        TimeoutError: One does not end within a minute.
-    """
+    """Wait until no mongod with its data below a directory is left."""
     deadline = time.monotonic() + _MONGOD_END_S
     while working_below(directory, "mongod"):
         if time.monotonic() > deadline:

@@ -178,10 +178,6 @@ def typestore_of(schema: Schema) -> tuple[Typestore, str]:
 
     Args:
         schema: Of encoding `ros1msg`, `ros2msg` or `ros2idl`.
-
-    Raises:
-        TypesysError: rosbags cannot read it.
-        KeyError: It refers to a type that is not there.
     """
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     from rosbags.typesys.msg import normalize_msgtype

@@ -102,11 +102,7 @@ class Hybridlog(Backend):
             )
 
     def counts(self) -> Mapping[str, int]:
-        """Payloads that were read back, by topic.
-
-        Raises:
-            BackendFailedError: The index has another number of documents.
-        """
+        """Payloads that were read back, by topic."""
         found = dict.fromkeys((channel.topic for channel in self._channels), 0)
         try:
             store = self.store

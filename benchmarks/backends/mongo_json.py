@@ -179,14 +179,7 @@ class MongoJsonIndexed(MongoJson):
 
 @dataclass(slots=True)
 class _Batch:
-    """What one channel has not sent yet.
-
-    Attributes:
-        lock: Whoever does anything with it has this.
-        documents: In the order in which they came.
-        size: Their bytes.
-        since: When the first of them came.
-    """
+    """What one channel has not sent yet."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     documents: list[RawBSONDocument] = field(default_factory=list)

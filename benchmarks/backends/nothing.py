@@ -50,11 +50,7 @@ class Nothing(Backend):
         (self.directory / _COUNTS).write_text(json.dumps(totals), encoding="utf-8")
 
     def counts(self) -> Mapping[str, int]:
-        """The counts that were written.
-
-        Raises:
-            BackendFailedError: `finish` was not reached.
-        """
+        """The counts that were written."""
         try:
             text = (self.directory / _COUNTS).read_text(encoding="utf-8")
         except FileNotFoundError:

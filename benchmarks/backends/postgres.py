@@ -92,11 +92,7 @@ class PostgresAutocommit(DatabaseBackend):
         return table_of(topic)
 
     def connect(self) -> Connection:
-        """A new connection in autocommit mode; whoever asked for it closes it.
-
-        Raises:
-            BackendFailedError: The server does not answer.
-        """
+        """A new connection in autocommit mode; whoever asked for it closes it."""
         import psycopg
 
         try:
@@ -208,16 +204,7 @@ class PostgresAutocommit(DatabaseBackend):
 
 @dataclass(slots=True)
 class _Batch:
-    """One channel's transaction, to which its messages go as they come.
-
-    Attributes:
-        lock: Whoever does anything with it has this.
-        copy: The COPY that is under way.
-        ending: Ends it: at its own end well, in an exception without a trace.
-        texts: What it was given, in case that one of them cannot be held.
-        size: Their characters.
-        since: When it began.
-    """
+    """One channel's transaction, to which its messages go as they come."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     copy: Copy | None = None
@@ -318,11 +305,7 @@ class PostgresTuned(PostgresAutocommit):
 
     @contextmanager
     def _one_by_one(self, channel: int, batch: _Batch) -> Iterator[None]:
-        """If one message cannot be held, the others need not suffer for it.
-
-        Raises:
-            BackendFailedError: It was something else.
-        """
+        """If one message cannot be held, the others need not suffer for it."""
         import psycopg
 
         try:

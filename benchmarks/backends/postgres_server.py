@@ -52,11 +52,7 @@ class Programs:
 
 
 def find_programs() -> Programs:
-    """The wheel's programs, else those on the PATH, else the newest Debian has put aside.
-
-    Raises:
-        BackendMissingError: There are none, or root cannot run them here.
-    """
+    """The wheel's programs, else those on the PATH, else the newest Debian has put aside."""
     for directory in _places():
         if all(os.access(directory / name, os.X_OK) for name in ("initdb", "postgres")):
             if os.geteuid() != 0:
@@ -79,9 +75,6 @@ def start(
         server: New.
         data: Directory of the cluster; its parent exists.
         settings: Of the server, besides where it listens.
-
-    Raises:
-        BackendMissingError: It does not start.
     """
     server.prepare(data, programs.owner)
     if not (data / _COMPLETE).is_file():

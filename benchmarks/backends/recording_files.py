@@ -100,11 +100,7 @@ class FileBackend(Backend):
                     recorder.close()
 
     def _check_channels(self, channels: Sequence[Channel]) -> None:
-        """See that the files can hold such channels.
-
-        Raises:
-            BackendMissingError: They cannot.
-        """
+        """See that the files can hold such channels."""
 
     @abstractmethod
     def _record(self, path: Path) -> Recorder:

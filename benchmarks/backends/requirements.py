@@ -13,9 +13,6 @@ def need(module: str, package: str) -> None:
     Args:
         module: What is imported.
         package: What is installed, as pip calls it.
-
-    Raises:
-        BackendMissingError: It cannot; says how to install it.
     """
     try:
         found = find_spec(module)

@@ -59,9 +59,6 @@ class Server:
         Args:
             data: Directory of the data; its parent exists.
             owner: User id that the server will run as, when it is another one.
-
-        Raises:
-            BackendMissingError: Another benchmark uses it, or it cannot be written.
         """
         try:
             self._lock = self._locked()
@@ -93,9 +90,6 @@ class Server:
             command: The program and its arguments.
             stop: The signal that ends it in good order.
             answers: Whether it answers now; returns soon.
-
-        Raises:
-            BackendMissingError: It ends, or does not answer; with what it logged.
         """
         assert self._lock is not None
         begin = self.log.stat().st_size if self.log.exists() else 0
@@ -154,11 +148,7 @@ class Server:
             shutil.rmtree(self.sockets, ignore_errors=True)
 
     def _locked(self) -> int:
-        """A descriptor with the lock.
-
-        Raises:
-            BackendMissingError: Somebody else has it for long.
-        """
+        """A descriptor with the lock."""
         descriptor = os.open(self._lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         deadline = time.monotonic() + _END_LIMIT_S
         while True:

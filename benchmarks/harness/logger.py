@@ -184,11 +184,7 @@ def _end(publisher: subprocess.Popen[str]) -> None:
 
 
 class _Meter:
-    """What a run uses, from its making until it is stopped.
-
-    Args:
-        system: Its servers are counted.
-    """
+    """What a run uses, from its making until it is stopped."""
 
     def __init__(self, system: Backend) -> None:
         self._system = system

@@ -88,9 +88,6 @@ def run(
         backend: A class at the top of a module.
         directory: Empty and nobody else's. The caller removes it.
         setting: How.
-
-    Raises:
-        ValueError: The load has no messages.
     """
     setting = setting or Setting()
     if not len(load):
@@ -146,11 +143,7 @@ def run(
 def _account(
     values: Values, load: Load, counters: Counters, counts: Mapping[str, int] | None
 ) -> str:
-    """Put what was published and what was found side by side.
-
-    Returns:
-        What does not fit; empty when all does.
-    """
+    """Put what was published and what was found side by side; returns what does not fit."""
     published, dropped = _by_topic(load, counters.published()), _by_topic(load, counters.dropped)
     values["published"] = sum(published.values())
     values["dropped"] = sum(dropped.values())

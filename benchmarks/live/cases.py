@@ -190,12 +190,7 @@ def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
 
 
 def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int]:
-    """What a killed recorder has left.
-
-    Returns:
-        Age of the last message at the kill, in seconds; messages; messages that are not as
-        they were sent, or whose forerunner is missing, and findings of `verify`.
-    """
+    """Age in seconds of the last message at the kill, messages, and faults among them."""
     import hybridlog
 
     data = Data(load)

@@ -84,11 +84,7 @@ class Ours:
         time.sleep(_START_S)
 
     def stop(self) -> Kept:
-        """Ends it and reads what it says of itself.
-
-        Raises:
-            SideError: It did not end in good order.
-        """
+        """Ends it and reads what it says of itself."""
         processes = with_children([self.process.pid])
         used = cpu_s(processes)
         _end(self.process)

@@ -125,9 +125,6 @@ def hcr_like(
         state: With joint states and transforms, which the robot publishes and the
             study's launch file does not record.
         name: Of the load.
-
-    Raises:
-        UsageError: An argument is out of its range, or the directory cannot be written.
     """
     if sessions < 1 or not minutes >= 1 or seed < 0:
         raise UsageError(
@@ -154,18 +151,7 @@ def hcr_like(
 
 @dataclass(slots=True)
 class _Plan:
-    """One session: all log times, and what happens.
-
-    Attributes:
-        seed: Of the load.
-        number: Of the session.
-        start: Log time of its begin, ns.
-        viewpoint: The user's viewpoint and the right gripper.
-        drags: Of each arm.
-        left: Openings that the left gripper is sent to.
-        times: Log times by topic, ascending but for /tf and the feedback.
-        errors: Log times of the system errors.
-    """
+    """One session: all log times, and what happens."""
 
     seed: int
     number: int
@@ -441,11 +427,7 @@ def _diagnostics(types: OldTypes) -> list[Any]:
 
 
 def _jpegs(seed: int) -> list[NDArray[np.uint8]]:
-    """Pictures as JPEG files, of the quality that the image transport of ROS sets.
-
-    Raises:
-        MissingDependencyError: Pillow is not installed.
-    """
+    """Pictures as JPEG files, of the quality that the image transport of ROS sets."""
     try:
         from PIL import Image
     except ImportError as error:

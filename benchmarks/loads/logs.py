@@ -29,10 +29,6 @@ def from_log(path: Path, directory: Path, *, seconds: float | None = None) -> Lo
         path: A file or a directory.
         directory: Where the load goes; what lies there is replaced.
         seconds: Only so many from the start of the log; all when None.
-
-    Raises:
-        SourceError: There is nothing to read; the message says why and what to do.
-        UsageError: `seconds` is not above 0, or the directory cannot be written.
     """
     if seconds is not None and not seconds > 0:
         raise UsageError(f"{seconds:g} s of a log are nothing; choose more than 0 s")

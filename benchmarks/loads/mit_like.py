@@ -279,9 +279,6 @@ def mit_like(
         seed: Not negative. Gives the noise.
         kinect: With colour and depth images, as the later recordings have.
         name: Of the load.
-
-    Raises:
-        UsageError: An argument is out of its range, or the directory cannot be written.
     """
     if not 0 < seconds <= MAX_SECONDS or seed < 0:
         raise UsageError(

@@ -32,9 +32,6 @@ class Spool:
 
     Args:
         directory: Made when it is not there; a load that lies in it is replaced.
-
-    Raises:
-        UsageError: The directory cannot be written to.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -104,9 +101,6 @@ class Spool:
             channels: One a topic.
             seconds: Leave out what is due this long after the start, or later.
             damage: What of a log could not be read.
-
-        Raises:
-            UsageError: There is no message.
         """
         if not self._columns:
             raise UsageError(f"{name}: no messages; choose a longer time or another log")

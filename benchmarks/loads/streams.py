@@ -69,9 +69,6 @@ def stream(
         seed: Of the payloads.
         pool: Payload file of a stream of the same size, seed and `pool_messages`: it is
             shared, as a hard link.
-
-    Raises:
-        ValueError: A number is too small.
     """
     if size < MIN_SIZE:
         raise ValueError(f"a message of {size} bytes is too small; give {MIN_SIZE} or more")

@@ -113,11 +113,7 @@ def table_checksum(frame: pd.DataFrame) -> tuple[int, int]:
 def _measured(
     jobs: Sequence[Callable[[], _T]], summary: Callable[[_T], tuple[int, int]]
 ) -> dict[str, Any]:
-    """Do jobs one after the other; what they give is summed up outside of the time.
-
-    Returns:
-        `first_ms`; `ms`, the median; `total_ms`; and `answer`.
-    """
+    """Do jobs one after the other; what they give is summed up outside of the time."""
     times: list[float] = []
     answers: list[tuple[int, int]] = []
     for job in jobs:

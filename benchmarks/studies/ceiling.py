@@ -170,11 +170,7 @@ def _has_queues(backend: str) -> bool:
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
-    """Look for the ceilings that are not known yet; the backends take turns.
-
-    Raises:
-        ValueError: A backend is not known.
-    """
+    """Look for the ceilings that are not known yet; the backends take turns."""
     settings = settings or Settings.usual(quick=context.quick)
     for searches in _rounds(context, settings):
         take_turns(context, searches)

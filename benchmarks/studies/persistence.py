@@ -38,22 +38,13 @@ def plan(context: Context, settings: Settings | None = None) -> list[Sample]:
 
     The backends take turns within a log, so that what disturbs the machine for a while
     hits all of them alike.
-
-    Raises:
-        SourceError: There is no log at a path.
-        ValueError: A backend or a log is not known.
     """
     settings = settings or Settings.usual(quick=context.quick)
     return _plan(context, settings, settings.replays(context.seed))
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
-    """Do what is still to be done.
-
-    Raises:
-        SourceError: There is no log at a path, or nothing of it can be read.
-        ValueError: A backend or a log is not known.
-    """
+    """Do what is still to be done."""
     settings = settings or Settings.usual(quick=context.quick)
     found = settings.replays(context.seed)
     by_name = {replay.name: replay for replay in found}

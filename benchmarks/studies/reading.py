@@ -51,11 +51,7 @@ class Settings:
 
 
 def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
-    """Every backend's turn, those that the journal has included.
-
-    Raises:
-        ValueError: A backend is not known.
-    """
+    """Every backend's turn, those that the journal has included."""
     settings = settings or Settings.usual(quick=context.quick)
     found = []
     for name, kind in chosen(context.backends, settings.backends).items():
@@ -73,11 +69,7 @@ def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
-    """Do what is still to be done.
-
-    Raises:
-        ValueError: A backend is not known.
-    """
+    """Do what is still to be done."""
     settings = settings or Settings.usual(quick=context.quick)
     truth: dict[tuple[str, int], list[int]] = {}
 

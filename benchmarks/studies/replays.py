@@ -73,11 +73,6 @@ def replays(
         logs: Files and directories; a directory stands for the log that it is, or for
             all logs that lie in it. One that is named twice is published once.
         made: Names of those that are made.
-
-    Raises:
-        SourceError: There is no log at a path.
-        UsageError: None is left.
-        ValueError: A name in `made` is not known, or `seconds` is not above 0.
     """
     if not seconds > 0:
         raise ValueError(f"{seconds:g} s of a log are nothing; give more than 0 s")
@@ -113,12 +108,7 @@ class LogSettings:
     backends: Sequence[str] | None = None
 
     def replays(self, seed: int) -> list[Replay]:
-        """The logs.
-
-        Raises:
-            SourceError: There is no log at a path.
-            ValueError: A name in `made` is not known, or `seconds` is not above 0.
-        """
+        """The logs."""
         logs = self.logs or (chosen_logs() if self.chosen else ())
         return replays(seed, self.log_seconds, logs, self.made)
 
@@ -129,11 +119,7 @@ def chosen_logs() -> list[Path]:
 
 
 def logs_at(path: Path) -> list[Path]:
-    """The log at a path, or all logs in a directory that is none itself.
-
-    Raises:
-        SourceError: There is none.
-    """
+    """The log at a path, or all logs in a directory that is none itself."""
     try:
         open_source(path).close()
     except SourceError:

@@ -150,9 +150,6 @@ def chosen(
     Args:
         backends: All, by name.
         names: Which; None for all.
-
-    Raises:
-        ValueError: One is not known; the message names those that are.
     """
     if names is None:
         return dict(backends)
@@ -176,9 +173,6 @@ def _digesting_s(values: Mapping[str, Any]) -> float:
     A virtual machine returns freed memory to its host bit by bit, every two seconds. The
     host then loses sight of the pages that are in use, too, and who touches them next pays
     for it: 100 to 300 ms of a run's first seconds, when the one before had kept gigabytes.
-
-    Args:
-        values: Of the run.
     """
     kept: float = values.get("persisted_bytes", 0)
     return min(kept / _DIGESTED_S, _DIGESTING_S)

@@ -180,11 +180,7 @@ def take_turns(context: Context, searches: Iterable[Search]) -> None:
 
 
 def _try(context: Context, search: Search, failed: set[str]) -> bool:
-    """Do the next trial of a search.
-
-    Returns:
-        Whether there was one to do.
-    """
+    """Do the next trial of a search; returns whether there was one."""
     trial = next_trial(context, search, failed)
     if trial is None:
         return False

@@ -106,12 +106,7 @@ def speeds(
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
-    """Look for the speeds that are not known yet; the backends take turns.
-
-    Raises:
-        SourceError: There is no log at a path, or nothing of it can be read.
-        ValueError: A backend or a log is not known.
-    """
+    """Look for the speeds that are not known yet; the backends take turns."""
     settings = settings or Settings.usual(quick=context.quick)
     for replay in settings.replays(context.seed):
         for searches in _rounds(context, settings, replay):

@@ -59,9 +59,6 @@ def plan(context: Context, settings: Settings | None = None) -> list[Sample]:
 
     The backends take turns within a stream, so that what disturbs the machine for a
     while hits all of them alike.
-
-    Raises:
-        ValueError: A backend is not known.
     """
     settings = settings or Settings.usual(quick=context.quick)
     backends = chosen(context.backends, settings.backends)
@@ -75,11 +72,7 @@ def plan(context: Context, settings: Settings | None = None) -> list[Sample]:
 
 
 def run(context: Context, settings: Settings | None = None) -> None:
-    """Do what is still to be done.
-
-    Raises:
-        ValueError: A backend is not known.
-    """
+    """Do what is still to be done."""
     for sample in plan(context, settings):
         context.run(sample, partial(_stream, context, sample.case))
 

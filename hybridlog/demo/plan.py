@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 WIDTH, DEPTH, WALL_HEIGHT = 14.0, 10.0, 2.6
 """Metres of the building in x and y, and up to its ceiling."""
@@ -27,13 +25,7 @@ _PILLARS = ((8.4, 5.0, 0.28), (10.6, 5.0, 0.28), (8.4, 8.9, 0.22), (12.9, 8.9, 0
 
 
 class Hits(NamedTuple):
-    """Ends of n rays.
-
-    Attributes:
-        distance: float64[n], metres in the plane; infinite without a hit.
-        surface: int64[n], row of the plan's surfaces, -1 without a hit.
-        cosine: float64[n], cosine of the angle between ray and surface normal, 0 to 1.
-    """
+    """Ends of n rays: metres (infinite without a hit), row of the surface, cosine of incidence."""
 
     distance: Floats
     surface: NDArray[np.int64]
@@ -41,16 +33,9 @@ class Hits(NamedTuple):
 
 
 class FloorPlan:
-    """Upright surfaces, numbered: straight segments first, then round pillars.
+    """Upright surfaces: float64[s, 4] straight `segments`, then float64[p, 3] round `pillars`.
 
-    Args:
-        seed: Moves pillars and boxes a little; walls and doors stay.
-
-    Attributes:
-        segments: float64[s, 4], x and y of both ends, metres.
-        pillars: float64[p, 3], x, y and radius, metres.
-        height: float64[s + p], metres above the floor.
-        tall: bool[s + p], surfaces that reach the ceiling.
+    The seed moves pillars and boxes a little; walls and doors stay.
     """
 
     def __init__(self, seed: int) -> None:
@@ -72,14 +57,7 @@ class FloorPlan:
     def cast(
         self, x: Floats, y: Floats, angle: Floats, surfaces: NDArray[np.bool_] | None = None
     ) -> Hits:
-        """The nearest surface in each ray's way.
-
-        Args:
-            x: float64[n], origin of each ray, metres.
-            y: float64[n].
-            angle: float64[n], radians from the x axis, counter-clockwise.
-            surfaces: Surfaces that count; all when None.
-        """
+        """The nearest surface, of all or some, in the way of rays: metres and radians."""
         dx, dy = np.cos(angle), np.sin(angle)
         best, which, cosine = np.full(len(x), np.inf), np.full(len(x), -1), np.zeros(len(x))
         counted = range(len(self.height)) if surfaces is None else np.flatnonzero(surfaces)
@@ -117,9 +95,7 @@ class FloorPlan:
 
     def occupancy(self, resolution: float) -> NDArray[np.int8]:
         """Occupancy grid, int8[rows, columns] from y = 0 up: 100 occupied, 0 free."""
-        gx, gy = np.meshgrid(
-            (np.arange(round(WIDTH / resolution)) + 0.5) * resolution,
-            (np.arange(round(DEPTH / resolution)) + 0.5) * resolution,
-        )
+        columns, rows = (np.arange(round(m / resolution)) + 0.5 for m in (WIDTH, DEPTH))
+        gx, gy = np.meshgrid(columns * resolution, rows * resolution)
         near = self.clearance(gx.ravel(), gy.ravel()) < resolution * 0.75
         return np.where(near, 100, 0).astype(np.int8).reshape(gx.shape)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from hybridlog.demo.plan import FloorPlan
+from hybridlog.demo.plan import Floats, FloorPlan
 from hybridlog_storage.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 MAX_DURATION_S = 7 * 86_400.0
 MOTOR_WARN, MOTOR_ERROR = 70.0, 80.0
@@ -33,12 +28,8 @@ _PATH = np.array(
 )
 # Kind, a point close by, seconds of standing. `brake` is a sudden stop for an obstacle.
 _STOPS = (
-    ("dock", 2.9, 3.4, 2.0),
-    ("pick", 9.2, 2.1, 3.0),
-    ("place", 12.2, 4.6, 2.4),
-    ("brake", 10.0, 7.6, 1.4),
-    ("pick", 4.0, 7.85, 4.2),
-    ("brake", 2.9, 5.9, 1.2),
+    *(("dock", 2.9, 3.4, 2.0), ("pick", 9.2, 2.1, 3.0), ("place", 12.2, 4.6, 2.4)),
+    *(("brake", 10.0, 7.6, 1.4), ("pick", 4.0, 7.85, 4.2), ("brake", 2.9, 5.9, 1.2)),
 )
 _ARRIVALS = {
     "dock": "dock reached, lap finished",
@@ -57,11 +48,7 @@ class Stop(NamedTuple):
 
 
 class State(NamedTuple):
-    """The true motion at n moments, all float64[n]; metres, seconds and radians.
-
-    Position in the plan, heading unwrapped over laps, distance since the start, speed and
-    acceleration forward, yaw rate counter-clockwise.
-    """
+    """The motion at n moments, float64[n] each, in metres, seconds and radians."""
 
     x: Floats
     y: Floats
@@ -95,35 +82,24 @@ class Remark(NamedTuple):
 
 
 class Robot:
-    """A differential-drive robot. Times are seconds since the start.
+    """A differential-drive robot. Times are seconds since the start, at `start_ns`.
 
-    Args:
-        duration_s: Seconds of simulated time, above 0, up to a week.
-        seed: Not negative. Changes the furniture, the speeds, the noise, and the day.
-
-    Attributes:
-        start_ns: Log time of the start, nanoseconds since the epoch.
-        stops: Stops within the duration, in order; so are commands and remarks.
-
-    Raises:
-        UsageError: An argument is out of its range.
+    The seed changes the furniture, the speeds, the noise, and the day.
     """
 
     def __init__(self, duration_s: float, seed: int) -> None:
         if not 0 < duration_s <= MAX_DURATION_S:
-            raise UsageError(
-                f"a robot cannot drive for {duration_s} s; choose a duration above 0 s"
-                f" and up to {MAX_DURATION_S:.0f} s"
-            )
+            limits = f"above 0 s and up to {MAX_DURATION_S:.0f} s"
+            raise UsageError(f"a robot cannot drive for {duration_s} s; choose {limits}")
         if seed < 0:
             raise UsageError(f"seed is {seed}; it must not be negative")
         self.duration_s, self.seed = float(duration_s), seed
         self.plan = FloorPlan(seed)
         # A day for each seed, so that recordings do not overlap.
         self.start_ns = (_FIRST_DAY_S + seed % 3_000 * 86_400) * 1_000_000_000
-        self._path_s, self._path_x, self._path_y, self._path_heading = _loop()
+        self._path_s, *self._path = _loop()
         self._length = float(self._path_s[-1])
-        self._curvature = np.gradient(self._path_heading, self._path_s)
+        self._curvature = np.gradient(self._path[2], self._path_s)
         lap = self._drive_lap(np.random.default_rng([seed, 0x1A9]))
         starts = np.arange(int(self.duration_s // self.period) + 1) * self.period
         every = [Stop(s.kind, t + s.start, t + s.end) for t in starts.tolist() for s in lap]
@@ -135,40 +111,32 @@ class Robot:
             travel_s = abs(command.reaches - openings[-1]) / 0.1
             times += [command.seconds, command.seconds + max(travel_s, 1e-6)]
             openings += [openings[-1], command.reaches]
-        self._finger_times, self._finger_openings = times, openings
+        self._fingers = times, openings
 
     def at(self, seconds: Floats) -> State:
         """The true motion at float64[n] seconds, from 0 on."""
         laps = np.floor(seconds / self.period)
         clock = seconds - laps * self.period
-        along = np.interp(clock, self._times, self._distance)
-        speed = np.interp(clock, self._times, self._speed)
+        along, speed, acceleration = (np.interp(clock, self._times, v) for v in self._motion)
         curvature = np.interp(along, self._path_s, self._curvature, period=self._length)
         whole, part = np.divmod(along, self._length)
-        turn = self._path_heading[-1] - self._path_heading[0]
-        return State(
-            x=np.asarray(np.interp(part, self._path_s, self._path_x)),
-            y=np.asarray(np.interp(part, self._path_s, self._path_y)),
-            heading=np.interp(part, self._path_s, self._path_heading) + (laps + whole) * turn,
-            distance=along + laps * self._length,
-            speed=speed,
-            acceleration=np.interp(clock, self._times, self._acceleration),
-            yaw_rate=curvature * speed,
-        )
+        x, y, heading = (np.asarray(np.interp(part, self._path_s, v)) for v in self._path)
+        heading = heading + (laps + whole) * (self._path[2][-1] - self._path[2][0])
+        distance = along + laps * self._length
+        return State(x, y, heading, distance, speed, acceleration, curvature * speed)
 
     def motor_temperature(self, seconds: Floats) -> Floats:
         """Degrees Celsius of the drive motors, float64[n]: hard braking heats them."""
         temperature = 50.0 + 4.0 * self.at(seconds).speed
-        for stop in self.stops:
-            if stop.kind == "brake" and len(seconds) and stop.start <= seconds[-1]:
-                since = seconds - stop.start
-                heat = 40.0 * np.exp(-np.maximum(since, 0) / 4.0)
-                temperature += np.where(since >= 0, heat, 0.0)
+        for kind, start, _ in self.stops:
+            since = seconds - start
+            is_hot = (since >= 0) & (kind == "brake")
+            temperature += np.where(is_hot, 40.0 * np.exp(-np.maximum(since, 0) / 4.0), 0.0)
         return temperature
 
     def gripper_opening(self, seconds: Floats) -> Floats:
         """Metres between the fingers, float64[n]."""
-        return np.interp(seconds, self._finger_times, self._finger_openings)
+        return np.interp(seconds, *self._fingers)
 
     def _drive_lap(self, rng: np.random.Generator) -> list[Stop]:
         """Drive one lap from dock to dock, as fast as curves, acceleration and stops allow."""
@@ -177,17 +145,15 @@ class Robot:
         limit = np.minimum(top, _YAW_RATE / np.maximum(np.abs(self._curvature), 1e-6)) ** 2
         plans = []
         for kind, x, y, hold in _STOPS:
-            nearest = float(s[np.hypot(self._path_x - x, self._path_y - y).argmin()])
+            nearest = float(s[np.hypot(self._path[0] - x, self._path[1] - y).argmin()])
             plans.append((nearest, kind, hold + float(rng.uniform(0, 0.4))))
         plans.sort()
         # The lap begins exactly where the path does, so that laps join.
         plans[0] = (0.0, "dock", plans[0][2])
         times: list[Floats] = []
         distances: list[Floats] = []
-        stops, clock = [], 0.0
-        for (start, kind, hold), (end, next_kind, _) in zip(
-            plans, [*plans[1:], (length, "dock", 0.0)], strict=True
-        ):
+        stops, clock, ahead = [], 0.0, [*plans[1:], (length, "dock", 0.0)]
+        for (start, kind, hold), (end, next_kind, _) in zip(plans, ahead, strict=True):
             stops.append(Stop(kind, clock, clock + hold))
             leg = np.concatenate(([start], s[(s > start + 1e-6) & (s < end - 1e-6)], [end]))
             braking = _HARD_BRAKING if next_kind == "brake" else _BRAKING
@@ -205,11 +171,9 @@ class Robot:
         self.period = clock + _SMOOTHING_S
         count = round(self.period / _STEP_S)
         self._times = np.arange(count + 1) * (self.period / count)
-        distance = np.interp(
-            self._times[:-1],
-            np.append(np.concatenate(times), self.period),
-            np.append(np.concatenate(distances), length),
-        )
+        times.append(np.array([self.period]))
+        distances.append(np.array([length]))
+        distance = np.interp(self._times[:-1], np.concatenate(times), np.concatenate(distances))
         # Averaging distance over a short window rounds the corners of the speed and
         # keeps distance, speed and acceleration derivatives of one another.
         window = round(_SMOOTHING_S / _STEP_S) | 1
@@ -220,9 +184,8 @@ class Robot:
         acceleration = np.gradient(speed, self._times[1])[window:-window]
         smooth, speed = smooth[window:-window], np.maximum(speed[window:-window], 0.0)
         # With the first value of the next lap, interpolation reaches the end.
-        self._distance = np.append(smooth, smooth[0] + length)
-        self._speed = np.append(speed, speed[0])
-        self._acceleration = np.append(acceleration, acceleration[0])
+        ends = (smooth, smooth[0] + length), (speed, speed[0]), (acceleration, acceleration[0])
+        self._motion = [np.append(*both) for both in ends]
         return stops
 
     def _gripper_commands(self) -> list[GripperCommand]:
@@ -260,17 +223,11 @@ class Robot:
 
 
 def _loop() -> tuple[Floats, Floats, Floats, Floats]:
-    """Distance, x, y and heading along the closed path, which starts at the dock.
-
-    A cubic B-spline: the curvature is continuous, so the yaw rate has no steps.
-    """
+    """Distance, x, y and heading along the closed path: a cubic B-spline from the dock."""
     u = np.linspace(0, 1, 400, endpoint=False)[:, None]
     basis = ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3)
-    pieces = [
-        sum((basis[k] * _PATH[(i + k - 1) % len(_PATH)] for k in range(4)), np.zeros((400, 2))) / 6
-        for i in range(len(_PATH))
-    ]
-    curve = np.concatenate(pieces)
+    around = [np.roll(_PATH, 1 - k, axis=0)[:, None] * basis[k] for k in range(4)]
+    curve = ((((around[0] + around[1]) + around[2]) + around[3]) / 6).reshape(-1, 2)
     closed = np.concatenate((curve, curve[:1]))
     steps = np.diff(closed, axis=0)
     distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
@@ -282,6 +239,6 @@ def _loop() -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def _slope_limited(at: Floats, values: Floats, slope: float) -> Floats:
-    """The largest function below `values` that rises by at most `slope` a metre."""
+    # The largest function below `values` that rises by at most `slope` a metre.
     ramp = slope * np.abs(at - at[0])
     return np.asarray(np.minimum.accumulate(values - ramp) + ramp)

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
-from hybridlog.demo.plan import DEPTH, WALL_HEIGHT, WIDTH
+from hybridlog.demo.plan import DEPTH, WALL_HEIGHT, WIDTH, Floats
+from hybridlog.demo.robot import Robot, State
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from hybridlog.demo.robot import Robot, State
-
-    Floats = NDArray[np.float64]
-    Singles = NDArray[np.float32]
+Singles = NDArray[np.float32]
 
 GRAVITY = 9.80665
 GYRO_NOISE, ACCELERATION_NOISE = 0.002, 0.03
@@ -41,11 +35,7 @@ def scan_steps(beams: int) -> tuple[float, float]:
 def scan(
     robot: Robot, seconds: Floats, beams: int, rng: np.random.Generator
 ) -> tuple[Singles, Singles]:
-    """Scans of a laser that turns counter-clockwise on the robot's front.
-
-    Returns:
-        Ranges in metres (infinite without return) and intensities, float32[n, beams].
-    """
+    """Ranges in metres (infinite without return) and intensities, float32[n, beams]."""
     number, (angle_step, time_step) = np.arange(beams), scan_steps(beams)
     # The robot moves on while the scanner turns: every beam has its own pose.
     state = robot.at((seconds[:, None] + number * time_step).ravel())
@@ -62,11 +52,7 @@ def scan(
 
 
 def cloud(robot: Robot, seconds: float, columns: int, rng: np.random.Generator) -> NDArray[np.void]:
-    """A turn of a lidar on the mast that sees walls, pillars and the floor.
-
-    Returns:
-        `POINT`[rings * columns] in the sensor's frame, metres; NaN without return.
-    """
+    """A turn of a lidar that sees walls and floor: `POINT`[rings * columns], NaN for none."""
     state, plan = robot.at(np.array([seconds])), robot.plan
     angle = np.linspace(-np.pi, np.pi, columns, endpoint=False)
     origin = np.repeat(state.x, columns), np.repeat(state.y, columns)
@@ -83,18 +69,7 @@ def cloud(robot: Robot, seconds: float, columns: int, rng: np.random.Generator) 
 
 
 class Camera:
-    """A pinhole camera, drawn column by column from ray casts.
-
-    Args:
-        size: Width and height in pixels.
-        yaw: Radians from the robot's heading.
-        offset: Metres in front of the robot's centre.
-        colour: bgr8 when true, else mono8.
-
-    Attributes:
-        focal: Focal length in pixels.
-        center: Column and row of the optical axis.
-    """
+    """A pinhole camera, `focal` pixels long, with its axis at `center`; bgr8, else mono8."""
 
     def __init__(self, size: tuple[int, int], yaw: float, offset: float, *, colour: bool) -> None:
         (self.width, self.height), self.channels = size, 3 if colour else 1
@@ -117,7 +92,8 @@ class Camera:
         stretch = 1 / np.cos(self._angle)
         px = x.astype(np.float32) + self._away * (np.cos(angle) * stretch).astype(np.float32)
         py = y.astype(np.float32) + self._away * (np.sin(angle) * stretch).astype(np.float32)
-        material = ((px >= 0) & (px <= WIDTH) & (py >= 0) & (py <= DEPTH)) + 2 * (self._slope < 0)
+        inside = (px >= 0) & (px <= WIDTH) & (py >= 0) & (py <= DEPTH)
+        material = inside + np.uint8(2) * (self._slope < 0)
         shade = np.repeat(0.55 + 0.45 / (1 + self._away**2 / 30), self.width, axis=1)
         rays = np.repeat(x, self.width), np.repeat(y, self.width), angle
         walls, things = plan.cast(*rays, plan.tall), plan.cast(*rays, ~plan.tall)
@@ -132,9 +108,9 @@ class Camera:
             # A dark skirting board where a surface meets the floor.
             light = light * np.where(z < 0.08, np.float32(0.55), np.float32(1))
             shade[:, columns] = np.where(drawn, light, shade[:, columns])
-            material[:, columns] = np.where(drawn, number, material[:, columns])
+            material[:, columns] = np.where(drawn, np.uint8(number), material[:, columns])
         palette = _PALETTE if self.channels == 3 else (_PALETTE @ _GREY)[:, None]
-        flat = np.asarray(palette[material] * shade[:, :, None], np.float32).ravel()
+        flat = np.asarray(palette.take(material, axis=0) * shade[:, :, None], np.float32).ravel()
         flat += 2.0 * rng.standard_normal(flat.size, np.float32)
         return np.asarray(np.clip(flat, 0, 255).astype(np.uint8))
 

@@ -107,11 +107,7 @@ def generator(seed: int, name: str, block: int, use: int = 0) -> np.random.Gener
 
 
 class Ticks(NamedTuple):
-    """Moments of a topic's messages in one span of time.
-
-    Seconds since the start as float64[n], the same in nanoseconds since the epoch, the
-    message's number from 0, the number of the span, and noise of this topic in this span.
-    """
+    """Moments of messages in a span: since the start, since the epoch, numbers, and noise."""
 
     seconds: Floats
     stamp: NDArray[np.int64]
@@ -144,17 +140,9 @@ Fill = Callable[[Speaker, Ticks], Filled]
 
 
 class Topic(NamedTuple):
-    """One topic.
+    """One topic: a rate and phase, or `moments`; from stamp to log time least and mean delay.
 
-    Attributes:
-        msgtype: As ROS 1 spells it.
-        hz: Rate; 0 for a topic whose messages come at `moments`.
-        phase: Seconds until the first message.
-        delay: Seconds from header stamp to log time: the least, and the mean of the rest.
-        jitter: Deviation of the period, as a part of it.
-        clock: Topics with the same clock have the same moments.
-        moments: Seconds since the start, rising.
-        latched: Whether a late subscriber gets the last message.
+    Topics with the same `clock` have the same moments.
     """
 
     name: str
@@ -269,50 +257,52 @@ def _scan(speaker: Speaker, ticks: Ticks) -> Filled:
     return values, dict(zip(("ranges", "intensities"), found, strict=True))
 
 
-_FRONT, _REAR = "/camera/front", "/camera/rear"
+_FRONT, _REAR = "camera/front", "camera/rear"
 
 
-def _image(speaker: Speaker, camera: sensors.Camera, frame: str, ticks: Ticks) -> Filled:
-    values: Values = {"header.frame_id": frame, "height": camera.height, "width": camera.width}
-    values["encoding"] = "bgr8" if camera.channels == 3 else "mono8"
-    values["step"] = camera.width * camera.channels
-    pictures = [camera.render(speaker.robot, t, ticks.rng) for t in ticks.seconds.tolist()]
-    return values, {"data": pictures}
+def _image(name: str) -> Fill:
+    def fill(speaker: Speaker, ticks: Ticks) -> Filled:
+        camera: sensors.Camera = getattr(speaker, name)
+        values: Values = {"header.frame_id": f"{name}_camera_optical_frame"}
+        values |= {"height": camera.height, "width": camera.width}
+        values["encoding"] = "bgr8" if camera.channels == 3 else "mono8"
+        values["step"] = camera.width * camera.channels
+        pictures = [camera.render(speaker.robot, t, ticks.rng) for t in ticks.seconds.tolist()]
+        return values, {"data": pictures}
+
+    return fill
 
 
-@topic(
-    f"{_FRONT}/image_raw", "sensor_msgs/Image", _FRONT, 5, 0.013, (0.032, 0.003), clock=_FRONT[1:]
-)
-def _front_image(speaker: Speaker, ticks: Ticks) -> Filled:
-    return _image(speaker, speaker.front, "front_camera_optical_frame", ticks)
-
-
-@topic(
-    f"{_FRONT}/camera_info",
-    "sensor_msgs/CameraInfo",
-    _FRONT,
+topic(
+    f"/{_FRONT}/image_raw",
+    "sensor_msgs/Image",
+    f"/{_FRONT}",
     5,
     0.013,
-    (0.03, 5e-4),
-    clock=_FRONT[1:],
+    (0.032, 0.003),
+    clock=_FRONT,
+)(_image("front"))
+
+
+@topic(
+    f"/{_FRONT}/camera_info",
+    *("sensor_msgs/CameraInfo", f"/{_FRONT}", 5, 0.013, (0.03, 5e-4), 0.01, _FRONT),
 )
-def _front_info(speaker: Speaker, _ticks: Ticks) -> Filled:
-    camera, upper = speaker.front, speaker.types.ros == 1
-    f, (cx, cy) = camera.focal, camera.center
-    values: Values = {"header.frame_id": "front_camera_optical_frame"}
-    values |= {"height": camera.height, "width": camera.width, "distortion_model": "plumb_bob"}
-    matrices = {"d": [0] * 5, "k": [f, 0, cx, 0, f, cy, 0, 0, 1], "r": [1, 0, 0, 0, 1, 0, 0, 0, 1]}
-    matrices["p"] = [f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1, 0]
+def _info(speaker: Speaker, _ticks: Ticks) -> Filled:
+    camera, (cx, cy) = speaker.front, speaker.front.center
+    values: Values = {"header.frame_id": "front_camera_optical_frame", "height": camera.height}
+    values |= {"width": camera.width, "distortion_model": "plumb_bob"}
+    k = np.array([[camera.focal, 0, cx], [0, camera.focal, cy], [0, 0, 1]])
+    p = np.append(k, np.zeros((3, 1)), axis=1)
+    matrices = {"d": np.zeros(5), "k": k.ravel(), "r": np.eye(3).ravel(), "p": p.ravel()}
     for name, numbers in matrices.items():
-        values[name.upper() if upper else name] = np.array(numbers, np.float64)
+        values[name.upper() if speaker.types.ros == 1 else name] = numbers
     return values, {}
 
 
-@topic(
-    f"{_REAR}/image_raw", "sensor_msgs/Image", _REAR, 2.5, 0.021, (0.032, 0.003), clock=_REAR[1:]
-)
-def _rear_image(speaker: Speaker, ticks: Ticks) -> Filled:
-    return _image(speaker, speaker.rear, "rear_camera_optical_frame", ticks)
+topic(
+    f"/{_REAR}/image_raw", "sensor_msgs/Image", f"/{_REAR}", 2.5, 0.021, (0.032, 0.003), clock=_REAR
+)(_image("rear"))
 
 
 @topic("/lidar/points", "sensor_msgs/PointCloud2", "/velodyne_node", 0.5, 0.1, (0.061, 0.004), 1e-3)
@@ -403,13 +393,9 @@ def _velocity(speaker: Speaker, ticks: Ticks) -> Filled:
     return {}, {"linear.x": ahead.speed, "angular.z": ahead.yaw_rate}
 
 
-def _gripper_moments(robot: Robot) -> list[float]:
-    return [command.seconds for command in robot.gripper_commands]
-
-
 @topic(
     *("/r_gripper_controller/command", "pr2_controllers_msgs/Pr2GripperCommand", "/grasp_planner"),
-    moments=_gripper_moments,
+    moments=lambda robot: [command.seconds for command in robot.gripper_commands],
 )
 def _gripper(speaker: Speaker, ticks: Ticks) -> Filled:
     commands = [speaker.robot.gripper_commands[k] for k in ticks.number]
@@ -499,18 +485,15 @@ def _diagnostics(speaker: Speaker, ticks: Ticks) -> Filled:
     return {}, {"status": found}
 
 
-def _remark_moments(robot: Robot) -> list[float]:
-    return [remark.seconds for remark in robot.remarks]
-
-
-@topic("/rosout", "rosgraph_msgs/Log", "/rosout", moments=_remark_moments)
+@topic("/rosout", "rosgraph_msgs/Log", "/rosout", moments=lambda r: [m.seconds for m in r.remarks])
 def _text_log(speaker: Speaker, ticks: Ticks) -> Filled:
     levels = (2, 4, 8) if speaker.types.ros == 1 else (20, 30, 40)
     grades = dict(zip(("info", "warn", "error"), levels, strict=True))
     remarks = [speaker.robot.remarks[k] for k in ticks.number]
-    columns: Values = {"stamp": ticks.stamp, "msg": [remark.text for remark in remarks]}
-    columns["level"] = [grades[remark.severity] for remark in remarks]
-    columns["name"] = [remark.node for remark in remarks]
-    columns["line"] = [100 + len(remark.text) for remark in remarks]
+    rows = [(grades[r.severity], r.node, r.text, 100 + len(r.text)) for r in remarks]
+    columns: Values = dict(
+        zip(("level", "name", "msg", "line"), zip(*rows, strict=True), strict=True)
+    )
+    columns["stamp"] = ticks.stamp
     topics = ["/rosout", "/cmd_vel"]
     return {"file": "robot.cpp", "function": "spin", "topics": topics}, columns

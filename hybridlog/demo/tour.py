@@ -25,18 +25,34 @@ with hl.open("{STORE}") as store:
 print(frame.shape)
 print(frame[["angular_velocity.z", "linear_acceleration.x"]].describe())
 """
-_POSE = "pose.pose.position.x,pose.pose.position.y,twist.twist.linear.x"
+_STEPS = """\
+A robot drives through a floor plan
+python -m hybridlog.demo {bag} --duration {duration:g} --seed {seed} --truth {truth} # makes {bag}
+Record its log
+hybridlog record {bag} {store}
+What is in the store?
+hybridlog ls {store}
+What did the robot say?
+hybridlog info {store}
+How often was the gripper closed?
+{fetch} r_gripper_controller/command --where 'position == 0' --count {store} # gripper_closings
+How many scans saw something nearer than half a metre?
+{fetch} scan --where 'ranges.min < 0.5' --count {store} # near_scans
+Which errors did the diagnostics report?
+{fetch} diagnostics --where 'status.level >= 2' --fields {errors} --format jsonl {store} # errors
+One second of the laser, as numpy arrays in a file
+{fetch} scan {second} --format npz -o {slice} {store} # makes {slice}
+Where was the robot in that second, and how fast?
+{fetch} odom {second} --fields {pose} --every 10 {store}
+"""
+"""Titles and commands, with the fact that is the answer or the file that is made."""
 
 
 class Step(NamedTuple):
-    """One command of the tour.
+    """One command of the tour, as one types it, and the file that it makes.
 
-    Attributes:
-        title: Its purpose.
-        command: As one types it.
-        fact: Key of the right answer in the simulation's truth: a number that the command
-            prints with `--count`, else its number of lines.
-        makes: A file that must be there afterwards.
+    `fact` is the key of the right answer in the simulation's truth: a number that the command
+    prints with `--count`, else its number of lines.
     """
 
     title: str
@@ -54,43 +70,26 @@ class Step(NamedTuple):
 
 def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> list[Step]:
     """The tour, in order."""
-    write = f"{BAG} --duration {duration_s:g} --seed {seed} --truth {TRUTH}"
     # A second out of the middle; a short recording has none after ten seconds.
     start = min(10.0, duration_s / 2)
-    second = f"--between +{start:g}s +{start + 1:g}s"
-    errors = "--where 'status.level >= 2' --fields 'status[].name,status[].message'"
-    fetch, store = "hybridlog fetch --topic", f"--store {STORE}"
-    return [
-        Step("A robot drives through a floor plan", f"python -m hybridlog.demo {write}", "", BAG),
-        Step("Record its log", f"hybridlog record {BAG} {store}"),
-        Step("What is in the store?", f"hybridlog ls {store}"),
-        Step("What did the robot say?", f"hybridlog info {store}"),
-        Step(
-            "How often was the gripper closed?",
-            f"{fetch} r_gripper_controller/command --where 'position == 0' --count {store}",
-            "gripper_closings",
-        ),
-        Step(
-            "How many scans saw something nearer than half a metre?",
-            f"{fetch} scan --where 'ranges.min < 0.5' --count {store}",
-            "near_scans",
-        ),
-        Step(
-            "Which errors did the diagnostics report?",
-            f"{fetch} diagnostics {errors} --format jsonl {store}",
-            "errors",
-        ),
-        Step(
-            "One second of the laser, as numpy arrays in a file",
-            f"{fetch} scan {second} --format npz -o {SLICE} {store}",
-            makes=SLICE,
-        ),
-        Step(
-            "Where was the robot in that second, and how fast?",
-            f"{fetch} odom {second} --fields {_POSE} --every 10 {store}",
-        ),
-        Step("A pandas frame", f"python -c '\n{_SNIPPET}'"),
-    ]
+    text = _STEPS.format(
+        bag=BAG,
+        slice=SLICE,
+        truth=TRUTH,
+        duration=duration_s,
+        seed=seed,
+        fetch="hybridlog fetch --topic",
+        second=f"--between +{start:g}s +{start + 1:g}s",
+        errors="'status[].name,status[].message'",
+        pose="pose.pose.position.x,pose.pose.position.y,twist.twist.linear.x",
+        store=f"--store {STORE}",
+    )
+    lines, found = text.splitlines(), []
+    for title, line in zip(lines[::2], lines[1::2], strict=True):
+        command, _, note = line.partition(" # ")
+        makes = note.removeprefix("makes ") if note.startswith("makes ") else ""
+        found.append(Step(title, command, "" if makes else note, makes))
+    return [*found, Step("A pandas frame", f"python -c '\n{_SNIPPET}'")]
 
 
 def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> int:

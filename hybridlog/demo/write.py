@@ -32,16 +32,10 @@ _FACTS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 
 
 class BagSummary(NamedTuple):
-    """A written bag.
+    """A written bag: bytes on disk, messages by topic, start in ns since the epoch.
 
-    Attributes:
-        path: A file, or the directory of a ROS 2 bag.
-        size: Bytes on disk.
-        messages: Number of messages by topic.
-        start_ns: Log time at which the recording starts, nanoseconds since the epoch.
-        truth: What questions to the bag must answer: `gripper_closings` (commands with
-            position 0), `near_scans` (scans with a range below 0.5 m), `errors`
-            (diagnostics with an error in them).
+    `truth` has the right answers to questions: `gripper_closings` (commands with position
+    0), `near_scans` (with a range below 0.5 m), `errors` (diagnostics with an error in them).
     """
 
     path: Path
@@ -82,9 +76,10 @@ def write_bag(
     path = Path(path)
     speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types(ros))
     names = [topic.name for topic in TOPICS]
-    for name in sorted(set(topics or ()).difference(names)):
+    wanted = set(names if topics is None else topics)
+    for name in sorted(wanted.difference(names)):
         raise TopicError(f"the robot has no topic {name}; it has {', '.join(names)}")
-    chosen = [t for t in TOPICS if topics is None or t.name in set(topics)]
+    chosen = [topic for topic in TOPICS if topic.name in wanted]
     if path.exists() or path.is_symlink():
         raise UsageError(f"{path} exists already; remove it or choose another name")
     if ros == 2 and compression != "none":
@@ -93,14 +88,13 @@ def write_bag(
     truth = Counter({fact: 0 for fact, _ in _FACTS.values()})
     try:
         with _writer(path, ros, storage, compression) as writer:
-            connections = [
-                writer.add_connection(
-                    *(topic.name, topic.type_in(speaker.types)),
-                    typestore=speaker.types.store,
-                    **_publisher(topic, ros),
-                )
-                for topic in chosen
-            ]
+            connections = []
+            for topic in chosen:
+                about: dict[str, Any] = {"typestore": speaker.types.store}
+                if ros == 1:
+                    about |= {"callerid": topic.node, "latching": int(topic.latched) or None}
+                msgtype = topic.type_in(speaker.types)
+                connections.append(writer.add_connection(topic.name, msgtype, **about))
             for log_time, _, index, payload, fact in _messages(speaker, chosen):
                 writer.write(connections[index], log_time, payload)
                 counts[chosen[index].name] += 1
@@ -158,7 +152,3 @@ def _writer(path: Path, ros: int, storage: str, compression: str) -> Any:
     if compression != "none":
         writer.set_compression(writer.CompressionFormat[compression.upper()])
     return writer
-
-
-def _publisher(topic: Topic, ros: int) -> dict[str, Any]:
-    return {} if ros == 2 else {"callerid": topic.node, "latching": int(topic.latched) or None}
