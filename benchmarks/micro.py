@@ -17,7 +17,6 @@ from typing import Any
 import bson
 import numpy as np
 import pytest
-from hybridlog.columns.gatherer import FieldGatherer
 from rosbags.rosbag1 import Reader
 
 import hybridlog as hl
@@ -25,6 +24,7 @@ from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.schema.codecs import codec_for
+from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.chunk import StoredChunk, pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
@@ -275,17 +275,13 @@ def bench_few(bags: Path, benchmark: Any) -> None:
 
 
 def bench_gather(bags: Path, tmp_path: Path, benchmark: Any) -> None:
-    """Fields of small messages to the columns beside the segments."""
+    """Fields of small messages to the tables."""
     stream = read(bags / IMU, "/imu/data", 5000)
     batch: Any = stream.batches(5000)[0]
-    gatherer = FieldGatherer(tmp_path)
+    writer = TableWriter(tmp_path, "0" * 32)
     channels = dict.fromkeys(batch.channel.tolist(), stream.channel())
-    # So much is decoded at once, and not put together with more.
-    assert len(batch.buffer) > 1 << 20
-    benchmark.pedantic(gatherer.add, (_chunk(batch), channels), rounds=50, warmup_rounds=1)
-    if benchmark.enabled:  # else it ran once, and columns are written later
-        assert sum(path.stat().st_size for path in tmp_path.iterdir()) > 50 * 5000 * 8
-    gatherer.discard()
+    benchmark.pedantic(writer.add, (_chunk(batch), channels), rounds=50, warmup_rounds=1)
+    writer.discard()
 
 
 def _chunk(batch: Any) -> Any:

@@ -2,7 +2,7 @@
 
 A user drags the arms of a PR2 about by markers, looks at it from viewpoints that are
 changed now and then, and opens and closes the grippers. Topics and types are those that
-the study's own launch file records; `docs/benchmarks-loads.md` has the sources.
+the study's own launch file records; `docs/benchmarks-method.md` has the sources.
 
 Everything is planned first, so what must be found in the load is known before a message
 is made: `truth.json` beside it.

@@ -1,7 +1,7 @@
 """The topics of a PR2 that drives through a building, and a load of them: many bytes.
 
 Topics, types and rates are those of the published recordings and of the robot's own
-launch files; `docs/benchmarks-loads.md` has the sources.
+launch files; `docs/benchmarks-method.md` has the sources.
 """
 
 from __future__ import annotations
