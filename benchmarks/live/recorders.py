@@ -22,6 +22,7 @@ from benchmarks.usage import cpu_s, with_children
 _STOP_S = 120.0
 _START_S = 2.5
 _ROOT = Path(__file__).parents[2]
+_SOURCES = (str(_ROOT), str(_ROOT / "storage"))
 _ROSBAG = ("/usr/lib/rosbag/record", "/opt/ros/noetic/lib/rosbag/record")
 
 
@@ -75,7 +76,7 @@ class Ours:
         command = [sys.executable, "-m", "hybridlog", "record", "--ros1", "--json"]
         self.process = subprocess.Popen(
             [*command, "--store", str(store), *more],
-            env={**environment(master), "PYTHONPATH": str(_ROOT)},
+            env={**environment(master), "PYTHONPATH": os.pathsep.join(_SOURCES)},
             stdout=self._said,
             stderr=subprocess.DEVNULL,
             cwd=store.parent,
