@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.connection import Connection
@@ -20,7 +20,6 @@ from hybridlog.query.predicate.types import check
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
-from hybridlog.tables.reader import Tables
 from hybridlog_storage.errors import (
     CatalogError,
     DatabaseError,
@@ -33,7 +32,7 @@ from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.tables.reader import TopicTable
+    from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -57,7 +56,6 @@ class Session:
         connection: The connection to MongoDB.
         repairs: What was repaired when the store was opened.
         recent_chunks: Chunks that single messages were read from.
-        tables: Parquet tables of topics.
     """
 
     def __init__(
@@ -67,7 +65,6 @@ class Session:
         self.connection = Connection(directory, mongo)
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
-        self.tables = Tables(directory.path)
         self._unavailable: HybridlogError | None = None
         self._progress = progress
         self._connecting = threading.RLock()
@@ -408,6 +405,13 @@ class Session:
                 self._segments[key] = reader
             return reader
 
+    @cached_property
+    def tables(self) -> Tables:
+        """Parquet tables of topics; pyarrow is loaded for them."""
+        from hybridlog.tables.reader import Tables
+
+        return Tables(self.directory.path)
+
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic, made again if it is missing; None if there can be none."""
         from hybridlog.maintenance.tables import made_for
@@ -428,7 +432,8 @@ class Session:
             self._segments.clear()  # each is closed by the last thread that reads from it
         self._chunk_lists.clear()
         self.recent_chunks.clear()
-        self.tables.invalidate()
+        if "tables" in vars(self):
+            self.tables.invalidate()
         self._remember_meanings()
 
     def close(self) -> None:
@@ -438,7 +443,8 @@ class Session:
                 reader.close()
             self._segments.clear()
         self.recent_chunks.clear()
-        self.tables.invalidate()
+        if "tables" in vars(self):
+            self.tables.invalidate()
         self.disconnect()
         self.catalog.close()
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.tree import And, Opaque, Predicate, nodes
 from hybridlog_storage.errors import DefinitionError, PayloadError, WhereError
 
@@ -86,6 +85,8 @@ class MessageFilter:
         """
         if channel.is_reduced or not channel.codec.indexed:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
+        from hybridlog.query.predicate.to_mask import to_mask
+
         decoded = channel.codec.arrow(
             batch.buffer, batch.offset, batch.length, self._fields - {"_meta"}
         )

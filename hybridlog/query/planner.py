@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
+from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
 
+_CONNECT_S = 0.3  # seconds to start and reach the embedded MongoDB
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
 _RETRIED = (DatabaseError, IndexChangedError, SegmentError, StoreError, UndecidedError)
@@ -134,7 +136,7 @@ class Planner:
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
         """Whether the fields of the messages of a part come from its table."""
-        if self._choose(part, Need.VALUES, fields)[0] is not self._tables:
+        if next(self._choose(part, Need.VALUES, fields)) is not self._tables:
             return False
         try:
             self._tables.check(part)
@@ -224,20 +226,35 @@ class Planner:
         self.session.database_for("A MongoDB filter")
         raise DatabaseError("No engine answers this question.")
 
-    def _choose(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> list[Engine]:
+    def _choose(
+        self, part: Part, need: Need, fields: Collection[str] | None = ()
+    ) -> Iterator[Engine]:
         """The engines that can answer, the cheapest first.
+
+        MongoDB is connected to only if that pays, or if nothing else can answer.
 
         Raises:
             DatabaseError: only MongoDB can, and it is unavailable.
         """
-        costs = [(engine.cost(part, need, fields), engine) for engine in self._engines]
-        able = sorted(
-            ((cost, number) for number, (cost, _) in enumerate(costs) if cost is not None),
-        )
-        if not able:
+        files = [engine for engine in self._engines if engine is not self._mongo]
+        costs = self._costs(files, part, need, fields)
+        is_connected = self.session.connected is not None
+        if costs and not is_connected and costs[0][0] < _CONNECT_S:
+            yield from (engine for _, engine in costs)
+            costs = []
+        costs = sorted([*costs, *self._costs([self._mongo], part, need, fields)], key=itemgetter(0))
+        yield from (engine for _, engine in costs)
+        if not costs and not self._costs(files, part, need, fields):
             self.session.database_for("A MongoDB filter")
             raise DatabaseError("No engine answers this question.")
-        return [costs[number][1] for _, number in able]
+
+    def _costs(
+        self, engines: Sequence[Engine], part: Part, need: Need, fields: Collection[str] | None
+    ) -> list[tuple[float, Engine]]:
+        """Costs of the engines that can answer, in order."""
+        found = [(engine.cost(part, need, fields), engine) for engine in engines]
+        able = [(cost, engine) for cost, engine in found if cost is not None]
+        return sorted(able, key=itemgetter(0))
 
     def _count(self, parts: Sequence[Part]) -> int:
         groups: dict[int, list[Part]] = defaultdict(list)
@@ -246,7 +263,7 @@ class Planner:
             if self._is_narrowed(part):
                 narrowed.append(part)
                 continue
-            engine = self._choose(part, Need.COUNT)[0]
+            engine = next(self._choose(part, Need.COUNT))
             groups[self._engines.index(engine)].append(part)
         total = 0
         for number, group in groups.items():
@@ -261,10 +278,15 @@ class Planner:
 
     def _is_narrowed(self, part: Part) -> bool:
         """Whether MongoDB finds candidates, and the messages decide."""
-        if part.predicate is None or self.session.database is None:
+        if part.predicate is None:
             return False
-        able = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
-        return able in ([], [self._scan]) and self._mongo.cost(part, Need.SELECTION) is not None
+        files = [engine for engine in self._engines if engine is not self._mongo]
+        costs = self._costs(files, part, Need.COUNT, ())
+        if costs and (costs[0][1] is not self._scan or costs[0][0] < _CONNECT_S):
+            return False
+        if self.session.database is None or self._costs([self._mongo], part, Need.COUNT, ()):
+            return False
+        return self._mongo.cost(part, Need.SELECTION) is not None
 
     def _count_otherwise(self, part: Part, failed: int, failure: Exception) -> int:
         """The count of an engine that failed, by the next ones."""

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlog.losses import lost_spans
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, UndecidedError, Values
 from hybridlog.query.message_filter import can_decide, meta_array
-from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
@@ -47,21 +47,17 @@ class TablesEngine:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
-        if not part.is_by_log_time:
-            return None
-        asks_fields = part.predicate is not None or need is Need.VALUES
-        if asks_fields:
-            table = self._session.table(part.recording, part.topic)
-        else:
-            table = self._session.tables.of(part.recording, part.topic)
-        if table is None:
-            return None
-        if table.reduced and asks_fields:
-            return None  # tables have no fields of reduced messages
+        if not part.is_by_log_time or (part.predicate is None and need is not Need.VALUES):
+            return None  # the chunk index knows the times
         if part.predicate is not None and not can_decide(part.predicate):
             return None
         if need is Need.VALUES and not _are_whole(part, fields):
             return None
+        if any(True for _ in lost_spans(part.recording)):
+            return None  # rows of messages that are lost must not answer
+        table = self._session.table(part.recording, part.topic)
+        if table is None or table.reduced:
+            return None  # tables have no fields of reduced messages
         own = ("ref",) if need is Need.SELECTION else ()
         wanted = _wanted(table, part, fields if need is Need.VALUES else ())
         return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
@@ -155,6 +151,8 @@ class TablesEngine:
         predicate = part.predicate
         if predicate is None:
             return np.ones(len(rows), np.bool_)
+        from hybridlog.query.predicate.to_mask import to_mask
+
         records: Any = rows.records
         asked = predicate.fields()
         if any(path.startswith("_meta") for path in asked):
