@@ -117,21 +117,6 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/query/column_filter.py",
-        (
-            "ceil-for-floor",
-            '(math.ceil if operator in {"$lt", "$gte"} else math.floor)',
-            '(math.floor if operator in {"$lt", "$gte"} else math.ceil)',
-            "tests/query/test_column_filter.py",
-        ),
-        (
-            "floats-as-narrow-as-the-column",
-            "column.values.astype(np.float64, copy=False), operand",
-            "column.values, operand",
-            "tests/query/test_column_filter.py",
-        ),
-    ),
-    *_of(
         "hybridlog/query/intervals.py",
         (
             "touching-intervals-meet-below",

@@ -181,6 +181,7 @@ class Decoder:
         self._counters = planner.counters
         self._chosen = planner.question.fields
         self._own = _own(planner)
+        self._takes_reduced = _are_single(planner)
         self._ranks = _ranks(planner.channels(), channels)
         self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
 
@@ -195,7 +196,7 @@ class Decoder:
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
         for number, rows in rows_by_channel(run.batch.channel):
-            if self.channels[number].is_reduced:
+            if self.channels[number].is_reduced and not self._takes_reduced:
                 self._counters.reduced += len(rows)
             else:
                 yield self.block(number, run.batch.take(rows), run.seq[rows])[0]
@@ -230,6 +231,15 @@ class Decoder:
         """Our columns of messages of one channel, besides the log time."""
         channel = self.channels[number]
         return {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
+
+
+def _are_single(planner: Planner) -> bool:
+    """Whether only single values are asked for, which reduced messages have, too."""
+    fields = planner.question.fields
+    known = planner.session.field_types(planner.question.topics, planner.question.recordings)
+    if not fields or known is None:
+        return False
+    return all(path in known and not known[path].endswith("]") for path in fields)
 
 
 def _own(planner: Planner) -> list[str]:
@@ -276,7 +286,7 @@ def _to_decode(
     fields: Sequence[str] | None, channel: RecordedChannel, own: Sequence[str]
 ) -> frozenset[str] | None:
     """Paths that are decoded: those asked for, arrays whose summaries are, the stamp."""
-    if fields is None or channel.is_reduced:
+    if fields is None:
         return None
     known = {path.path: path.type for path in channel.codec.paths()}
     wanted = set(fields)

@@ -89,7 +89,7 @@ def end_and_hear(
 def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     done = run("record", "--replay", logs / "small.bag", "--speed", 20, "--reserve", 0, store=store)
-    assert "all has been played" in done.out
+    assert "all sources have ended" in done.out
     assert "lost" in done.out
     assert "nothing" in done.out
     expected = read(logs / "small.bag")
@@ -174,7 +174,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         assert "messages/s" in shown
         refused = run("trigger", "now", store=store, code=2)
         assert "--ring" in refused.err
-        assert "is not being recorded now" in run("mark", "x", "-r", "b", store=store, code=2).err
+        assert "No running recorder matches" in run("mark", "x", "-r", "b", store=store, code=2).err
         assert complete(f"mark x --store {store} -r fi") == ["first-drive"]
         assert_it_is_told_as_unfinished(store)
         assert_ctrl_c_leaves_top(store)
@@ -184,7 +184,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     )
     assert json.loads(found.out.splitlines()[0])["text"] == "gripper slipped"
     for command in (["top"], ["mark", "x"], ["trigger", "x"]):
-        assert "Nothing is being recorded" in run(*command, store=store, code=2).err
+        assert "No recorder runs on this store" in run(*command, store=store, code=2).err
 
 
 def assert_it_is_told_as_unfinished(store: Path) -> None:
@@ -253,7 +253,7 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
         ("--replay {bag} --throttle /a --duration 1s", "(--throttle TOPIC RATE), not '/a'"),
         ("--replay {bag} --priority /a --duration 1s", "(--priority TOPIC WORD), not '/a'"),
         ("--replay {bag} --throttle /a fast", "is no rate"),
-        ("--replay {bag} --priority /a urgent", "no priority"),
+        ("--replay {bag} --priority /a urgent", "Unknown priority"),
         ("--replay {bag} --before 1s", "are for --ring"),
         ("--replay {bag} --ring 1s --before 2s", "longer than --ring"),
         ("--replay {bag} --ring 0s", "--ring must be longer"),
@@ -272,8 +272,8 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
         ("{bag} --split-size 5GB --qos f", "--qos and --split-size are for a running robot"),
         ("--ros1 http://localhost:1 --qos f", "--qos is for --ros2"),
         ("--ros1 http://localhost:1 --speed 2", "--speed is for --replay"),
-        ("--ros1 127.0.0.1:11311", "'127.0.0.1:11311' is no address of the form http://host:port"),
-        ("--ros1 localhost", "'localhost' is no address of the form http://host:port"),
+        ("--ros1 127.0.0.1:11311", "'127.0.0.1:11311' is not an address like http://host:port"),
+        ("--ros1 localhost", "'localhost' is not an address like http://host:port"),
         ("--ros1 '' --duration 1s", "looks like http://host:11311"),
         ("--ros1 {bag}", "looks like http://host:11311"),
         ("--foxglove http://robot", "does not begin with ws://"),

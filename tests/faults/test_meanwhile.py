@@ -100,7 +100,7 @@ def test_a_count_is_refused_while_documents_go(case: Case) -> None:
                 list(query.documents())
             # The messages themselves tell as well.
             assert query.count() == whole
-            assert query.counters.chunks_read > 0
+            assert query.counters.documents_read == 0
             assert len(list(query)) == whole
             assert query.at("end").fields["n"] >= 0
             # Questions without a predicate or about the other recording need no payload scan.
@@ -114,8 +114,10 @@ def test_a_count_is_refused_while_documents_go(case: Case) -> None:
 def test_what_goes_while_it_is_counted_is_noticed(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from hybridlog.query.engines.tables import TablesEngine
     from hybridlog_storage.database import Database
 
+    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
     with case.open() as store, case.open() as other:
         store.connect()
         other.connect()

@@ -491,7 +491,7 @@ def test_a_symlink_in_place_of_the_socket_directory(
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o700)
     (runtime / f"hybridlog-{os.geteuid()}").symlink_to(elsewhere)
-    with pytest.raises(DatabaseError, match="nobody else can open"):
+    with pytest.raises(DatabaseError, match="only this user can open"):
         EmbeddedMongod(directory).start()
     assert not list(elsewhere.iterdir())
 
@@ -500,7 +500,7 @@ def test_a_socket_directory_that_others_can_open(directory: Path, runtime: Path)
     own = runtime / f"hybridlog-{os.geteuid()}"
     own.mkdir()
     own.chmod(0o755)
-    with pytest.raises(DatabaseError, match="nobody else can open"):
+    with pytest.raises(DatabaseError, match="only this user can open"):
         EmbeddedMongod(directory).start()
 
 

@@ -605,7 +605,7 @@ def many(count: int, channel: int = 0, size: int = 100, step: int = 10**7) -> li
 
 def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
     rows = [row for pair in zip(many(200), many(200, 1, 5000), strict=True) for row in pair]
-    _, chunks = write(tmp_path, [rows])
+    _, chunks = write(tmp_path, [rows], SegmentSettings(span_size=0))
     for chunk in chunks:
         assert len(set(chunk.batch.channel.tolist())) == 1
         if int(chunk.batch.length[0]) == 5000:
