@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hybridlog import consent
-from hybridlog.maintenance import lease
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import EMBEDDED, with_password
 
@@ -40,6 +38,7 @@ class Connection:
             DatabaseError: MongoDB does not answer.
             StoreError: it holds the index of another store, or this store is a copy.
         """
+        from hybridlog.maintenance import lease
         from hybridlog_storage.index_state import IndexState
 
         if self.database is None:
@@ -56,6 +55,7 @@ class Connection:
         Raises:
             DatabaseError: MongoDB does not answer.
         """
+        from hybridlog import consent
         from hybridlog_storage.database import Database
 
         if self._uri is None:
@@ -104,6 +104,7 @@ class Connection:
             DatabaseError: MongoDB does not answer.
             StoreError: the database holds the index of another store.
         """
+        from hybridlog.maintenance import lease
         from hybridlog_storage.index_state import IndexState
 
         self.close()

@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.connection import Connection
 from hybridlog.entries import channels_of, take_inventory
-from hybridlog.guarded import Belief, GuardedIndex
 from hybridlog.losses import topics_of
 from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
-from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.types import check
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
@@ -31,6 +28,7 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
+    from hybridlog.guarded import Belief, GuardedIndex
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
@@ -170,6 +168,8 @@ class Session:
             DatabaseError: it is unavailable; says what it was needed for, and why it is.
             IndexChangedError: another process removes documents of these recordings.
         """
+        from hybridlog.guarded import GuardedIndex
+
         return GuardedIndex(self.database_for(purpose), recordings, self.belief, self.invalidate)
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
@@ -180,6 +180,8 @@ class Session:
             keys: Keys of the recordings.
             anew: Ask it now.
         """
+        from hybridlog.guarded import Belief
+
         found = self._belief = Belief.of(database, keys, None if anew else self._belief)
         return found
 
@@ -318,6 +320,9 @@ class Session:
         return self._parsed(text, topics, recordings)
 
     def _parse(self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]) -> Predicate:
+        from hybridlog.query.predicate.parser import parse
+        from hybridlog.query.predicate.types import check
+
         found = parse(text)
         check(found, self.field_types(topics, recordings))
         return found

@@ -20,7 +20,6 @@ import numpy as np
 
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
 
@@ -334,6 +333,8 @@ class ChunkScan:
         elif self._plan.clock == "publish":
             times = batch.publish_time
         else:
+            from hybridlog.schema.stamps import stamps_of
+
             times = np.full(len(batch), -1, np.int64)
             for index in distinct(channel[mask]).tolist():
                 rows = np.flatnonzero(mask & (channel == index))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
+from functools import cached_property
 from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar
 
@@ -18,11 +19,8 @@ import numpy as np
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
 from hybridlog.query.engines.base import Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex
-from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.statistics import Statistics
-from hybridlog.query.engines.tables import TablesEngine
-from hybridlog.query.message_filter import MessageFilter, residual
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP
@@ -40,6 +38,9 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine, Outcomes, Values
+    from hybridlog.query.engines.mongo import Mongo
+    from hybridlog.query.engines.tables import TablesEngine
+    from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
@@ -65,16 +66,26 @@ class Planner:
         self.question = question
         self.counters = counters
         self._ranges = RangeResolver(session, question)
-        self._mongo = Mongo(session, counters)
         self._scan = PayloadScan(session, counters)
-        self._tables = TablesEngine(session, counters)
-        self._engines: tuple[Engine, ...] = (
-            Statistics(),
-            ChunkIndex(session, counters),
-            self._tables,
-            self._mongo,
-            self._scan,
-        )
+        self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
+
+    @cached_property
+    def _mongo(self) -> Mongo:
+        from hybridlog.query.engines.mongo import Mongo
+
+        return Mongo(self.session, self.counters)
+
+    @cached_property
+    def _tables(self) -> TablesEngine:
+        from hybridlog.query.engines.tables import TablesEngine
+
+        return TablesEngine(self.session, self.counters)
+
+    def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
+        """The engines that need no server."""
+        if part.predicate is None and need is not Need.VALUES:
+            return *self._catalog, self._scan
+        return *self._catalog, self._tables, self._scan
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic; recordings oldest first.
@@ -179,7 +190,9 @@ class Planner:
         plan.reverse = self.question.reverse
         if self.question.predicate is None or not parts:
             return plan
-        selecting: dict[int, list[Part]] = defaultdict(list)
+        from hybridlog.query.message_filter import MessageFilter
+
+        selecting: dict[Engine, list[Part]] = defaultdict(list)
         unindexed: set[int] = set()
         filters: dict[int, MessageFilter] = {}
         place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
@@ -190,7 +203,7 @@ class Planner:
                 unindexed.update(indexes)
                 decide = part.predicate
             else:
-                selecting[self._engines.index(engine)].append(part)
+                selecting[engine].append(part)
                 decide = self._undecided(part) if engine is self._mongo else None
             if decide is not None:
                 filters.update(dict.fromkeys(indexes, MessageFilter(decide, part.field_types)))
@@ -198,8 +211,8 @@ class Planner:
 
         def select(tasks: Sequence[ChunkTask]) -> RowSelection:
             offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-            for number, chosen in selecting.items():
-                for key, rows in self._engines[number].select(chosen, tasks).offsets.items():
+            for engine, chosen in selecting.items():
+                for key, rows in engine.select(chosen, tasks).offsets.items():
                     offsets[key].append(rows)
             merged = {key: np.sort(np.concatenate(rows)) for key, rows in offsets.items()}
             return RowSelection(merged, unindexed)
@@ -209,6 +222,8 @@ class Planner:
 
     def _undecided(self, part: Part) -> Predicate | None:
         """The share of a part's predicate that is left when MongoDB has answered."""
+        from hybridlog.query.message_filter import residual
+
         assert part.predicate is not None
         return residual(part.predicate) if self._mongo.undecided(part) else None
 
@@ -236,7 +251,7 @@ class Planner:
         Raises:
             DatabaseError: only MongoDB can, and it is unavailable.
         """
-        files = [engine for engine in self._engines if engine is not self._mongo]
+        files = self._files(part, need)
         costs = self._costs(files, part, need, fields)
         is_connected = self.session.connected is not None
         if costs and not is_connected and costs[0][0] < _CONNECT_S:
@@ -257,20 +272,20 @@ class Planner:
         return sorted(able, key=itemgetter(0))
 
     def _count(self, parts: Sequence[Part]) -> int:
-        groups: dict[int, list[Part]] = defaultdict(list)
+        groups: dict[Engine, list[Part]] = defaultdict(list)
         narrowed: list[Part] = []
         for part in parts:
             if self._is_narrowed(part):
                 narrowed.append(part)
                 continue
             engine = next(self._choose(part, Need.COUNT))
-            groups[self._engines.index(engine)].append(part)
+            groups[engine].append(part)
         total = 0
-        for number, group in groups.items():
+        for engine, group in groups.items():
             try:
-                total += self._engines[number].count(group)
+                total += engine.count(group)
             except _RETRIED as error:
-                total += sum(self._count_otherwise(part, number, error) for part in group)
+                total += sum(self._count_otherwise(part, engine, error) for part in group)
         if narrowed:
             scan = ChunkScan(self._plan_of(narrowed), self.session.segment)
             total += sum(len(run.batch) for run in scan.unordered())
@@ -280,7 +295,7 @@ class Planner:
         """Whether MongoDB finds candidates, and the messages decide."""
         if part.predicate is None:
             return False
-        files = [engine for engine in self._engines if engine is not self._mongo]
+        files = self._files(part, Need.COUNT)
         costs = self._costs(files, part, Need.COUNT, ())
         if costs and (costs[0][1] is not self._scan or costs[0][0] < _CONNECT_S):
             return False
@@ -288,10 +303,10 @@ class Planner:
             return False
         return self._mongo.cost(part, Need.SELECTION) is not None
 
-    def _count_otherwise(self, part: Part, failed: int, failure: Exception) -> int:
+    def _count_otherwise(self, part: Part, failed: Engine, failure: Exception) -> int:
         """The count of an engine that failed, by the next ones."""
         for engine in self._choose(part, Need.COUNT):
-            if engine is not self._engines[failed]:
+            if engine is not failed:
                 with suppress(*_RETRIED):
                     return engine.count([part])
         raise failure

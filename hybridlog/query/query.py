@@ -19,13 +19,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hybridlog.frames.names import is_own, is_summary
-from hybridlog.message import messages_in
-from hybridlog.query.answers.last_message import just_before, message_at
-from hybridlog.query.answers.latched import in_force
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.query.predicate.from_mongo import from_mongo
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
@@ -129,6 +124,8 @@ class Query:
         if isinstance(predicate, str):
             checked = self._session.predicate(predicate, self.topics, self.recordings)
         else:
+            from hybridlog.query.predicate.from_mongo import from_mongo
+
             checked = from_mongo(predicate)
         if self.question.predicate is not None:
             checked = self.question.predicate & checked
@@ -167,6 +164,8 @@ class Query:
         Raises:
             TopicError: no topic of the query has such a field.
         """
+        from hybridlog.frames.names import is_own
+
         known = self.field_types()
         for path in paths:
             if known and not (_is_field(path, known) or is_own(path)):
@@ -240,6 +239,8 @@ class Query:
             TopicError: there is none.
             UsageError: the question has a time range, or another clock than log time.
         """
+        from hybridlog.query.answers.last_message import just_before
+
         found = self.at(moment)
         time = found.log_time_ns
         return Query(self._session, just_before(self.question, found.recording, time, time))
@@ -248,6 +249,8 @@ class Query:
 
     def __iter__(self) -> Iterator[Message]:
         """The messages, ordered by log time, recording and arrival."""
+        from hybridlog.message import messages_in
+
         planner = self._planner()
         plan = planner.scan_plan()
         for run in planner.runs(plan):
@@ -269,6 +272,8 @@ class Query:
                 "A message at a time is the last one by log time; `between`, `during` and "
                 "`clock` do not fit."
             )
+        from hybridlog.query.answers.last_message import message_at
+
         with self.counters.timed():
             found = message_at(self._session, self.question, self.counters, moment)
         if found is None:
@@ -291,6 +296,8 @@ class Query:
 
     def latched(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """Latched messages from before the time range that are in force when it begins."""
+        from hybridlog.query.answers.latched import in_force
+
         return in_force(self._session, self.question, self.counters)
 
     def count(self) -> int:
@@ -496,6 +503,8 @@ class Query:
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:
+    from hybridlog.frames.names import is_summary
+
     if is_summary(path, known):
         return True
     return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)

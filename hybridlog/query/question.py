@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hybridlog.query.times import TIME_LIMIT, TimeLike
-from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
@@ -88,6 +87,8 @@ class RecordedChannel:
     @cached_property
     def codec(self) -> Codec:
         """Decodes its payloads; made when first used."""
+        from hybridlog.schema.codecs import codec_for
+
         return codec_for(self.channel)
 
     @property

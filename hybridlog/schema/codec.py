@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from hybridlog.schema.wire import Unreadable
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.wire import Unreadable
     from hybridlog_storage.messages import Buffer
 
 

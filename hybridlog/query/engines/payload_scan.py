@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.indexing import rows_by_channel
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
 from hybridlog.query.engines.base import Need, Outcomes, Values
-from hybridlog.query.message_filter import MessageFilter, can_decide
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
+    from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.session import Session
 
@@ -39,8 +38,11 @@ class PayloadScan:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By bytes and messages; None if only MongoDB understands the predicate."""
-        if part.predicate is not None and not can_decide(part.predicate):
-            return None
+        if part.predicate is not None:
+            from hybridlog.query.message_filter import can_decide
+
+            if not can_decide(part.predicate):
+                return None
         size = sum(stats.payload_bytes for stats in part.stats)
         encodings = {channel.channel.message_encoding for channel in part.channels}
         message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S
@@ -54,6 +56,8 @@ class PayloadScan:
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """Read the messages in order and decide on each."""
+        from hybridlog.indexing import rows_by_channel
+
         plan = self.plan([part], filtered=False)
         decide = _filter_of(part)
         for run in ChunkScan(plan, self._session.segment).runs():
@@ -127,4 +131,6 @@ class PayloadScan:
 def _filter_of(part: Part) -> MessageFilter | None:
     if part.predicate is None:
         return None
+    from hybridlog.query.message_filter import MessageFilter
+
     return MessageFilter(part.predicate, part.field_types)
