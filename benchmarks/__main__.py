@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.samples import NAME, Journal
-from hybridlog.cli import stopping
+from hybridlog.cli import signals
 from hybridlog.cli.exit_codes import of_os_error
 from hybridlog.cli.output import note, parse_size, print_table, printable
 from hybridlog_storage.errors import HybridlogError, UsageError
@@ -76,13 +76,13 @@ def main(arguments: Sequence[str]) -> int:
     """Run a command; returns the exit code."""
     if arguments and arguments[0] == "live":
         return int(import_module("benchmarks.live.command").main(list(arguments[1:])))
-    stopping.install()
+    signals.install()
     try:
         return _do(_parser().parse_args(arguments), ["python", "-m", "benchmarks", *arguments])
     except HybridlogError as error:
         print(f"benchmarks: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
-    except stopping.Stopped as stopped:
+    except signals.Stopped as stopped:
         print(f"\nbenchmarks: interrupted. {stopped.consequence}".rstrip(), file=sys.stderr)
         return stopped.exit_code
     except OSError as error:
@@ -207,7 +207,7 @@ def _run(chosen: argparse.Namespace, command: list[str]) -> int:
             for part in planned:
                 speed = chosen.speed if part.name == "persistence" else 1.0
                 part.module.run(replace(context, speed=speed), part.settings)
-        except stopping.Stopped as stopped:
+        except signals.Stopped as stopped:
             again = shlex.join(word for word in command if word != "--restart")
             done = sum(sample.status == "ok" for sample in journal.samples.values())
             drawing = shlex.join([*command[:3], "report", "--out", str(chosen.out)])

@@ -23,6 +23,8 @@ import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
 from hybridlog.indexing import ChunkIndexer
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.chunk import StoredChunk, pack
@@ -310,17 +312,21 @@ PLANS: dict[str, Callable[[Any], Any]] = {
 def bench_plan(case: str, store: Any, benchmark: Any) -> None:
     """Which chunks hold the answer, in a store that has been asked before."""
     question = PLANS[case]
-    plan = benchmark(lambda: question(store).plan())
-    assert plan.lanes
+    plan = benchmark(lambda: _plan(store, question))
+    assert plan.channels
 
 
 def bench_plan_first(store: Any, benchmark: Any) -> None:
     """The same when nothing is known of the store yet."""
     question = PLANS["slice"]
     plan = benchmark.pedantic(
-        lambda: question(store).plan(), setup=store.refresh, rounds=30, warmup_rounds=1
+        lambda: _plan(store, question), setup=store.refresh, rounds=30, warmup_rounds=1
     )
-    assert plan.lanes
+    assert plan.channels
+
+
+def _plan(store: Any, question: Callable[[Any], Any]) -> Any:
+    return Planner(store.session, question(store).question, Counters()).scan_plan()
 
 
 FETCHES: dict[str, tuple[Callable[[Any], Any], int]] = {
@@ -349,7 +355,7 @@ def bench_moment(case: str, store: Any, benchmark: Any) -> None:
 
     def forget() -> None:
         if case == "elsewhere":
-            store.recent_chunks.clear()
+            store.session.recent_chunks.clear()
 
     def look() -> Any:
         return store.topic("/scan").at(next(moments)).decode()
@@ -384,7 +390,7 @@ def bench_first(case: str, store: Any, benchmark: Any) -> None:
     ask = AGAIN[case]
 
     def forget() -> None:
-        store.kept.clear()
+        store.session.tables.invalidate()
 
     answer = ask(store)
     found = benchmark.pedantic(ask, (store,), setup=forget, rounds=30, warmup_rounds=1)

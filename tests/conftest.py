@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -60,8 +61,70 @@ for number, handler in (
         signal.signal(number, handler)
 
 
+SLOW = frozenset(
+    (
+        "benchmarks/test_backends.py",
+        "benchmarks/test_harness.py",
+        "benchmarks/test_live.py",
+        "benchmarks/test_queries.py",
+        "benchmarks/test_throughput.py",
+        "cli/test_coverage.py",
+        "cli/test_export.py",
+        "cli/test_fetch.py",
+        "cli/test_info.py",
+        "cli/test_intervals.py",
+        "cli/test_maintain.py",
+        "cli/test_record.py",
+        "cli/test_record_live.py",
+        "cli/test_start.py",
+        "cli/test_stopping.py",
+        "cli/test_terminal.py",
+        "demo/test_tour.py",
+        "export/test_base.py",
+        "faults/test_some.py",
+        "live/sources/test_ros2_live.py",
+        "live/test_killed.py",
+        "live/test_recording.py",
+        "query/test_chunk_counts.py",
+        "query/test_counting.py",
+        "query/test_engines.py",
+        "query/test_intervals.py",
+        "query/test_latest.py",
+        "schema/test_codec.py",
+        "schema/test_wire.py",
+        "sources/test_rosbag1.py",
+        "sources/test_rosbag2.py",
+        "storage/test_catalog.py",
+        "storage/test_mongod.py",
+        "storage/test_segments.py",
+        "tables/test_maintenance.py",
+        "tables/test_reader.py",
+        "tables/test_writer.py",
+        "test_benchmarks.py",
+        "test_catalog_by_hand.py",
+        "test_consent.py",
+        "test_docs.py",
+        "test_exact_values.py",
+        "test_faults.py",
+        "test_field_indexes.py",
+        "test_groups.py",
+        "test_hostile_store.py",
+        "test_model.py",
+        "test_mutants.py",
+        "test_packaging.py",
+        "test_power_cut.py",
+        "test_reader.py",
+        "test_real_logs.py",
+        "test_second_opinion.py",
+        "test_style.py",
+    )
+)
+"""Files left out by `-m "not slow"`: with them, a run takes ten minutes instead of one."""
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", 'slow: takes long; left out by -m "not slow"')
+    config.addinivalue_line("markers", 'slow: left out by -m "not slow", the quick loop')
+    config.addinivalue_line("markers", "exhaustive: takes hours; run by -m exhaustive")
     config.addinivalue_line("markers", "peer(kind): speaks with a real peer, not one of ours")
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(real_peers.Attendance())
@@ -78,5 +141,9 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     real_peers.mark(items)
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.relative_to(here).as_posix() in SLOW or item.get_closest_marker("exhaustive"):
+            item.add_marker(pytest.mark.slow)
     rank = {name: at for at, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))

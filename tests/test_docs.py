@@ -429,7 +429,7 @@ def test_the_two_commands_stand_where_the_machine_reads_them() -> None:
     assert len(lines) == 2
     assert all(line.startswith("    python3 -m venv .venv && ") for line in lines)
     assert lines[0].endswith(".venv/bin/hybridlog demo")
-    assert lines[1].endswith(".venv/bin/pytest -q -m 'not slow'")
+    assert lines[1].endswith(".venv/bin/pytest -q")
 
 
 def test_the_changelog_has_this_version() -> None:

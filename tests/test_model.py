@@ -1237,7 +1237,7 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         model.teardown()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(3600)
 def test_the_store_is_its_model_whatever_chance_brings(machine: type[Machine]) -> None:
     run_state_machine_as_test(

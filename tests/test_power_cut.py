@@ -147,7 +147,7 @@ def test_a_power_cut_while_recording(
     try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=12, fates=3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
 def test_power_cuts_at_every_call(
     tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch

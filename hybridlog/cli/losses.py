@@ -31,11 +31,13 @@ def command(
     as_json: bool,
 ) -> None:
     """Show what is missing, from when to when, and why."""
-    from hybridlog.query.topics import matcher
+    from hybridlog.query.topics import matcher, resolve
 
     fits = matcher(topic) if topic else None
     with opened_store(store, mongo) as opened:
         entries = opened.select(recording) if recording else opened.recordings()
+        if topic:
+            resolve(topic, opened.topics())  # refuses a name that fits no topic
     rows = [
         {"recording": entry.label, **loss}
         for entry in entries

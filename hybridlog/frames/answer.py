@@ -215,6 +215,7 @@ class Decoder:
             stamps = stamp_array(records)
             records = _without_stamp(records, self._chosen)
         if len(good) < len(batch):
+            self._counters.unreadable += len(batch) - len(good)
             batch, seq = batch.take(good), seq[good]
         own = self.own_columns(number, batch, seq, stamps)
         order = seq + self._ranks[number]

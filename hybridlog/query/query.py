@@ -137,8 +137,8 @@ class Query:
         Raises:
             UsageError: a negative number.
         """
-        if count < 0:
-            raise UsageError("A limit cannot be negative.")
+        if not isinstance(count, int) or count < 0:
+            raise UsageError(f"A limit is a number from 0 on, not {count!r}.")
         return self._with(limit=count)
 
     def every(self, step: int) -> Query:
@@ -147,8 +147,8 @@ class Query:
         Raises:
             UsageError: less than one.
         """
-        if step < 1:
-            raise UsageError("every(n) needs n of at least 1.")
+        if not isinstance(step, int) or step < 1:
+            raise UsageError(f"every(n) needs a number n of at least 1, not {step!r}.")
         return self._with(every=step)
 
     def reverse(self) -> Query:
@@ -166,6 +166,8 @@ class Query:
         """
         from hybridlog.frames.names import is_own
 
+        if not all(isinstance(path, str) for path in paths):
+            raise UsageError('Fields are names: fields("header.stamp", "ranges.min").')
         known = self.field_types()
         for path in paths:
             if known and not (_is_field(path, known) or is_own(path)):

@@ -171,6 +171,11 @@ class TopicTable:
         """
         return self.empty(paths).type
 
+    @property
+    def has_fields(self) -> bool:
+        """Whether the messages have any field."""
+        return any(not leaf.is_own for leaves in self._leaves.values() for leaf in leaves)
+
     def has(self, path: str) -> bool:
         """Whether there is a field."""
         names = _names(path)

@@ -10,7 +10,7 @@ from tests.faults.cases import Bench
 from tests.faults.scenarios import scenario
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", points.BESIDE)
 def test_questions_beside_a_command_are_answered_right_or_refused(bench: Bench, name: str) -> None:

@@ -7,7 +7,7 @@ from tests.faults.cases import Bench, try_everything
 from tests.faults.scenarios import scenario
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", points.CHANGES)
 def test_what_is_interrupted_is_finished_or_taken_back(bench: Bench, name: str) -> None:

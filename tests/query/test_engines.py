@@ -391,7 +391,7 @@ def test_every_engine_answers_as_a_loop_does(world: World, question: dict[str, A
     check(world, question)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @settings(max_examples=3000, suppress_health_check=relaxed)
 @given(question=questions())
 def test_three_thousand_questions(world: World, question: dict[str, Any]) -> None:

@@ -54,7 +54,7 @@ class Mongo:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
-        if need is Need.VALUES or self._session.database is None:
+        if need is Need.VALUES or _is_older(part) or self._session.database is None:
             return None
         try:
             if need is not Need.SELECTION and self.undecided(part):
@@ -195,6 +195,14 @@ class Mongo:
             self._counters.documents_read += len(keys)
             if len(keys):
                 yield keys
+
+
+def _is_older(part: Part) -> bool:
+    """Whether the index is older than the package that reads the fields of the messages."""
+    if part.predicate is None:
+        return False
+    unread = {c.id for c in part.recording.channels if c.reason is not None}
+    return any(c.channel_id in unread and c.codec.indexed for c in part.channels)
 
 
 def joined(condition: _Filter, predicate: Mapping[str, object]) -> _Filter:

@@ -56,8 +56,10 @@ class TablesEngine:
         if any(True for _ in lost_spans(part.recording)):
             return None  # rows of messages that are lost must not answer
         table = self._session.table(part.recording, part.topic)
-        if table is None or table.reduced:
-            return None  # tables have no fields of reduced messages
+        if table is None or table.reduced or table.unreadable:
+            return None  # fields of such messages are not in the table
+        if not table.has_fields and any(c.codec.indexed for c in part.channels):
+            return None  # the table is older than the package that reads the messages
         own = ("ref",) if need is Need.SELECTION else ()
         wanted = _wanted(table, part, fields if need is Need.VALUES else ())
         return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
@@ -135,7 +137,7 @@ class TablesEngine:
         if table is None:
             raise StoreError(f"The table of {part.topic} is not there any more.")
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
-        columns = {*own, "state"} if table.unreadable else {*own}
+        columns = {*own}
         if part.predicate is not None and "_meta.pub" in part.predicate.fields():
             columns.add("pub")
         paths = _wanted(table, part, fields)
@@ -161,9 +163,6 @@ class TablesEngine:
         found = to_mask(predicate, part.field_types, records)
         if found is None:
             raise UndecidedError(f"The table of {part.topic} cannot tell.")
-        if "state" in rows.own and not all(path.startswith("_meta") for path in asked):
-            states = rows.own["state"].cast("string").to_numpy(zero_copy_only=False)
-            found = found & (states != "unreadable")
         return found
 
 
