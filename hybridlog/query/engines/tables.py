@@ -47,22 +47,30 @@ class TablesEngine:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
+        table = self._believed(part, need, fields)
+        if table is None:
+            return None
+        own = ("ref",) if need is Need.SELECTION else ()
+        wanted = _wanted(table, part, fields if need is Need.VALUES else ())
+        return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
+
+    def _believed(
+        self, part: Part, need: Need, fields: Collection[str] | None
+    ) -> TopicTable | None:
+        """The table of a part, if it can answer."""
         if not part.is_by_log_time or (part.predicate is None and need is not Need.VALUES):
             return None  # the chunk index knows the times
         if part.predicate is not None and not can_decide(part.predicate):
             return None
-        if need is Need.VALUES and not _are_whole(part, fields):
+        is_lossy = any(True for _ in lost_spans(part.recording))  # lost rows must not answer
+        if is_lossy or (need is Need.VALUES and not _are_whole(part, fields)):
             return None
-        if any(True for _ in lost_spans(part.recording)):
-            return None  # rows of messages that are lost must not answer
         table = self._session.table(part.recording, part.topic)
         if table is None or table.reduced or table.unreadable:
             return None  # fields of such messages are not in the table
-        if not table.has_fields and any(c.codec.indexed for c in part.channels):
-            return None  # the table is older than the package that reads the messages
-        own = ("ref",) if need is Need.SELECTION else ()
-        wanted = _wanted(table, part, fields if need is Need.VALUES else ())
-        return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
+        # A table may be older than the package that reads the messages.
+        is_older = not table.has_fields and any(c.codec.indexed for c in part.channels)
+        return None if is_older else table
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of rows of which the predicate holds.
