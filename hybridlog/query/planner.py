@@ -1,8 +1,8 @@
 """Splits a question into parts and chooses an engine for each.
 
 This is the only place that chooses. A part is one topic of one recording: an ended, a
-running and a damaged recording may need different engines. Each engine tells what its
-answer would cost; the cheapest one answers, and if it fails, the next one.
+running and a damaged recording may need different engines. Each engine estimates the cost
+of its answer; the cheapest one answers, and if it fails, the next one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
 
-_READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
+_READ_AHEAD_FROM = 50  # messages; fewer are read without reading ahead
 _T = TypeVar("_T")
 _RETRIED = (DatabaseError, IndexChangedError, SegmentError, StoreError, UndecidedError)
 """Failures of one engine that another engine may not have."""
@@ -78,8 +78,8 @@ class Planner:
         """The question, split by recording and topic; recordings oldest first.
 
         Raises:
-            TimeError: the time range is empty, or outside of all recordings.
-            TopicError: a topic does not have the clock that was asked for.
+            TimeError: the time range is empty, or outside all recordings.
+            TopicError: a topic does not have the requested clock.
         """
         wanted = set(self.question.topics)
         found: list[Part] = []
@@ -104,7 +104,7 @@ class Planner:
         return found
 
     def channels(self) -> list[RecordedChannel]:
-        """Every channel that the question is about."""
+        """Every channel of the question."""
         wanted = set(self.question.topics)
         return [
             channel
@@ -116,7 +116,7 @@ class Planner:
     # Answers.
 
     def count(self) -> int:
-        """Number of messages in the answer; payloads are read only if nothing else can tell."""
+        """Number of messages in the answer; payloads are read only as the last resort."""
         every = self.question.every
         by_topic: dict[str, list[Part]] = defaultdict(list)
         for part in self.parts():
@@ -133,7 +133,7 @@ class Planner:
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
-        """Whether the fields of the messages of a part come from its table."""
+        """True if the fields of the messages of a part come from its table."""
         if self._choose(part, Need.VALUES, fields)[0] is not self._tables:
             return False
         try:
@@ -143,14 +143,14 @@ class Planner:
         return True
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Fields of the messages of a part that match, in order."""
+        """Fields of the matching messages of a part, in order."""
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
     def runs(self, plan: ScanPlan | None = None) -> Iterator[MessageRun]:
         """The messages of the answer, in order.
 
         Args:
-            plan: What `scan_plan` gave, for a caller that needs its channels.
+            plan: The result of `scan_plan`, for a caller that needs its channels.
         """
         question = self.question
         if question.limit == 0:
@@ -163,13 +163,13 @@ class Planner:
             yield run
 
     def unordered(self, plan: ScanPlan) -> Iterator[MessageRun]:
-        """The messages of an answer without `limit` and `every`, in no order."""
+        """The messages of an answer without `limit` and `every`, unordered."""
         for run in ChunkScan(plan, self.session.segment).unordered():
             self.counters.add_messages(run.batch)
             yield run
 
     def scan_plan(self) -> ScanPlan:
-        """What to read for the messages of the answer."""
+        """The plan for reading the messages of the answer."""
         return self._plan_of(self.parts())
 
     def _plan_of(self, parts: Sequence[Part]) -> ScanPlan:
@@ -206,7 +206,7 @@ class Planner:
         return plan
 
     def _undecided(self, part: Part) -> Predicate | None:
-        """The share of a part's predicate that is left when MongoDB has answered."""
+        """The part of a predicate that remains after MongoDB has answered."""
         assert part.predicate is not None
         return residual(part.predicate) if self._mongo.undecided(part) else None
 
@@ -260,14 +260,14 @@ class Planner:
         return total
 
     def _is_narrowed(self, part: Part) -> bool:
-        """Whether MongoDB finds candidates, and the messages decide."""
+        """True if MongoDB finds candidates, and the messages decide."""
         if part.predicate is None or self.session.database is None:
             return False
         able = [e for e in self._engines if e.cost(part, Need.COUNT) is not None]
         return able in ([], [self._scan]) and self._mongo.cost(part, Need.SELECTION) is not None
 
     def _count_otherwise(self, part: Part, failed: int, failure: Exception) -> int:
-        """The count of an engine that failed, by the next ones."""
+        """The count from the next engines, after one has failed."""
         for engine in self._choose(part, Need.COUNT):
             if engine is not self._engines[failed]:
                 with suppress(*_RETRIED):
