@@ -188,7 +188,7 @@ class IntervalQueries:
             )
         if not question.returns_all or question.reverse:
             raise UsageError(
-                f"{subject} is found in all messages: limit, every and reverse do not fit."
+                f"{subject} uses all messages; it cannot be combined with limit, every or reverse."
             )
 
 
