@@ -71,7 +71,7 @@ class IntervalQueries:
                 "without `limit` and `every`."
             )
         if parse_duration(before) == parse_duration(after) == 0:
-            raise UsageError("How long before or after? A window needs one of them.")
+            raise UsageError("A window needs a length: give before, after or both.")
         found = []
         for entry, times in self._times():
             rows = np.stack([times, times, np.ones_like(times)], axis=1)
