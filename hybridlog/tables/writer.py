@@ -572,7 +572,7 @@ class TableWriter:
         return sum(topic.size for topic in self._topics.values())
 
     def _spill(self) -> None:
-        """Write rows of the largest topics, if too many wait in memory."""
+        """Write rows of the largest topics if too many are waiting in memory."""
         if self._pending < _PENDING:
             return
         self._decode()
@@ -587,12 +587,12 @@ class TableWriter:
                 continue
             for segment in sorted({piece.segment for piece in topic.pieces}):
                 with self._only(topic):
-                    # What waits of segments that are cut has no file to go to.
+                    # Waiting rows of closed segments have no file to go to.
                     place = segment if segment not in self._cut else max(self._seen)
                     opened += self._write(topic, place, topic.take({segment}))
 
     def _write(self, topic: _Topic, segment: int, pieces: list[_Piece]) -> int:
-        """Write rows to the unfinished file of a segment; returns how many files were begun."""
+        """Write rows to the unfinished file of a segment; returns the number of new files."""
         from hybridlog.tables.fields import UnfitError
 
         if not pieces:
@@ -614,7 +614,7 @@ class TableWriter:
     def _new_part(self) -> Path:
         if not self._has_parts:
             with suppress(FileNotFoundError):
-                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # of a crash
+                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # left from a crash
             files.make_folders(self._parts, depth=files.IN_FOLDER)
             self._has_parts = True
         self._numbers += 1
@@ -625,7 +625,7 @@ class TableWriter:
             raise OSError(errno.ENOSPC, "the disk is nearly full")
 
     def _cut_sealed(self) -> None:
-        """Finish files of segments that are sealed, and of which all messages have come."""
+        """Finish files of sealed segments of which all messages have been added."""
         if not self._sealed:
             return
         with self._lock:
@@ -642,7 +642,7 @@ class TableWriter:
             self._cut_segment(segment, digest)
 
     def _cut_segment(self, segment: int, digest: str) -> None:
-        """Finish the files of a segment; topics of few rows wait for the next one."""
+        """Finish the files of a segment; topics with few rows wait for the next one."""
         self._cut[segment] = digest
         for topic in self._topics.values():
             with self._only(topic):
@@ -652,7 +652,7 @@ class TableWriter:
                 self._finish(topic)
 
     def _finish(self, topic: _Topic) -> None:
-        """Finish a topic's files of segments that are cut."""
+        """Finish a topic's files of closed segments."""
         for segment in sorted(topic.files.keys() & self._cut.keys()):
             for file in topic.files.pop(segment):
                 name = topic_file(topic.schema, segment, topic.finished[segment])
@@ -675,7 +675,7 @@ class TableWriter:
         )
 
     def _publish(self, folder: str, path: Path, name: str) -> None:
-        """Give a finished file its name now, or remember which one it gets."""
+        """Give a finished file its name now, or record the name for the end."""
         if not self._is_new:
             self._finished.setdefault(folder, []).append((path, name))
             return
@@ -717,7 +717,7 @@ class TableWriter:
         return failed | {name for name in rows if rows[name] != entry.messages_of(name)}
 
     def _write_small(self) -> None:
-        """Topics of few rows, those of one type in one file."""
+        """Write topics with few rows, those of one type into one file."""
         by_schema: dict[str, list[_Topic]] = {}
         for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.pieces:
@@ -737,7 +737,7 @@ class TableWriter:
             self._publish(SMALL, file.path, small_file(topics[0].type, schema))
 
     def _exchange(self, place: Path, finished: list[tuple[Path, str]]) -> None:
-        """Put finished files in the place of those that are there."""
+        """Replace existing files with finished ones."""
         files.make_folders(place, depth=IN_TOPIC - 1)
         target = place
         if place.name != SMALL:
@@ -755,7 +755,7 @@ class TableWriter:
 
 
 def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.intp] | None:
-    """Rows by log time and arrival; None if they are in this order already."""
+    """Order of the rows by log time and arrival; None if they are in order already."""
     later = log_time[1:] > log_time[:-1]
     if not later.all():
         same = log_time[1:] == log_time[:-1]
@@ -807,7 +807,7 @@ def _own_columns(
 
 
 def _errors(pieces: Sequence[_Piece], states: NDArray[np.int8]) -> Any:
-    """Why messages are unreadable; their states are set."""
+    """Reasons why messages are unreadable; sets their states."""
     import pyarrow as pa
 
     if not any(piece.errors for piece in pieces):
