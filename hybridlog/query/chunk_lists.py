@@ -67,8 +67,7 @@ class ChunkLists:
             fetch: As for `find`.
 
         Yields:
-            A chunk, and the greatest log time, ns, of any message in it or in a later
-            chunk.
+            A chunk, and the greatest log time, ns, that it or any later chunk may hold.
             come may hold.
         """
         held = frozenset(channels)

@@ -4,8 +4,8 @@ Under pressure a recorder stores only the small parts of a large message. A redu
 is stored in the segment like any message, on a separate channel with the encoding
 `REDUCED`. The index can therefore be rebuilt from it, too.
 
-Its payload is a head of 40 bytes, with the size (u64, little-endian) and the SHA-256 of
-the dropped payload, and then the BSON elements of the index document without `_meta`.
+Its payload begins with 40 bytes: the size (u64, little-endian) and the SHA-256 of the
+dropped payload. The BSON elements of the index document without `_meta` follow.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Predicates from MongoDB filters that a user wrote.
 
 Only operators that compare values are allowed. Operators that run code on the server
-(`$where`, `$function`, `$accumulator`), read other data or are unknown are refused, and so
-are values with code in them. Conditions that the language has become the same
-tree as its text; the rest remains a filter that only MongoDB answers. Patterns
-have RE2's syntax, and are allowed where the language has them.
+(`$where`, `$function`, `$accumulator`), read other data or are unknown are refused. Values
+with code in them are refused, too. Conditions that the language has become the same tree as
+its text; the rest remains a filter that only MongoDB answers. Patterns have RE2's syntax,
+and are allowed where the language has them.
 """
 
 from __future__ import annotations
