@@ -205,8 +205,8 @@ class _Results:
         if done == len(self._paths):
             return "Everything was recorded."
         kept = len(self._reports)
-        before = f" {output.counted(kept, 'recording')} made before stay." if kept else ""
-        return f"Nothing of {self._paths[done]} is kept.{before}"
+        before = f" {output.counted(kept, 'recording')} stored before." if kept else ""
+        return f"Nothing of {self._paths[done]} is stored.{before}"
 
     def show(self) -> None:
         """Print the table of the finished recordings."""
