@@ -33,7 +33,7 @@ _IMAGES: Final[Mapping[str, tuple[str, int]]] = {
     },
     **dict.fromkeys(("yuv422", "yuv422_yuy2", "uyvy", "yuyv"), ("u1", 2)),
 }
-# Planes of one byte a sample: rows of the whole picture for each row of the image.
+# Planes of one byte per sample: rows of the whole picture for each row of the image.
 _PLANAR: Final[Mapping[str, tuple[int, int]]] = {"nv21": (3, 2), "nv12": (3, 2), "nv24": (3, 1)}
 _CV_ENCODING = re.compile(r"(8|16|32|64)(U|S|F)C(\d{1,3})?")
 _CV_TYPES = {"8U", "8S", "16U", "16S", "32S", "32F", "64F", "16F"}
@@ -59,26 +59,26 @@ def to_numpy(type_name: str, message: object) -> NDArray[Any]:
 
     * `Image`: shape (height, width) or (height, width, channels) in the encoding's own
       channel order; big-endian samples have a big-endian dtype. YUV 4:2:2 has two
-      channels as they lie; NV12, NV21 and NV24 come as the raw planes, shape
+      channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape
       (rows of all planes, width).
     * `CompressedImage`: shape (height, width) or (height, width, 3 or 4), red first.
       `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
-      (NaN where nothing was measured).
-    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if there are any)
+      (NaN for missing measurements).
+    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
       and `angle` (radians), float32.
     * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
       cloud's own fields; `PointCloud`: shape (n,), `x`, `y`, `z` and the channels.
 
-    Images, and clouds of the new kind, are views of the message's data and do not copy.
+    Images and `PointCloud2` clouds are views of the message's data, without a copy.
 
     Args:
         type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
         message: The decoded message, its fields as attributes.
 
     Raises:
-        PayloadError: The type is none of these, or the sizes, the encoding or the
+        PayloadError: the type is none of these, or the sizes, the encoding or the
             fields do not fit the data.
-        MissingDependencyError: Pillow is needed and not there.
+        MissingDependencyError: Pillow is required and not installed.
     """
     maker = _MAKERS.get(type_name.replace("/msg/", "/"))
     if maker is None:
@@ -89,7 +89,7 @@ def to_numpy(type_name: str, message: object) -> NDArray[Any]:
     try:
         return maker(message)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise PayloadError(f"this {type_name} is not the usual one: {error}") from error
+        raise PayloadError(f"this {type_name} has unusual fields: {error}") from error
 
 
 def _bytes(data: Any) -> NDArray[np.uint8]:
@@ -123,7 +123,7 @@ def _image(message: Any) -> NDArray[Any]:
 
 
 def _sample(encoding: str) -> tuple[np.dtype[Any], int]:
-    """Type of a sample, and samples a pixel."""
+    """Type of a sample, and number of samples per pixel."""
     known = _IMAGES.get(encoding.lower())
     if known is not None:
         return np.dtype(known[0]), known[1]
@@ -157,7 +157,7 @@ def _view(
 ) -> NDArray[Any]:
     """An array over `data`; the caller checked that it lies inside."""
     if 0 in shape:
-        # Sizes beside the zero are free to lie; numpy refuses those it cannot multiply.
+        # If one size is zero, the others are unchecked; numpy refuses those it cannot multiply.
         return np.empty(tuple(min(size, 1 << 31) for size in shape), dtype)
     array: NDArray[Any] = np.ndarray(shape, dtype, data.data, 0, strides)
     return array
@@ -172,7 +172,7 @@ def _compressed_image(message: Any) -> NDArray[Any]:
 
 
 def _depth(form: str, data: bytes) -> NDArray[Any]:
-    """A depth image behind its header: quantised inverse depth, or depth as it is."""
+    """A depth image after its header: quantised inverse depth, or plain depth."""
     if len(data) < _DEPTH_HEADER.size or "rvl" in form.lower():
         raise PayloadError(f"a depth image in the form {form[:60]!r} cannot be read: only PNG can")
     _, scale, shift = _DEPTH_HEADER.unpack_from(data)
@@ -203,7 +203,7 @@ def _picture(data: bytes) -> NDArray[Any]:
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=_COMPRESSED) as image:
-                # Grey of 16 bits and of 32-bit floats have modes of their own.
+                # 16-bit and 32-bit float grey images have modes of their own.
                 plain = image.mode in {"L", "RGB", "RGBA", "F", "I"} or image.mode[:4] == "I;16"
                 mode = "RGBA" if "A" in image.mode or "transparency" in image.info else "RGB"
                 mode = "L" if image.mode == "1" else mode
@@ -251,7 +251,7 @@ def _point_cloud2(message: Any) -> NDArray[Any]:
     data = _bytes(message.data)
     order = ">" if message.is_bigendian else "<"
     dtype = _point_dtype(message.fields, step, order)
-    # The step of a single row is often left at 0.
+    # The step of a single row is often 0.
     row_step = int(message.row_step) if height > 1 else width * step
     _check_rows("a point cloud", (height, width), width * step, row_step, len(data))
     if height == 1:
@@ -263,7 +263,7 @@ def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
     """The structure of one point.
 
     Raises:
-        PayloadError: A field has an unknown type, lies outside the point, or overlaps
+        PayloadError: a field has an unknown type, lies outside the point, or overlaps
             another.
     """
     names: list[str] = []
@@ -302,7 +302,7 @@ def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
 
 
 def _unique(name: str, taken: list[str]) -> str:
-    """A field name that numpy accepts: not empty and not there already."""
+    """A field name that numpy accepts: not empty and not used already."""
     name = name or f"field_{len(taken)}"
     while name in taken:
         name += "_"

@@ -49,7 +49,7 @@ class Backpressure:
             chunks back from the segments.
         has_room: Returns whether this many bytes of chunks may wait for the index in memory.
         next_chunk_size: Returns the size in bytes of the next chunk.
-        spare: Semaphore of the processors for packing without hurry, and for making documents
+        spare: Semaphore of the processors for packing that can wait, and for making documents
             and tables.
         on_written: Called on another thread when less content waits for the disk. `append`
             then never waits; its caller watches `writer.waiting`.
@@ -73,11 +73,11 @@ class Capture:
         catalog: Its catalog.
         database: The index.
         name: Name of the recording.
-        tags: Kept with it.
-        source: What its messages come from, as the catalog shows it.
-        settings: How segments are cut and packed.
-        pressure: Of whoever appends, if it cannot wait for compression, disk and index.
-        check: Called with the catalog before anything is made, while nobody else can
+        tags: Tags of the recording.
+        source: Origin of its messages, for the catalog.
+        settings: Rotation, chunks and compression of segments.
+        pressure: Settings for a caller that cannot wait for compression, disk and index.
+        check: Called with the catalog before anything is written, while no other process can
             start a recording; raises to refuse.
 
     Attributes:

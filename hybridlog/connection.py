@@ -1,4 +1,4 @@
-"""The connection of a store to its index in MongoDB, made when a question needs it."""
+"""The connection of a store to its index in MongoDB, made on first use."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 class Connection:
-    """Starts and reaches the MongoDB that holds the index of a store.
+    """Starts and connects to the MongoDB that holds the index of a store.
 
     Args:
         directory: The store.
-        mongo: URI of the MongoDB, or `embedded`; None for the one that the store names.
+        mongo: URI of the MongoDB, or `embedded`; None for the one in the store's settings.
 
     Attributes:
-        database: The index; None while there is no connection.
+        database: The index; None without a connection.
     """
 
     def __init__(self, directory: StoreDirectory, mongo: str | None) -> None:
@@ -32,7 +32,7 @@ class Connection:
         self._mongod: EmbeddedMongod | None = None
 
     def open(self) -> Database:
-        """Connect, and make sure that the database belongs to this store.
+        """Connect, and check that the database belongs to this store.
 
         Raises:
             DatabaseError: MongoDB does not answer.
@@ -50,7 +50,7 @@ class Connection:
         return self.database
 
     def another(self) -> Database:
-        """A further connection; starts the embedded MongoDB if it is not running.
+        """An additional connection; starts the embedded MongoDB if it is not running.
 
         Raises:
             DatabaseError: MongoDB does not answer.
@@ -78,7 +78,7 @@ class Connection:
 
     @property
     def place(self) -> str:
-        """Where the index is, in words; MongoDB is not asked."""
+        """Description of the index's location; does not contact MongoDB."""
         if self.database is not None:
             return f"database {self.database.name} at {self.database.address}"
         uri = self._wanted or self._directory.settings.mongo or EMBEDDED
@@ -89,7 +89,7 @@ class Connection:
         return without_secrets(uri)
 
     def close(self) -> None:
-        """Disconnect; the embedded MongoDB ends when nobody uses it."""
+        """Disconnect; the embedded MongoDB ends when no process uses it."""
         if self.database is not None:
             self.database.close()
         self.database = None
@@ -98,7 +98,7 @@ class Connection:
         self._mongod = None
 
     def take_over(self) -> None:
-        """Record in the index that the store lies here now.
+        """Record in the index that the store is at this location.
 
         Raises:
             DatabaseError: MongoDB does not answer.

@@ -1,8 +1,8 @@
-"""Which MongoDB servers this user lets stores lead to.
+"""The user's consent to MongoDB servers that stores refer to.
 
-A store may come from somebody else, and its `hybridlog.toml` may name any server. So the URI
-in it is used only when this user made the store with it, or agreed to it later. What was
-agreed to is kept outside of all stores, in `$XDG_STATE_HOME/hybridlog/trusted.json`.
+A store may be untrusted, and its `hybridlog.toml` may name any server. So the URI
+in it is used only if this user created the store with it, or agreed to it later.
+Agreements are outside all stores, in `$XDG_STATE_HOME/hybridlog/trusted.json`.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _STORES: Final = "stores"
 
 
 def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
-    """The URI that a store may lead to, or `embedded`.
+    """The URI that a store may use, or `embedded`.
 
     Args:
-        settings: The store's.
+        settings: The store's settings.
         store: Its directory, for the message.
 
     Raises:
-        DatabaseError: It names a server that this user has not agreed to.
+        DatabaseError: the store names a server that this user has not agreed to.
     """
     if settings.mongo is None:
         return EMBEDDED
@@ -53,19 +53,19 @@ def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
 
 
 def is_trusted(store_id: str, uri: str) -> bool:
-    """Whether this user has agreed that a store leads to a server."""
+    """True if this user has agreed that a store uses a server."""
     return without_password(uri) in _trusted().get(store_id, ())
 
 
 def remember(store_id: str, uri: str) -> None:
-    """Agree that a store leads to a server.
+    """Agree that a store uses a server.
 
     Args:
         store_id: The store.
-        uri: The server; without its password it is kept.
+        uri: The server; it is stored without its password.
 
     Raises:
-        StoreError: It cannot be written down.
+        StoreError: the agreement cannot be stored.
     """
     with _changing() as trusted:
         uris = trusted.setdefault(store_id, [])
@@ -74,23 +74,23 @@ def remember(store_id: str, uri: str) -> None:
 
 
 def forget(store_id: str) -> bool:
-    """Agree no more to any server that a store may name.
+    """Revoke the agreement to all servers of a store.
 
     Returns:
-        Whether there was one.
+        True if there was an agreement.
 
     Raises:
-        StoreError: It cannot be written down.
+        StoreError: the change cannot be stored.
     """
     with _changing() as trusted:
         return trusted.pop(store_id, None) is not None
 
 
 def state_directory() -> Path:
-    """Where this user's agreements are kept.
+    """Directory of this user's agreements.
 
     Raises:
-        StoreError: This user has no home.
+        StoreError: this user has no home directory.
     """
     named = os.environ.get("XDG_STATE_HOME", "")
     if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count
@@ -104,7 +104,7 @@ def state_directory() -> Path:
 
 
 def _trusted() -> dict[str, list[str]]:
-    """URIs by store; none where the file is missing, damaged, or not this user's alone."""
+    """URIs by store; empty if the file is missing, damaged, or writable by other users."""
     try:
         path = state_directory() / _NAME
         about = files.status(path, depth=files.IN_STORE)
@@ -126,7 +126,7 @@ def _trusted() -> dict[str, list[str]]:
 
 @contextmanager
 def _changing() -> Iterator[dict[str, list[str]]]:
-    """What is trusted, to be changed while no other process does."""
+    """The agreements, locked against other processes during a change."""
     directory = state_directory()
     path = directory / _NAME
     try:

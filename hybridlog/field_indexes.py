@@ -1,7 +1,7 @@
-"""Indexes on fields, with which MongoDB finds documents without looking at all of them.
+"""Indexes on fields, with which MongoDB finds documents without a scan.
 
-They change how long a question takes and never its answer, so the segments know nothing
-of them: MongoDB keeps them, and `reindex` makes again what was there.
+They change the duration of a query and never its answer, so the segments do not have
+them: MongoDB stores them, and `reindex` creates them again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
 
 OWN_FIELDS = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
-"""Fields that every index document has, whatever its topic."""
+"""Fields that every index document has, in any topic."""
 
 _OURS = "hybridlog."
 _MOST_FIELDS = 8
@@ -27,7 +27,7 @@ class FieldIndex(NamedTuple):
 
     Attributes:
         topic: Full name.
-        fields: In the order of the index.
+        fields: Fields in the order of the index.
     """
 
     topic: str
@@ -35,11 +35,11 @@ class FieldIndex(NamedTuple):
 
 
 def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> None:
-    """Make an index on each topic, unless it is there.
+    """Create an index on each topic, unless it exists.
 
     Raises:
         UsageError: no field, or too many.
-        DatabaseError: MongoDB cannot make it: two of the fields are arrays.
+        DatabaseError: MongoDB cannot create it: two of the fields are arrays.
     """
     _check(fields)
     for topic in topics:
@@ -48,7 +48,7 @@ def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> Non
 
 
 def remove(database: Database, topics: Iterable[str], fields: Sequence[str]) -> int:
-    """Drop the index on these fields from each topic; returns how many there were."""
+    """Drop the index on these fields from each topic; returns the number of indexes dropped."""
     _check(fields)
     return sum(database.drop_index(collection_of(topic), _keys(fields)) for topic in topics)
 
@@ -63,7 +63,7 @@ def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
 
 
 def of_collections(database: Database) -> Mapping[str, list[list[tuple[str, int]]]]:
-    """The keys of all indexes on topics' collections, to make them again."""
+    """The keys of all indexes on topics' collections, for `make_again`."""
     names = [name for name in database.list_collections() if not name.startswith(_OURS)]
     return {name: keys for name in names if (keys := database.indexes(name))}
 
@@ -71,7 +71,7 @@ def of_collections(database: Database) -> Mapping[str, list[list[tuple[str, int]
 def make_again(
     database: Database, indexes: Mapping[str, Sequence[Sequence[tuple[str, int]]]]
 ) -> None:
-    """Make indexes on collections that were dropped."""
+    """Create indexes again on collections that were dropped."""
     for collection, all_keys in indexes.items():
         database.ensure_collection(collection)
         for keys in all_keys:
@@ -80,9 +80,9 @@ def make_again(
 
 def _check(fields: Sequence[str]) -> None:
     if not fields:
-        raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
+        raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
     if len(fields) > _MOST_FIELDS or len(set(fields)) != len(fields):
-        raise UsageError(f"An index takes up to {_MOST_FIELDS} fields, each once.")
+        raise UsageError(f"An index takes up to {_MOST_FIELDS} fields, without duplicates.")
 
 
 def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:

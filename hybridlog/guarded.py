@@ -1,9 +1,9 @@
-"""Guards answers from MongoDB against another process that removes or rebuilds the index.
+"""Protects answers from MongoDB against changes of the index by other processes.
 
-Another process may remove a recording, or make its index again, at any moment. It says so
-in the database before the first document goes. So whoever asks looks there once more after
-each answer: one small question, of one document. Before the first one it is made sure that
-all documents of the recordings are there.
+Another process may remove a recording or rebuild its index at any time. It announces this
+in the database before it removes the first document. After each answer, a small query of
+one document therefore looks for announcements. Before the first answer, the index is
+checked to be complete for the recordings.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Belief:
-    """What the index said of itself at a time.
+    """State of the index at some time.
 
     Attributes:
-        turn: How often documents of any recording were about to be removed.
-        recordings: How far each recording was that was looked at, by key; None for one that
-            is not in the index. Looked at after `turn` was.
+        turn: Number of announced removals of documents of any recording.
+        recordings: Progress of each recording, by key; None if it is not in the
+            index. Read after `turn`.
     """
 
     turn: int
@@ -39,7 +39,7 @@ class Belief:
 
     @classmethod
     def of(cls, database: Database, keys: Collection[str], before: Belief | None) -> Belief:
-        """What it says now of some recordings, and of those that it said something of before."""
+        """The current state for some recordings, and for those in an earlier state."""
         state = IndexState(database)
         if before is not None and before.recordings.keys() >= set(keys):
             return before
@@ -49,7 +49,7 @@ class Belief:
         return cls(turn, {**known, **dict.fromkeys(missing), **state.progress(missing)})
 
     def problem(self, entry: RecordingEntry) -> str | None:
-        """Why the index cannot answer for a recording; None when it can."""
+        """The reason why the index cannot answer for a recording; None if it can."""
         found = self.recordings[entry.key]
         if found is None:
             gone = f"Recording {entry.label!r} was removed from the index by another process."
@@ -71,9 +71,9 @@ class Believe(Protocol):
 
 
 class GuardedIndex:
-    """Asks the index about some recordings. Thread safe.
+    """Queries the index about some recordings. Thread safe.
 
-    The methods are those of `Database`, and raise what those raise.
+    The methods are those of `Database`, and raise the same errors.
 
     Args:
         database: The index.
@@ -83,7 +83,7 @@ class GuardedIndex:
         on_change: Called when another process has changed the index.
 
     Raises:
-        IndexChangedError: Not all documents of these recordings are there.
+        IndexChangedError: some documents of these recordings are missing.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class GuardedIndex:
         return self._once(lambda: self.database.count_each(questions, most=most))
 
     def find_one(self, collection: str, *args: Any, **options: Any) -> dict[str, Any] | None:
-        """The first document, None when there is none."""
+        """The first document; None if none matches."""
         return self._once(lambda: self.database.find_one(collection, *args, **options))
 
     def find_raw(self, collection: str, *args: Any, **options: Any) -> Iterator[bytes]:
@@ -120,7 +120,7 @@ class GuardedIndex:
     def find_each(
         self, collection: str, filters: Sequence[_Filter], *args: Any, **options: Any
     ) -> Iterator[bytes]:
-        """Documents of many questions, one after the other, as `find_raw` gives them."""
+        """Documents of many queries, one after the other, in the form of `find_raw`."""
         return self._each(self.database.find_each(collection, filters, *args, **options))
 
     def _once(self, ask: Callable[[], _T]) -> _T:
@@ -129,7 +129,7 @@ class GuardedIndex:
         return found
 
     def _each(self, found: Iterator[bytes]) -> Iterator[bytes]:
-        """Items that are believed: each is kept back until there is another one, or no more."""
+        """Verified items: each is yielded once the next item or the end has been received."""
         kept: bytes | None = None
         for item in found:
             if kept is not None:
@@ -141,10 +141,10 @@ class GuardedIndex:
             yield kept
 
     def _check(self) -> None:
-        """Make sure that what was found is all there was.
+        """Check that the index was not changed during the query.
 
         Raises:
-            IndexChangedError: It may not be; what the store knows is read anew.
+            IndexChangedError: it may have changed; the store's knowledge of it is refreshed.
         """
         if IndexState(self.database).turn() == self._belief.turn:
             return

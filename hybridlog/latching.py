@@ -1,4 +1,4 @@
-"""Which channels latch: their last messages are sent to subscribers that come later."""
+"""Latching channels: late subscribers receive their last messages."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _MAX_DEPTH = 1000
 
 
 def depth_of(channel: Channel) -> int:
-    """How many of a channel's last messages a late subscriber gets; 0 without latching.
+    """Number of a channel's last messages that a late subscriber gets; 0 without latching.
 
     A ROS 1 connection latches one message. A ROS 2 channel mixes the publishers of its
-    topic, and the depth of each does not tell how many there are: all are kept, up to a bound.
+    topic, whose number the depth does not show: all messages count, up to a limit.
     """
     metadata = channel.metadata
     if metadata.get("latching") in {"1", "true"}:

@@ -1,9 +1,8 @@
-"""The loss ledger: what was sent and is not there, from when to when, and why.
+"""The loss ledger: missing messages, with time range and cause.
 
-A loss is noted where it is seen, often, and by any thread. Rows come out at every flush:
-one for all that a topic has lost for one reason since the last one, so that a loss that
-goes on for an hour costs no more than one row a flush. Who reads them joins what follows
-on one another again.
+A loss is noted where it is detected, often, and by any thread. Each flush returns one row
+for all losses of a topic with the same cause since the last flush. A continuous loss of an
+hour therefore costs at most one row for each flush. Readers join successive rows.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 _JOINED_NS = 12_000_000_000
-_SLOW_NS = 10_000_000_000  # rows of what the user wants are written so often
+_SLOW_NS = 10_000_000_000  # interval between rows for losses that the user wants
 
 
 class Cause(StrEnum):
-    """Why messages are missing; one word a row of the loss ledger."""
+    """Reason for missing messages; one word in each row of the loss ledger."""
 
     TRANSPORT = "transport"
     """They were sent and never reached the recorder: a gap in the sender's numbers."""
@@ -31,22 +30,22 @@ class Cause(StrEnum):
     """A connection broke in the middle of a message."""
 
     UNREADABLE = "unreadable"
-    """They came, and cannot be kept: a type that nobody can say, a broken record."""
+    """They were received and cannot be stored: an unusable type, a broken record."""
 
     THROTTLE = "throttle"
-    """The user wants fewer of them."""
+    """The user wants fewer messages."""
 
     DEGRADE = "degrade"
-    """The memory budget was spent: the payload was given up, the fields were kept."""
+    """The memory budget was exhausted: only the fields were stored."""
 
     QUEUE = "queue"
-    """The memory budget was spent, and there was nothing smaller to keep."""
+    """The memory budget was exhausted, and no smaller form could be stored."""
 
     DISK = "disk"
-    """No space."""
+    """The disk was full."""
 
     SEGMENT = "segment"
-    """They were stored, and what held them is missing from the store, or damaged."""
+    """They were stored, and their part of the store is missing or damaged."""
 
 
 @dataclass(slots=True)
@@ -59,7 +58,7 @@ class _Open:
 
 
 class Ledger:
-    """Notes losses, gives rows. Thread safe."""
+    """Collects losses and returns them as rows. Thread safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,15 +74,15 @@ class Ledger:
         last: int,
         detail: str = "",
     ) -> None:
-        """Note messages that are lost.
+        """Note lost messages.
 
         Args:
-            topic: Whose; empty when nobody knows.
-            cause: Why.
-            count: How many, None when that cannot be known.
-            first: From when on, ns since the epoch, by the recorder's clock.
-            last: Until when, likewise.
-            detail: For people.
+            topic: Topic of the messages; empty if unknown.
+            cause: The reason.
+            count: Number of messages; None if unknown.
+            first: Beginning of the loss, ns since the epoch, by the recorder's clock.
+            last: End of the loss, ns since the epoch, by the recorder's clock.
+            detail: Explanation for people.
         """
         with self._lock:
             row = self._open.get((topic, cause, detail))
@@ -94,10 +93,10 @@ class Ledger:
                 row.count = _sum(row.count, count)
 
     def take(self, *, everything: bool = False) -> list[dict[str, Any]]:
-        """The rows since the last time; they are the caller's now.
+        """The rows since the last call; the ledger forgets them.
 
         Args:
-            everything: Also those that need not be written so often.
+            everything: True to include rows that are written less often.
         """
         with self._lock:
             ready = [
@@ -109,10 +108,10 @@ class Ledger:
 
 
 def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows that follow on one another as one, in the order in which the losses began.
+    """Rows that follow each other joined, in the order in which the losses began.
 
     Args:
-        rows: Rows of one recording; those without times are left as they are.
+        rows: Rows of one recording; those without times are unchanged.
     """
     found: list[dict[str, Any]] = []
     latest: dict[tuple[str, str, str], dict[str, Any]] = {}
@@ -130,16 +129,16 @@ def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def topics_of(entry: RecordingEntry) -> set[str]:
-    """Topics of a recording, those included of which all stored messages are lost.
+    """Topics of a recording, including those that have lost all stored messages.
 
-    A question about such a topic must miss the recording, and say so.
+    A question about such a topic must report the missing messages.
     """
     lost = {row["topic"] for row in _lost_from_store(entry)} - {None}
     return lost | {channel.topic for channel in entry.channels}
 
 
 def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
-    """First and last log time (ns) of stored messages that are lost, a row of the ledger each."""
+    """First and last log time (ns) of lost stored messages, for each row of the ledger."""
     for row in _lost_from_store(entry):
         if row["from"] is not None:
             yield row["from"], row["to"]
@@ -154,7 +153,7 @@ def _sum(one: int | None, other: int | None) -> int | None:
 
 
 def _as_dict(topic: str, cause: Cause, detail: str, row: _Open) -> dict[str, Any]:
-    """A row as segments and catalog hold it."""
+    """A row in the form of segments and catalog."""
     return {
         "cause": cause.value,
         "count": row.count,

@@ -1,4 +1,4 @@
-"""Marks: what happened, as a message on a topic of its own, that questions can use."""
+"""Marks: events as messages on a separate topic, for use in questions."""
 
 from __future__ import annotations
 
@@ -24,5 +24,5 @@ def mark_channel() -> Channel:
 def mark_payload(text: str, tags: Mapping[str, str]) -> bytes:
     """A mark as a message."""
     content = json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False)
-    # What came as bytes that are no UTF-8 stands in it as JSON's own escapes.
+    # Bytes that are not UTF-8 appear in it as JSON's own escapes.
     return content.encode("utf-8", "backslashreplace")

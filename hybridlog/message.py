@@ -1,4 +1,4 @@
-"""A message of an answer: what is known of it at once, and what it takes a look to know."""
+"""A message of an answer; its content is decoded on access."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 class Message:
-    """One message of an answer. Its payload is decoded only when it is looked at.
+    """One message of an answer. Its payload is decoded on access.
 
     Attributes:
         topic: Its topic.
         type: Its type, as the source spells it.
-        log_time_ns: When the recorder received it, nanoseconds since the epoch.
-        publish_time_ns: When it was sent, by the sender's clock; None when unknown.
-        sequence: The sender's sequence number, 0 when there is none.
+        log_time_ns: Time at which the recorder received it, nanoseconds since the epoch.
+        publish_time_ns: Time at which it was sent, by the sender's clock; None if unknown.
+        sequence: The sender's sequence number, 0 if unknown.
         seq: Arrival number in its recording.
         recording: Id of its recording.
     """
@@ -77,28 +77,28 @@ class Message:
 
     @property
     def raw(self) -> bytes:
-        """The serialized message, byte for byte as it came.
+        """The serialized message, byte for byte as received.
 
         Raises:
-            PayloadError: it was given up under pressure.
+            PayloadError: the payload was dropped under pressure.
         """
         return bytes(self.payload)
 
     @property
     def payload(self) -> memoryview:
-        """The same without a copy."""
+        """The serialized message without a copy."""
         if self.is_reduced:
             self._codec.decode(self._view)
         return self._view
 
     @property
     def is_reduced(self) -> bool:
-        """Whether the payload was given up under pressure, and only `fields` are there."""
+        """True if the payload was dropped under pressure, and only `fields` are available."""
         return self._is_reduced
 
     @property
     def fields(self) -> dict[str, object]:
-        """Its fields as the index holds them: long arrays are summaries."""
+        """Its fields as in the index: long arrays are summaries."""
         return self._documents.fields(self._row)
 
     @property
@@ -109,11 +109,11 @@ class Message:
         return stamp if isinstance(stamp, int) else None
 
     def decode(self) -> Any:
-        """The whole message as an object, its attributes named as its fields.
+        """The whole message as an object with the fields as attributes.
 
         Raises:
             PayloadError: the payload does not fit its definition.
-            DefinitionError: there is no usable definition.
+            DefinitionError: no usable definition exists.
         """
         return self._codec.decode(self._view)
 
@@ -121,7 +121,7 @@ class Message:
         """Image, CompressedImage, LaserScan or PointCloud2 as an array.
 
         Raises:
-            PayloadError: it is none of these, or its sizes lie.
+            PayloadError: another type, or sizes that do not fit the data.
         """
         from hybridlog.arrays import to_numpy
 
@@ -129,10 +129,10 @@ class Message:
 
 
 class Documents:
-    """The index documents of some messages, made for all its messages when one is asked for.
+    """The index documents of some messages, created together on first access.
 
     Args:
-        channels: By what `batch.channel` holds.
+        channels: Channels by index, as in `batch.channel`.
         batch: The messages.
     """
 
@@ -146,7 +146,7 @@ class Documents:
         self._bodies: dict[int, bytes] = {}
 
     def fields(self, row: int) -> dict[str, object]:
-        """Those of a message, as its index document holds them."""
+        """The fields of one message, as in its index document."""
         import bson
 
         if row not in self._bodies:
@@ -168,7 +168,7 @@ def messages_in(channels: Sequence[RecordedChannel], run: MessageRun) -> Iterato
     batch = run.batch
     documents = Documents(channels, batch)
     view = memoryview(batch.buffer)
-    # Columns become lists at once: one number at a time is the slow way out of an array.
+    # Columns are converted to lists at once: access to single numbers of arrays is slow.
     columns = (
         batch.channel,
         batch.log_time,

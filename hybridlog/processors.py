@@ -1,4 +1,4 @@
-"""How many processors there are to work with."""
+"""Number of available processors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 
 
 def processors() -> int:
-    """Processors that this process may use, where the system tells, else all there are."""
+    """Processors available to this process if the system reports them, else all processors."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,8 +1,8 @@
 """Recording a log into the store: source to segments to index.
 
-The recorder gets its parts as arguments. A recording either comes to its end, with
-everything that could be read in it and everything that could not in its loss ledger,
-or it leaves nothing behind.
+The recorder gets its parts as arguments. A complete recording has everything that could
+be read, and a loss ledger of everything that could not. A failed recording leaves nothing
+behind.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ OUR_NAMES = "hybridlog."
 
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
-    """What to record and how.
+    """Options of a recording.
 
     Attributes:
-        name: Name of the recording; the file's own without.
-        tags: Kept with the recording.
-        matcher: Which topics; None for all.
+        name: Name of the recording; by default that of the file.
+        tags: Tags of the recording.
+        matcher: Selects topics; None for all.
         between: Log time `[begin, end)`, ns; None for all.
-        again: Record although the same content is in the store.
-        settings: How segments are cut and packed.
+        again: True to record even if the same content is in the store.
+        settings: Rotation, chunks and compression of segments.
     """
 
     name: str | None = None
@@ -62,14 +62,14 @@ class RecordOptions:
 
 @dataclass(slots=True)
 class RecordReport:
-    """How a recording went.
+    """The result of a recording.
 
     Attributes:
-        entry: The recording, as it stands in the catalog.
-        damage: What of the source could not be read.
+        entry: The recording's entry in the catalog.
+        damage: Unreadable parts of the source.
         indexed: Messages in the index.
-        missed: Messages stored whose index documents are still missing.
-        failure: Why they are missing.
+        missed: Stored messages whose index documents are missing.
+        failure: The reason why they are missing.
         skipped: Messages left out by topic or time.
         elapsed_s: Wall time, seconds.
     """
@@ -96,18 +96,18 @@ def record(
     """Record a whole source.
 
     Args:
-        source: Open, not yet read.
+        source: The source, open and not yet read.
         directory: The store.
         catalog: Its catalog.
         database: The index.
-        fingerprint: Of the source's content.
-        options: What and how.
-        progress: Called now and then with bytes read and messages stored.
+        fingerprint: Fingerprint of the source's content.
+        options: Options of the recording.
+        progress: Called periodically with bytes read and messages stored.
 
     Raises:
         AlreadyRecordedError: the same content is in the store.
-        SourceError: nothing at all could be read.
-        DiskFullError: no space; nothing is kept.
+        SourceError: nothing could be read.
+        DiskFullError: no space; nothing is stored.
     """
     started = time.monotonic()
 
@@ -136,7 +136,7 @@ def record(
         _check_result(source, capture.writer, options)
         failure = capture.close(_end_of(source))
     except BaseException:
-        # Nothing half-made: the source is still there, the command can be run again.
+        # Remove a partial recording: the source still exists, the command can be repeated.
         capture.forget()
         raise
     return RecordReport(
@@ -156,7 +156,7 @@ def _copy(
     options: RecordOptions,
     progress: Callable[[int, int], None] | None,
 ) -> int:
-    """Move every wanted message from the source to the writer; returns those left out."""
+    """Copy every wanted message from the source to the writer; returns the number left out."""
     choice = _Choice(options)
     skipped = 0
     for batch in source.batches():
@@ -177,7 +177,7 @@ def _copy(
 
 
 class _Choice:
-    """Which messages are wanted."""
+    """Selects the wanted messages."""
 
     def __init__(self, options: RecordOptions) -> None:
         self._matcher = options.matcher

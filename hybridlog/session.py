@@ -1,4 +1,4 @@
-"""What an open store holds: the catalog's snapshot, open files, the index, caches."""
+"""The state of an open store: the catalog's snapshot, open files, the index, caches."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ class Session:
     """The state of one open store. Thread safe for reading.
 
     Args:
-        directory: Where the store lies.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one that
-            the store names.
+        directory: The store's directory.
+        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in
+            the store's settings.
         progress: Called while an index is brought up to date.
 
     Attributes:
-        directory: Where the store lies.
+        directory: The store's directory.
         catalog: Recordings, channels, chunks and schemas.
         connection: The connection to MongoDB.
-        repairs: What was repaired when the store was opened.
+        repairs: Repairs made when the store was opened.
         recent_chunks: Chunks that single messages were read from.
     """
 
@@ -87,17 +87,17 @@ class Session:
 
     @property
     def connected(self) -> Database | None:
-        """The index, if there is a connection already."""
+        """The index, if it is connected already."""
         return self.connection.database
 
     @property
     def unavailable(self) -> HybridlogError | None:
-        """Why MongoDB cannot be reached; None while that is not known."""
+        """The reason why MongoDB is unavailable; None while that is unknown."""
         return self._unavailable
 
     @property
     def database(self) -> Database | None:
-        """The index; connected to when first asked for, None if MongoDB is unavailable."""
+        """The index, connected on first access; None if MongoDB is unavailable."""
         if self._unavailable is None and not (self.connected is not None and self._is_indexed):
             with suppress(HybridlogError):
                 self.connect()
@@ -141,12 +141,12 @@ class Session:
             return database
 
     def disconnect(self) -> None:
-        """Leave MongoDB; questions are answered from the files then."""
+        """Disconnect from MongoDB; questions are then answered from the files."""
         self.connection.close()
         self._belief = None
 
     def take_over(self) -> None:
-        """Record in the index that the store lies here now."""
+        """Record in the index that the store is at this location."""
         self._belief = None
         self.connection.take_over()
         self._unavailable = None
@@ -155,17 +155,17 @@ class Session:
         """The index.
 
         Raises:
-            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+            DatabaseError: it is unavailable; has the purpose and the reason.
         """
         if self.database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
         return self.database
 
     def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
-        """The index, to ask about some recordings.
+        """The index, for queries about some recordings.
 
         Raises:
-            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+            DatabaseError: it is unavailable; has the purpose and the reason.
             IndexChangedError: another process removes documents of these recordings.
         """
         from hybridlog.guarded import GuardedIndex
@@ -178,7 +178,7 @@ class Session:
         Args:
             database: The index.
             keys: Keys of the recordings.
-            anew: Ask it now.
+            anew: True to read it from the database now.
         """
         from hybridlog.guarded import Belief
 
@@ -193,7 +193,7 @@ class Session:
             try:
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
             except DiskFullError as error:
-                # The store stays readable, and recordings can be removed.
+                # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
@@ -206,18 +206,18 @@ class Session:
         """The entry of a recording, by its id or its label.
 
         Raises:
-            TopicError: there is none.
+            TopicError: it does not exist.
         """
         everything = self.recordings()
         found = self._by_id.get(recording)
         if found is None:
             found = next((entry for entry in everything if entry.label == recording), None)
         if found is None:
-            raise TopicError(f"Recording {recording!r} is not in the store any more.")
+            raise TopicError(f"Recording {recording!r} is no longer in the store.")
         return found
 
     def chosen(self, ids: Collection[str]) -> list[RecordingEntry]:
-        """The recordings with these ids, oldest first; those that are gone are left out."""
+        """The recordings with these ids, oldest first; missing ones are left out."""
         wanted = set(ids)
         return [entry for entry in self.recordings() if entry.id in wanted]
 
@@ -225,7 +225,7 @@ class Session:
         """Recordings by label, by name, by id, or by the beginning of one of these.
 
         Raises:
-            TopicError: there is no such recording, or there are several.
+            TopicError: no recording matches, or several do.
         """
         everything = self.recordings()
         chosen: list[RecordingEntry] = []
@@ -246,7 +246,7 @@ class Session:
         return chosen
 
     def topics(self) -> list[str]:
-        """Names of all topics, sorted; also of those whose messages are all lost."""
+        """Names of all topics, sorted; includes those whose messages are all lost."""
         return sorted({topic for r in self.recordings() for topic in topics_of(r)})
 
     def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
@@ -295,10 +295,10 @@ class Session:
         return tuple(topics), chosen
 
     def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The topics that patterns name, and the recordings that have them.
+        """The topics that patterns match, and the recordings that have them.
 
         Raises:
-            TopicError: a pattern fits nothing, or several topics; lists the candidates.
+            TopicError: a pattern matches no topic, or several; lists the candidates.
         """
         return self._resolved(names)
 
@@ -306,7 +306,7 @@ class Session:
         known = self.topics()
         if not names:
             listed = "There are: " + ", ".join(known[:20]) if known else "The store is empty."
-            raise TopicError("Which topic? " + listed)
+            raise TopicError("Name a topic. " + listed)
         return self.having(resolve(names, known))
 
     def predicate(
@@ -315,7 +315,7 @@ class Session:
         """A predicate on some topics of some recordings.
 
         Raises:
-            WhereError: it cannot be understood, or does not fit the fields.
+            WhereError: it cannot be parsed, or does not fit the fields.
         """
         return self._parsed(text, topics, recordings)
 
@@ -328,7 +328,7 @@ class Session:
         return found
 
     def _remember_meanings(self) -> None:
-        """Cache what patterns and predicates mean; finding out takes half of a small count."""
+        """Cache the results for patterns and predicates, which take half of a small count."""
         self._resolved = lru_cache(_MAX_MEANINGS)(self._resolve)
         self._parsed = lru_cache(_MAX_MEANINGS)(self._parse)
 
@@ -341,7 +341,7 @@ class Session:
             with suppress(CatalogError):
                 self._schemas = self.catalog.schemas(used)
         if not wanted <= self._schemas.keys():
-            # The catalog has lost one.
+            # The catalog has lost a schema.
             return channels_of(take_inventory(self.directory, recording.label).summaries.values())
         return {
             c.id: Channel(
@@ -373,7 +373,7 @@ class Session:
         """Chunks that may hold the last message of some channels by a time.
 
         Args:
-            recording: Of which.
+            recording: The recording.
             channels: Channel ids.
             span: Log time of the recording's first message, and the time, ns.
 
@@ -418,15 +418,15 @@ class Session:
         return Tables(self.directory.path)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic, made again if it is missing; None if there can be none."""
+        """The table of a topic, created again if it is missing; None if there can be none."""
         from hybridlog.maintenance.tables import made_for
 
         return made_for(self.directory, recording, topic, self.tables)
 
-    # The end.
+    # Closing.
 
     def invalidate(self) -> None:
-        """Drop everything that was read, so that the next question sees the store anew."""
+        """Drop everything that was read, so that the next question reads the store again."""
         self._recordings = None
         self._by_id = {}
         self._is_indexed = False
@@ -457,7 +457,7 @@ class Session:
 def _make_room(opened: dict[Any, Any]) -> None:
     """Drop the file that was opened first, if many are open.
 
-    It is closed when the last thread that reads from it drops it, too.
+    It is closed when the last thread that reads from it also drops it.
     """
     if len(opened) >= _MAX_OPEN_SEGMENTS:
         del opened[next(iter(opened))]

@@ -52,7 +52,7 @@ def open_store(
 ) -> Store:
     """Open a store; recover first after a crash.
 
-    MongoDB is connected to when a question needs it.
+    MongoDB is connected when a question needs it.
 
     Args:
         path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
@@ -101,8 +101,8 @@ class Store:
         progress: Called while an index is brought up to date.
 
     Attributes:
-        session: What it holds while it is open.
-        directory: Where it lies.
+        session: Its state while it is open.
+        directory: The store's directory.
         catalog: Recordings, channels, chunks and schemas, in a local file.
     """
 
@@ -141,12 +141,12 @@ class Store:
 
     @property
     def database(self) -> Database | None:
-        """The index; connected to when first asked for, None if MongoDB is unavailable."""
+        """The index, connected on first access; None if MongoDB is unavailable."""
         return self.session.database
 
     @property
     def without_database(self) -> HybridlogError | None:
-        """Why MongoDB is unavailable; None while that is not known."""
+        """The reason why MongoDB is unavailable; None while that is unknown."""
         return self.session.unavailable
 
     @property
@@ -167,12 +167,12 @@ class Store:
         """The index.
 
         Raises:
-            DatabaseError: it is unavailable; says what it was needed for, and why it is.
+            DatabaseError: it is unavailable; has the purpose and the reason.
         """
         return self.session.database_for(purpose)
 
     def refresh(self) -> None:
-        """Drop what was read of the catalog, to see what others have recorded."""
+        """Drop the snapshot of the catalog, to see new recordings of other processes."""
         self.session.invalidate()
 
     def close(self) -> None:
@@ -202,7 +202,7 @@ class Store:
         return self.session.select(names)
 
     def topics(self) -> list[str]:
-        """Names of all topics, sorted; also of those whose messages are all lost."""
+        """Names of all topics, sorted; includes those whose messages are all lost."""
         return self.session.topics()
 
     # Questions.
@@ -293,7 +293,7 @@ class Store:
         connected = self.session.connected
         if report.failure is None and (connected is None or connected.ping()):
             return
-        # MongoDB has ended meanwhile. If it can be had again, the rest is indexed.
+        # MongoDB has ended meanwhile. If it is available again, the rest is indexed.
         self.session.disconnect()
         try:
             self.connect()
@@ -388,7 +388,7 @@ class Store:
         """Check all checksums, and compare catalog and index with the segments.
 
         Args:
-            recordings: Which; None for all.
+            recordings: The recordings; None for all.
             progress: Called after each chunk.
         """
         from hybridlog.maintenance.verify import verify
@@ -499,7 +499,7 @@ class Store:
 
         Args:
             other: The other store's directory.
-            recordings: Which; None for all.
+            recordings: The recordings; None for all.
             progress: Called while files are copied and checked.
 
         Raises:
@@ -519,7 +519,7 @@ class Store:
         """Apply all repairs that lose no data; return them.
 
         Args:
-            recordings: Which; None for all.
+            recordings: The recordings; None for all.
             progress: Called after each chunk.
         """
         from hybridlog.maintenance.repair import repair, repair_index
@@ -542,7 +542,7 @@ class Store:
         return done
 
     def take_over(self) -> None:
-        """Record in the index that this store lies here now: it was moved.
+        """Record in the index that this store was moved to this location.
 
         Raises:
             DatabaseError: MongoDB does not answer.

@@ -60,6 +60,6 @@ def print_reduced(reduced: int) -> None:
     if reduced:
         have = "has" if reduced == 1 else "have"
         output.note(
-            f"{output.counted(reduced, 'message')} {have} no payload any more, given up under "
-            "pressure: not in this answer; --where and --fields find what was kept of them."
+            f"{output.counted(reduced, 'message')} {have} no payload, which was dropped under "
+            "pressure: not in this answer; --where and --fields find the fields."
         )

@@ -61,7 +61,7 @@ def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
     """The completeness of a recording in words: `complete`, or the number of missing messages."""
     wished = sum(loss["count"] or 0 for loss in losses if loss["cause"] == Cause.THROTTLE)
     losses = [loss for loss in losses if loss["cause"] != Cause.THROTTLE]
-    thinned = f"; {counted(wished, 'message')} thinned out by wish" if wished else ""
+    thinned = f"; {counted(wished, 'message')} left out by a throttle" if wished else ""
     return _completeness(entry, losses) + thinned
 
 
@@ -93,7 +93,7 @@ def line_of(loss: dict[str, Any]) -> str:
     file = f" {loss['file']}{place}:" if loss.get("file") else ""
     topic = f" on {loss['topic']}" if loss.get("topic") else ""
     if loss["cause"] == Cause.THROTTLE:
-        return f"{count}{topic} thinned out by wish"
+        return f"{count}{topic} left out by a throttle"
     said = f"{file} {loss['reason']}".rstrip()
     return f"{count}{topic} lost, {loss['cause']}{':' if said else ''}{said}"
 

@@ -79,7 +79,7 @@ class LiveSummary:
         elif reports:
             _print_snapshots(reports)
         else:
-            output.note("Nothing was triggered, so nothing is kept.")
+            output.note("Nothing was triggered; nothing was stored.")
 
     def _remarks(self) -> Iterator[str]:
         silent = self._recorder.silent()

@@ -94,7 +94,7 @@ def _check_new_store(choices: RecordChoices) -> None:
         if first is not None:
             raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
     if choices.mongo not in {None, EMBEDDED}:
-        # The new store remembers the URI, so it has to be right.
+        # The new store stores the URI, so it has to be right.
         from hybridlog_storage.database import Database
         from hybridlog_storage.index_state import IndexState
 
@@ -200,13 +200,13 @@ class _Results:
         )
 
     def on_stop(self) -> str:
-        """What becomes of the recordings when the command is stopped now."""
+        """The effect of stopping now on the recordings."""
         done = len(self._summaries)
         if done == len(self._paths):
             return "Everything was recorded."
         kept = len(self._reports)
-        before = f" {output.counted(kept, 'recording')} made before stay." if kept else ""
-        return f"Nothing of {self._paths[done]} is kept.{before}"
+        before = f" {output.counted(kept, 'recording')} stored before." if kept else ""
+        return f"Nothing of {self._paths[done]} is stored.{before}"
 
     def show(self) -> None:
         """Print the table of the finished recordings."""

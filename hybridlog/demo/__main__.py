@@ -22,7 +22,7 @@ def main() -> int:
     parser.add_argument("--ros", type=int, choices=(1, 2), default=1)
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument("--compression", choices=("none", "lz4", "bz2"), default="none")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what is in it as JSON")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write facts about it as JSON")
     options = vars(parser.parse_args())
     duration_s, truth = options.pop("duration"), options.pop("truth")
     began = time.monotonic()

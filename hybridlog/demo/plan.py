@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 WIDTH, DEPTH, WALL_HEIGHT = 14.0, 10.0, 2.6
-"""Metres of the building in x and y, and up to its ceiling."""
+"""Size of the building in x and y, and height of its ceiling, metres."""
 
-# Left, low, right, high of walls 0.12 m thick. A gate at x = 14 and three doors are open.
+# Left, low, right, high of walls 0.12 m thick. A gate at x = 14 and three doorways are open.
 _WALLS = (
     *((0, -0.06, 14, 0.06), (0, 9.94, 14, 10.06), (-0.06, 0, 0.06, 10)),
     *((13.94, 0, 14.06, 4), (13.94, 6, 14.06, 10), (5.94, 0, 6.06, 2.0), (5.94, 2.9, 6.06, 3.5)),
@@ -33,9 +33,9 @@ class Hits(NamedTuple):
 
 
 class FloorPlan:
-    """Upright surfaces: float64[s, 4] straight `segments`, then float64[p, 3] round `pillars`.
+    """Vertical surfaces: float64[s, 4] straight `segments` and float64[p, 3] round `pillars`.
 
-    The seed moves pillars and boxes a little; walls and doors stay.
+    The seed moves pillars and boxes slightly; the walls are fixed.
     """
 
     def __init__(self, seed: int) -> None:
@@ -57,7 +57,7 @@ class FloorPlan:
     def cast(
         self, x: Floats, y: Floats, angle: Floats, surfaces: NDArray[np.bool_] | None = None
     ) -> Hits:
-        """The nearest surface, of all or some, in the way of rays: metres and radians."""
+        """The nearest surface, of all or some, that rays hit: metres and radians."""
         dx, dy = np.cos(angle), np.sin(angle)
         best, which, cosine = np.full(len(x), np.inf), np.full(len(x), -1), np.zeros(len(x))
         counted = range(len(self.height)) if surfaces is None else np.flatnonzero(surfaces)

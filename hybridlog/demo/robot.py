@@ -1,4 +1,4 @@
-"""The simulated robot: its motion, a lap through the floor plan for ever, and its events."""
+"""The simulated robot: its motion, an endless lap through the floor plan, and its events."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hybridlog_storage.errors import UsageError
 
 MAX_DURATION_S = 7 * 86_400.0
 MOTOR_WARN, MOTOR_ERROR = 70.0, 80.0
-"""Motor temperatures in degrees Celsius from which diagnostics complain."""
+"""Motor temperatures in degrees Celsius that cause a warning and an error."""
 
 _FIRST_DAY_S = 1_748_851_200  # 2025-06-02 08:00 UTC
 _STEP_S, _SMOOTHING_S = 0.002, 0.3
@@ -40,7 +40,7 @@ _ARRIVALS = {
 
 
 class Stop(NamedTuple):
-    """A stop: its kind, and seconds since the start when the robot stands and drives on."""
+    """A stop: its kind, and the times, in seconds, at which the robot stops and drives on."""
 
     kind: str
     start: float
@@ -48,7 +48,7 @@ class Stop(NamedTuple):
 
 
 class State(NamedTuple):
-    """The motion at n moments, float64[n] each, in metres, seconds and radians."""
+    """The motion at n times, float64[n] each, in metres, seconds and radians."""
 
     x: Floats
     y: Floats
@@ -64,7 +64,7 @@ class State(NamedTuple):
 
 
 class GripperCommand(NamedTuple):
-    """A command: its time, wanted opening (0 closes), effort, and the opening it reaches."""
+    """A command: its time, requested opening (0 closes), effort, and the resulting opening."""
 
     seconds: float
     position: float
@@ -167,15 +167,15 @@ class Robot:
             times.append(np.concatenate(([clock, clock + hold], clock + hold + spent)))
             distances.append(np.concatenate(([start], leg)))
             clock = clock + hold + float(spent[-1])
-        # A little rest at the end, so that smoothing carries no speed into the next lap.
+        # A short rest at the end, so that smoothing carries no speed into the next lap.
         self.period = clock + _SMOOTHING_S
         count = round(self.period / _STEP_S)
         self._times = np.arange(count + 1) * (self.period / count)
         times.append(np.array([self.period]))
         distances.append(np.array([length]))
         distance = np.interp(self._times[:-1], np.concatenate(times), np.concatenate(distances))
-        # Averaging distance over a short window rounds the corners of the speed and
-        # keeps distance, speed and acceleration derivatives of one another.
+        # Averaging distance over a short window rounds the corners of the speed. Distance,
+        # speed and acceleration remain derivatives of one another.
         window = round(_SMOOTHING_S / _STEP_S) | 1
         padded = np.concatenate((distance[-window:] - length, distance, distance[:window] + length))
         kernel = np.convolve(np.ones(window // 2), np.ones(window // 2))
@@ -231,7 +231,7 @@ def _loop() -> tuple[Floats, Floats, Floats, Floats]:
     closed = np.concatenate((curve, curve[:1]))
     steps = np.diff(closed, axis=0)
     distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
-    # Heading of each chord belongs to its middle; back to the points by averaging.
+    # The heading of each chord belongs to its middle; averaging moves it to the points.
     chord = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     turn = 2 * np.pi * np.round((chord[-1] - chord[0]) / (2 * np.pi))
     before, after = np.append(chord[-1] - turn, chord), np.append(chord, chord[0] + turn)

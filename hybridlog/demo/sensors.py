@@ -13,10 +13,10 @@ Singles = NDArray[np.float32]
 GRAVITY = 9.80665
 GYRO_NOISE, ACCELERATION_NOISE = 0.002, 0.03
 LASER_OFFSET, LASER_HEIGHT, LIDAR_HEIGHT, CAMERA_HEIGHT = 0.2, 0.3, 1.05, 0.9
-"""Metres in front of the robot's centre, and above the floor."""
+"""Distance in front of the robot's centre, and height above the floor, metres."""
 SCAN_HZ = 20.0
 SCAN_ANGLE_MIN, SCAN_RANGE_MIN, SCAN_RANGE_MAX, SCAN_NOISE = -0.75 * np.pi, 0.05, 10.0, 0.008
-"""Radians, and metres."""
+"""Angle in radians, and range in metres."""
 RINGS = 16
 POINT = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("ring", "<u4")])
 """A point of the lidar."""
@@ -28,7 +28,7 @@ _GREY = np.array([0.114, 0.587, 0.299], np.float32)
 
 
 def scan_steps(beams: int) -> tuple[float, float]:
-    """Radians and seconds between two beams of a scan, three quarters of a turn."""
+    """Radians and seconds between two beams of a scan, which covers three quarters of a turn."""
     return -2 * SCAN_ANGLE_MIN / (beams - 1), 0.75 / SCAN_HZ / beams
 
 
@@ -37,7 +37,7 @@ def scan(
 ) -> tuple[Singles, Singles]:
     """Ranges in metres (infinite without return) and intensities, float32[n, beams]."""
     number, (angle_step, time_step) = np.arange(beams), scan_steps(beams)
-    # The robot moves on while the scanner turns: every beam has its own pose.
+    # The robot moves while the scanner turns: every beam has its own pose.
     state = robot.at((seconds[:, None] + number * time_step).ravel())
     angle = np.tile(SCAN_ANGLE_MIN + number * angle_step, len(seconds))
     hits = robot.plan.cast(*state.ahead(LASER_OFFSET), state.heading + angle)
@@ -84,11 +84,11 @@ class Camera:
         self._away = level / np.abs(self._slope)
 
     def render(self, robot: Robot, seconds: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The picture at a moment, uint8[height * width * channels]."""
+        """The picture at a time, uint8[height * width * channels]."""
         state, plan = robot.at(np.array([seconds])), robot.plan
         angle = state.heading + self._yaw + self._angle
         x, y = state.ahead(self._offset)
-        # Floor and ceiling, as if there were no walls.
+        # Floor and ceiling, without walls.
         stretch = 1 / np.cos(self._angle)
         px = x.astype(np.float32) + self._away * (np.cos(angle) * stretch).astype(np.float32)
         py = y.astype(np.float32) + self._away * (np.sin(angle) * stretch).astype(np.float32)
@@ -116,14 +116,14 @@ class Camera:
 
 
 class Odometer:
-    """Wheel encoders: a wrong radius, a wrong track and slip make them drift."""
+    """Wheel encoders that drift because of a wrong radius, a wrong track and slip."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._before = robot, robot.at(np.zeros(1))
         self._pose = (0.0, 0.0, 0.0)
 
     def measure(self, seconds: Floats, rng: np.random.Generator) -> State:
-        """Motion in the odom frame at rising moments, which follow those of the last call."""
+        """Motion in the odom frame at ascending times, later than those of the last call."""
         truth, before = self._robot.at(seconds), self._before
         driven = np.diff(truth.distance, prepend=before.distance[-1])
         turned = np.diff(truth.heading, prepend=before.heading[-1])

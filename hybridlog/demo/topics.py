@@ -78,7 +78,7 @@ class Types:
         return [] if is_list else np.zeros(length, {"bool": "u1", "octet": "u1"}.get(base, base))
 
     def filled(self, message: Any, columns: Values, count: int) -> Iterator[Any]:
-        """The message again and again, with the values of each row of columns by path."""
+        """One message object, yielded for each row of columns with the row's values by path."""
         places = []
         for path, column in columns.items():
             is_time = path.endswith("stamp") and isinstance(column, np.ndarray)
@@ -102,12 +102,12 @@ def _find(message: Any, path: str) -> tuple[Any, str]:
 
 
 def generator(seed: int, name: str, block: int, use: int = 0) -> np.random.Generator:
-    """Random numbers of a topic in a span of time, for one use."""
+    """Random generator for a topic, a time span and one use."""
     return np.random.default_rng([seed, zlib.crc32(name.encode()), block, use])
 
 
 class Ticks(NamedTuple):
-    """Moments of messages in a span: since the start, since the epoch, numbers, and noise."""
+    """Times of messages in a span: since the start, since the epoch, numbers, and noise."""
 
     seconds: Floats
     stamp: NDArray[np.int64]
@@ -117,7 +117,7 @@ class Ticks(NamedTuple):
 
 
 class Speaker:
-    """The robot with its sensors and the message types it speaks."""
+    """The robot with its sensors and its message types."""
 
     def __init__(self, robot: Robot, config: RobotConfig, types: Types) -> None:
         self.robot, self.types = robot, types
@@ -127,7 +127,7 @@ class Speaker:
         self._odometer, self._odometry = sensors.Odometer(robot), (-1, robot.at(np.zeros(1)))
 
     def odometry(self, ticks: Ticks) -> State:
-        """Odometry of a span, measured once for all topics of its clock."""
+        """Odometry of a span, measured once for all topics with the same clock."""
         if self._odometry[0] != ticks.block:
             rng = generator(self.robot.seed, "odometer", ticks.block)
             self._odometry = (ticks.block, self._odometer.measure(ticks.seconds, rng))
@@ -135,14 +135,14 @@ class Speaker:
 
 
 Filled = tuple[Values, Values]
-"""Values that all messages share, and columns of those that differ, by path."""
+"""Values common to all messages, and columns of values that differ, by path."""
 Fill = Callable[[Speaker, Ticks], Filled]
 
 
 class Topic(NamedTuple):
-    """One topic: a rate and phase, or `moments`; from stamp to log time least and mean delay.
+    """One topic: a rate and phase, or `moments`; least and mean delay from stamp to log time.
 
-    Topics with the same `clock` have the same moments.
+    Topics with the same `clock` have the same times.
     """
 
     name: str
@@ -162,7 +162,7 @@ class Topic(NamedTuple):
         return types.log_type if self.name == "/rosout" else self.msgtype.replace("/", "/msg/")
 
     def ticks(self, start: float, end: float, block: int, robot: Robot) -> Ticks:
-        """The moments in `[start, end)` seconds."""
+        """The message times in `[start, end)` seconds."""
         if self.hz:
             bounds = np.ceil((np.array([start, end]) - self.phase) * self.hz - 1e-9)
             number = np.arange(*np.maximum(bounds, 0).astype(int).tolist())
@@ -338,7 +338,7 @@ def _odom(speaker: Speaker, ticks: Ticks) -> Filled:
 )
 def _transforms(speaker: Speaker, ticks: Ticks) -> Filled:
     measured, truth = speaker.odometry(ticks), speaker.robot.at(ticks.seconds)
-    # map -> odom makes up for the drift: with odom -> base it gives the truth.
+    # map -> odom corrects the drift: with odom -> base it gives the true pose.
     turn = truth.heading - measured.heading
     x = truth.x - (np.cos(turn) * measured.x - np.sin(turn) * measured.y)
     y = truth.y - (np.sin(turn) * measured.x + np.cos(turn) * measured.y)
@@ -418,7 +418,7 @@ def _arm(speaker: Speaker, ticks: Ticks) -> Filled:
         here = (ticks.seconds - start - 0.4) / (end - start - 0.7)
         moves = (here >= 0) & (here <= 1) & (kind in {"pick", "place"})
         part = np.where(moves, here, part)
-    # Out to the shelf and back.
+    # To the shelf and back.
     reach = np.sin(np.pi * part)
     columns = _xyz("pose.position", 0.42 + 0.08 * reach, -0.18 - 0.4 * reach, 0.62 + 0.35 * reach)
     return {"header.frame_id": "base_link", "pose.orientation.w": 1.0}, columns
@@ -430,7 +430,7 @@ _VIEW = "/rviz_camera_publisher"
 @topic(f"{_VIEW}/camera_pose", "geometry_msgs/Pose", _VIEW, 10, 0.05, (0.006, 0.002))
 def _view(speaker: Speaker, ticks: Ticks) -> Filled:
     state = speaker.robot.at(ticks.seconds)
-    # An operator drags the view round the robot now and then, else it rests.
+    # An operator moves the view round the robot occasionally, else it rests.
     bursts, clock = np.divmod(ticks.seconds, 7.0)
     part = np.clip((clock - 1.0) / 2.5, 0, 1)
     orbit = 0.9 * (bursts + part * part * (3 - 2 * part))
@@ -451,7 +451,7 @@ def _battery(speaker: Speaker, ticks: Ticks) -> Filled:
     values |= {"capacity": 40.0, "design_capacity": 42.0, "serial_number": f"sim-{seed:04d}"}
     values |= {"power_supply_status": 2, "power_supply_health": 1, "location": "base"}
     full = 0.84 + 0.1 * float(generator(seed, "battery", 0).random())
-    # Electronics take 4.5 A all the time, driving 6 A more at a metre a second.
+    # Electronics draw 4.5 A all the time, driving 6 A more at 1 m/s.
     used = (4.5 * ticks.seconds + 6.0 * state.distance) / 3600
     charge, current = np.maximum(40.0 * full - used, 0.0), 4.5 + 6.0 * state.speed
     voltage = 24.0 + 4.8 * charge / 40.0 - 0.04 * current

@@ -1,4 +1,4 @@
-"""The guided tour: every command is printed, run for real, and its answer checked."""
+"""The guided tour: prints and runs every command, and checks its answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 DEFAULT_DURATION_S, DEFAULT_SEED = 60.0, 1
 BAG, STORE, SLICE, TRUTH = "robot.bag", "robot-logs", "scan.npz", "truth.json"
-"""Names of what the tour makes in its directory."""
+"""Names of the files that the tour makes in its directory."""
 
 _SNIPPET = f"""\
 import hybridlog as hl
@@ -45,11 +45,11 @@ One second of the laser, as numpy arrays in a file
 Where was the robot in that second, and how fast?
 {fetch} odom {second} --fields {pose} --every 10 {store}
 """
-"""Titles and commands, with the fact that is the answer or the file that is made."""
+"""Titles and commands, each with the fact that is the answer or the file that it makes."""
 
 
 class Step(NamedTuple):
-    """One command of the tour, as one types it, and the file that it makes.
+    """One command of the tour, as typed, and the file that it makes.
 
     `fact` is the key of the right answer in the simulation's truth: a number that the command
     prints with `--count`, else its number of lines.
@@ -62,7 +62,7 @@ class Step(NamedTuple):
 
     @property
     def argv(self) -> list[str]:
-        """The command as it is run: with this Python, which imports nothing from here."""
+        """The command to run: with this Python, which imports nothing from here."""
         program, *words = shlex.split(self.command)
         module = ["-m", "hybridlog"] if program == "hybridlog" else []
         return [sys.executable, "-P", *module, *words]
@@ -70,7 +70,7 @@ class Step(NamedTuple):
 
 def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> list[Step]:
     """The tour, in order."""
-    # A second out of the middle; a short recording has none after ten seconds.
+    # A second from the middle; a short recording has none after ten seconds.
     start = min(10.0, duration_s / 2)
     text = _STEPS.format(
         bag=BAG,
@@ -93,13 +93,13 @@ def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> l
 
 
 def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> int:
-    """Take the tour, which leaves its bag and store in `directory`.
+    """Run the tour, which leaves its bag and store in `directory`.
 
     Returns:
-        0, or the exit code of the step that failed; 1 when an answer is wrong.
+        0, or the exit code of the step that failed; 1 if an answer is wrong.
 
     Raises:
-        UsageError: Something of the tour's is in `directory` already, or the directory
+        UsageError: a file of the tour is in `directory` already, or the directory
             cannot be made.
     """
     for path in (directory / name for name in (BAG, STORE, SLICE, TRUTH)):
@@ -116,23 +116,23 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
         _print(f"\n# {step.title}\n$ {step.command}\n")
         code, fault = _take(step, directory)
         if code:
-            _print(f"The tour stops here; what it made is left in {directory}\n")
+            _print(f"The tour stops here; its files remain in {directory}\n")
             sys.stderr.write(f"error: `{step.command}` {fault}\n")
             return code
-    _print(f"\nEverything is left in {directory}; ask more with --store {directory / STORE}\n")
+    _print(f"\nAll files remain in {directory}; continue with --store {directory / STORE}\n")
     return 0
 
 
 def _take(step: Step, directory: Path) -> tuple[int, str]:
     """Run a step; returns an exit code and, if it is not 0, the fault."""
-    # The error stream goes straight through: its last line says what the answer cost.
+    # The error stream is not captured: its last line has the cost of the answer.
     stdout = subprocess.PIPE if step.fact else None
     done = subprocess.run(  # noqa: S603
         step.argv, cwd=directory, check=False, stdout=stdout, encoding="utf-8"
     )
     _print(done.stdout or "")
     if done.returncode:
-        # A child that died of a signal has a negative code, which no shell can pass on.
+        # A child that was killed by a signal has a negative code, which shells cannot return.
         code = done.returncode if done.returncode > 0 else 128 - done.returncode
         return code, f"failed with exit code {done.returncode}"
     made = directory / step.makes
@@ -153,6 +153,6 @@ def _take(step: Step, directory: Path) -> tuple[int, str]:
 
 
 def _print(text: str) -> None:
-    # Flushed, so that it comes before what the next command prints.
+    # Flushed, so that it precedes the output of the next command.
     sys.stdout.write(text)
     sys.stdout.flush()

@@ -1,6 +1,6 @@
-"""Writes what the simulated robot says as an ordinary ROS bag.
+"""Writes the log of the simulated robot as an ordinary ROS bag.
 
-A second is made, put in the order of log times and written before the next one is begun.
+One second at a time is generated, sorted by log time and written.
 The same arguments give the same bytes.
 """
 
@@ -59,19 +59,19 @@ def write_bag(
     """Simulate a robot and write its log.
 
     Args:
-        path: Must not exist: a `.bag` file for ROS 1, a directory for ROS 2.
+        path: The bag, which must not exist: a `.bag` file for ROS 1, a directory for ROS 2.
         duration_s: Seconds of log time; the bag spans `[0, duration_s)`.
-        seed: Gives the furniture, the noise and the day.
+        seed: Determines the furniture, the noise and the day.
         ros: Version of the messages and the bag.
         storage: File format within a ROS 2 bag.
-        compression: Of the chunks of a ROS 1 bag.
-        topics: Exact names; all when None.
+        compression: Compression of the chunks of a ROS 1 bag.
+        topics: Exact names; None for all.
         config: Sizes of the large messages.
 
     Raises:
-        UsageError: An argument is out of range, or `path` exists or cannot be written.
-        TopicError: A name in `topics` is none of the robot's.
-        DiskFullError: No space left. Whatever fails, no half bag is left behind.
+        UsageError: an argument is out of range, or `path` exists or cannot be written.
+        TopicError: a name in `topics` is none of the robot's.
+        DiskFullError: no space left. After any failure, no partial bag remains.
     """
     path = Path(path)
     speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types(ros))
@@ -100,7 +100,7 @@ def write_bag(
                 counts[chosen[index].name] += 1
                 truth[fact] += 1
     except BaseException as error:
-        # Also when interrupted: a bag without its index would only be found later.
+        # Also on interruption: a bag without its index would only be noticed later.
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
         if isinstance(error, OSError):
             if error.errno in NO_SPACE:
@@ -113,7 +113,7 @@ def write_bag(
 
 
 def _messages(speaker: Speaker, topics: list[Topic]) -> Iterator[tuple[int, int, int, bytes, str]]:
-    """Log time, order of arrival, index of the topic, payload and the fact it shows, if any."""
+    """Log time, order of arrival, index of the topic, payload and the fact in it, if any."""
     robot, arrival = speaker.robot, 0
     end_ns = robot.start_ns + round(robot.duration_s * 1e9)
     # The last log time of each topic: jitter must not swap two of its messages.
@@ -130,7 +130,7 @@ def _messages(speaker: Speaker, topics: list[Topic]) -> Iterator[tuple[int, int,
             name, shows = _FACTS.get(topic.name, ("", bool))
             messages = topic.messages(speaker, ticks)
             for log_time, message in zip(log_times.tolist(), messages, strict=True):
-                # What arrives after the recording has stopped is not in it.
+                # Messages that arrive after the recording has stopped are not in it.
                 if log_time < end_ns:
                     payload = speaker.types.encode(message, topic.type_in(speaker.types))
                     fact = name if shows(message) else ""

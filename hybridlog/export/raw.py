@@ -1,10 +1,10 @@
 """Writes unchanged payloads, one file each.
 
 The directory holds `index.jsonl`, with a line for each message (file, topic, type, times,
-sequence, length), and one directory for each topic with files `<log time in ns>.bin`. A
-second message of the same nanosecond is `<log time>-1.bin`. Topic directories are named
-like the index's collections, so no topic leads outside and no two share a directory. On a
-stream the payloads follow each other without separators.
+sequence, length). Each topic has a directory with files `<log time in ns>.bin`. A second
+message of the same nanosecond is `<log time>-1.bin`. Topic directories are named like the
+index's collections, so no topic leads outside and no two share a directory. On a stream the
+payloads follow each other without separators.
 """
 
 from __future__ import annotations

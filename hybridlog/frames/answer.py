@@ -1,4 +1,4 @@
-"""From a query to tables: payloads are decoded, or columns of whole topics are taken."""
+"""Conversion of answers to tables, from payloads or from the tables of topics."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
 _SEQ_BITS = 44
 _FIXED = {"ros1", "cdr"}
-"""Encodings of which a definition fixes the fields."""
+"""Encodings whose definition fixes the fields."""
 
 
 def to_arrow(planner: Planner) -> pa.Table:
     """The whole answer as an Arrow table, in order.
 
     Raises:
-        DefinitionError: a topic has no definition to make columns from.
+        DefinitionError: a topic has no definition to derive columns from.
     """
     return _finished(_collected(planner), planner.question)
 
@@ -47,7 +47,7 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
     """The whole answer as a frame, in order.
 
     Raises:
-        DefinitionError: a topic has no definition to make columns from.
+        DefinitionError: a topic has no definition to derive columns from.
     """
     frame = _collected(planner).to_pandas()
     return frame.iloc[::-1] if planner.question.reverse else frame
@@ -73,9 +73,9 @@ def _collected(planner: Planner) -> TableBuilder:
 
 
 def stream(planner: Planner) -> Iterator[pa.Table]:
-    """The answer in order, in tables of bounded size; at least one, perhaps empty.
+    """The answer in order, in tables of bounded size; at least one, possibly empty.
 
-    The type of a column may change from table to table where no definition fixes it.
+    The type of a column may differ between tables if no definition fixes it.
     """
     question = planner.question
     groups: Iterator[Iterable[Block]]
@@ -103,7 +103,7 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
 
 
 def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
-    """Whether tables hold all that is asked for."""
+    """True if tables of topics provide the whole answer."""
     question = planner.question
     if not question.returns_all or not parts:
         return False
@@ -114,7 +114,7 @@ def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
 
 
 def _fields_of(planner: Planner) -> list[str] | None:
-    """The fields asked for, without the names of our own columns; None for all."""
+    """The requested fields, without the names of built-in columns; None for all."""
     fields = planner.question.fields
     if fields is None:
         return None
@@ -137,9 +137,9 @@ def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
 
 
 def schema_of(planner: Planner) -> pa.Schema | None:
-    """The columns of an answer, when they depend on what is in its messages; else None.
+    """The columns of an answer if they depend on the content of its messages; else None.
 
-    The messages of which no definition fixes the fields are read for it.
+    Messages whose fields no definition fixes are read for this.
     """
     if not any(_is_open(channel) for channel in planner.channels()):
         return None
@@ -152,7 +152,7 @@ def json_columns(schema: pa.Schema | None) -> list[str]:
 
 
 def _is_open(channel: RecordedChannel) -> bool:
-    """Whether the columns of a channel depend on what is in its messages."""
+    """True if the columns of a channel depend on the content of its messages."""
     return channel.channel.message_encoding not in _FIXED
 
 
@@ -162,17 +162,17 @@ def _finished(builder: TableBuilder, question: Question) -> pa.Table:
 
 
 class Decoder:
-    """Makes blocks of the messages of a query.
+    """Makes blocks from the messages of a query.
 
     Args:
-        planner: Of the question.
+        planner: Planner of the question.
         channels: The channels of the messages.
 
     Attributes:
-        channels: The same.
+        channels: The channels of the messages.
 
     Raises:
-        DefinitionError: A channel has no definition to make columns from.
+        DefinitionError: a channel has no definition to derive columns from.
     """
 
     def __init__(self, planner: Planner, channels: Sequence[RecordedChannel]) -> None:
@@ -186,7 +186,7 @@ class Decoder:
         self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
 
     def empty(self) -> Iterator[Block]:
-        """A block without rows for each channel: columns exist even when no message does."""
+        """A block without rows for each channel: columns exist even without messages."""
         none = np.empty(0, np.int64)
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
         for number, channel in enumerate(self.channels):
@@ -204,7 +204,7 @@ class Decoder:
     def block(
         self, number: int, batch: Batch, seq: NDArray[np.int64]
     ) -> tuple[Block, NDArray[np.intp]]:
-        """Messages of one channel, and which of the rows could be read."""
+        """Messages of one channel, and the mask of the readable rows."""
         channel = self.channels[number]
         decoded = channel.codec.arrow(
             batch.buffer, batch.offset, batch.length, self._fields[number]
@@ -229,7 +229,7 @@ class Decoder:
         seq: NDArray[np.int64],
         stamps: pa.Array[Any] | None = None,
     ) -> dict[str, pa.Array[Any]]:
-        """Our columns of messages of one channel, besides the log time."""
+        """Built-in columns of messages of one channel, without the log time."""
         channel = self.channels[number]
         return {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
 
@@ -244,7 +244,7 @@ def _are_single(planner: Planner) -> bool:
 
 
 def _own(planner: Planner) -> list[str]:
-    """Columns of ours that a table has besides the log time."""
+    """Built-in columns of a table, without the log time."""
     question, channels = planner.question, planner.channels()
     defined = {path.path for c in channels if not c.is_reduced for path in c.codec.paths()}
     asked = own_columns(question.fields, defined)
@@ -299,7 +299,7 @@ def _to_decode(
 
 
 def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.StructArray:
-    """The messages without the stamp that was decoded only for the column of that name."""
+    """The messages without a stamp that was decoded only for the column of that name."""
     if fields is None or any(path in {"header", STAMP} for path in fields):
         return records
     children = dict(zip([f.name for f in records.type], records.flatten(), strict=True))
@@ -313,7 +313,7 @@ def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.
 
 
 def _ranks(every: Sequence[RecordedChannel], channels: Sequence[RecordedChannel]) -> list[int]:
-    """Numbers that put the messages of one recording behind those of the one before."""
+    """Numbers that order the messages of each recording after those of earlier ones."""
     keys = sorted({channel.recording.key for channel in every})
     order = {key: rank for rank, key in enumerate(keys)}
     return [order[channel.recording.key] << _SEQ_BITS for channel in channels]

@@ -23,10 +23,10 @@ class Block(NamedTuple):
     """Decoded messages of one topic.
 
     Attributes:
-        topic: Their topic.
+        topic: Topic of the messages.
         log_time: int64[n], ns.
-        order: int64[n], orders messages of the same log time.
-        own: Columns of ours besides the log time, n rows each.
+        order: int64[n], order of messages with the same log time.
+        own: Built-in columns without the log time, n rows each.
         records: n rows.
         size: Bytes of their payloads.
     """
@@ -43,8 +43,8 @@ class Named(NamedTuple):
     """A column and its name.
 
     Attributes:
-        name: Of the column.
-        field: Path of its field where that is another, else None.
+        name: Name of the column.
+        field: Path of its field if it differs from the name, else None.
         values: The column.
     """
 
@@ -54,15 +54,15 @@ class Named(NamedTuple):
 
 
 class TableBuilder:
-    """Collects blocks and hands them over as one table.
+    """Collects blocks and joins them to one table.
 
     Nested messages become dotted columns (`pose.position.x`). A column that a block lacks
-    is null there; one whose type changes gets the common exact type
-    (`schema/arrow_types.py`). Messages of a topic are made alike before they are made
-    flat, so that a table does not depend on how its messages are spread over chunks.
+    is null there. A column whose type changes gets the common exact type
+    (`schema/arrow_types.py`). Messages of a topic are converted to one type before they are
+    flattened, which makes the table independent of the division into chunks.
 
     Args:
-        fields: Paths that were asked for; None for all fields.
+        fields: Requested paths; None for all fields.
     """
 
     def __init__(self, fields: Sequence[str] | None = None) -> None:
@@ -71,11 +71,11 @@ class TableBuilder:
         self._rows = 0
 
     def __len__(self) -> int:
-        """Rows so far."""
+        """Number of rows so far."""
         return self._rows
 
     def append(self, block: Block) -> None:
-        """Add a block. Its arrays are kept, not copied."""
+        """Add a block. Its arrays are referenced, not copied."""
         self._blocks.append(block)
         self._rows += len(block.log_time)
 
@@ -85,7 +85,7 @@ class TableBuilder:
         Returns:
             The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire
             type; times are timestamp[ns, UTC], durations duration[ns], strings string,
-            arrays fixed_size_list when the definition fixes their length and list
+            arrays fixed_size_list if the definition fixes their length and list
             otherwise.
         """
         names: list[pa.Field] = []
@@ -109,7 +109,7 @@ class TableBuilder:
         return frame if wanted == names else frame[wanted]
 
     def _columns(self) -> Iterator[Named]:
-        """All columns, log time first; each is released once it is handed over."""
+        """All columns, log time first; each is released after it is yielded."""
         blocks, self._blocks, self._rows = self._blocks, [], 0
         blocks.sort(key=_beginning)
         order = _order(blocks)
@@ -135,7 +135,7 @@ class TableBuilder:
             yield Named(name, path if name != path else None, _ordered(arrays, kind, order))
 
     def _flat(self, blocks: Sequence[Block]) -> list[dict[str, pa.Array[Any]]]:
-        """The leaves of each block, those of a topic made alike."""
+        """The leaves of each block, with one type for each topic."""
         topics: dict[str, list[pa.StructArray]] = {}
         for block in blocks:
             topics.setdefault(block.topic, []).append(block.records)
@@ -151,7 +151,7 @@ def _beginning(block: Block) -> tuple[int, int]:
 
 
 def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
-    """The order of the rows by log time, None when they lie in it."""
+    """The order of the rows by log time; None if they are in order."""
     if not blocks:
         return None
     time = np.concatenate([block.log_time for block in blocks])

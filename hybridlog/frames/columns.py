@@ -25,8 +25,8 @@ _types = pa.types
 def flat(records: pa.StructArray) -> dict[str, pa.Array[Any]]:
     """The leaves of messages by dotted path, in the order of the definition.
 
-    A field of a message that is null is null. A message without fields has no leaf. A path
-    that exists already (only names with dots in them can do that) gets underscores.
+    Fields of a null message are null. A message without fields has no leaf. A duplicate path,
+    which only names with dots can cause, gets underscores.
     """
     leaves: dict[str, pa.Array[Any]] = {}
     pending = _children("", records)
@@ -48,7 +48,7 @@ def _children(prefix: str, array: pa.StructArray) -> list[tuple[str, pa.Array[An
 
 
 def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
-    """The array with `true` for messages without fields, which few formats can hold."""
+    """The array with `true` for messages without fields, which few formats support."""
     if not _has_empty(array.type):
         return array
     if is_list(array.type):
@@ -61,7 +61,7 @@ def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def _has_empty(kind: pa.DataType) -> bool:
-    """Whether a type has structs without fields in it."""
+    """True if a type contains structs without fields."""
     if _types.is_struct(kind):
         return not kind.num_fields or any(_has_empty(field.type) for field in kind)
     return is_list(kind) and _has_empty(kind.value_type)
@@ -70,13 +70,13 @@ def _has_empty(kind: pa.DataType) -> bool:
 def with_summaries(
     leaves: dict[str, pa.Array[Any]], asked: Collection[str] | None
 ) -> dict[str, pa.Array[Any]]:
-    """The leaves with the summaries that are asked for (`ranges.min`).
+    """The leaves with the requested summaries (`ranges.min`).
 
-    An array that only its summaries are asked of is left out.
+    An array of which only summaries are requested is left out.
 
     Args:
         leaves: By dotted path.
-        asked: Paths that are asked for; None for all fields.
+        asked: Requested paths; None for all fields.
     """
     wanted = [path.replace("[]", "") for path in asked or ()]
     found = {}
@@ -99,7 +99,7 @@ def _covers(path: str, field: str) -> bool:
 
 
 def summary_array(array: pa.Array[Any], what: str) -> pa.Array[Any] | None:
-    """One summary of each row; None when it is no array of which there is one."""
+    """One summary of each row; None if the array has no such summary."""
     if _types.is_binary(array.type) or _types.is_large_binary(array.type):
         return pc.binary_length(array).cast(pa.int64()) if what == "n" else None
     if not is_list(array.type):
@@ -111,7 +111,7 @@ def summary_array(array: pa.Array[Any], what: str) -> pa.Array[Any] | None:
     values = array.flatten()
     kind = values.type
     if not (_types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)):
-        # The type of the elements of arrays that are all empty is unknown.
+        # If all arrays are empty, the type of the elements is unknown.
         return pa.nulls(len(array), pa.float64()) if _types.is_null(kind) else None
     offset = np.zeros(len(counts) + 1, np.int64)
     if values.null_count:
@@ -132,7 +132,7 @@ def _numbers(values: NDArray[Any], missing: NDArray[np.bool_] | None) -> pa.Arra
 def in_order(column: pa.ChunkedArray[Any], order: NDArray[np.intp]) -> pa.ChunkedArray[Any]:
     """The rows of a column in another order.
 
-    Strings and lists whose elements are more than 32-bit offsets reach come in pieces.
+    Strings and lists with more elements than 32-bit offsets allow are returned in pieces.
     """
     kind = column.type
     size = _elements(column)
@@ -148,7 +148,7 @@ def in_order(column: pa.ChunkedArray[Any], order: NDArray[np.intp]) -> pa.Chunke
 
 
 def _elements(column: pa.ChunkedArray[Any]) -> int:
-    """Most elements, or bytes, at one level of a column of strings or lists."""
+    """Maximum number of elements, or bytes, at one level of a column of strings or lists."""
     kind = column.type
     if _types.is_string(kind) or _types.is_binary(kind):
         return sum(pc.sum(pc.binary_length(chunk)).as_py() or 0 for chunk in column.chunks)

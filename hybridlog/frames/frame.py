@@ -1,9 +1,9 @@
-"""Arrow columns as a pandas frame that every library takes.
+"""Arrow columns as a pandas frame with types that every library supports.
 
 | column | in pandas |
 |---|---|
-| integers, booleans | numpy; `Int64` and so on, `boolean`, where some are missing |
-| floats | numpy; `Float64` or `Float32` where some are missing, so that NaN is no missing value |
+| integers, booleans | numpy; `Int64` and so on, `boolean`, if some are missing |
+| floats | numpy; `Float64` or `Float32` if some are missing, so NaN is no missing value |
 | times, durations | `datetime64[ns, UTC]`, `timedelta64[ns]`; NaT where missing |
 | strings, JSON text | `str`; NaN where missing |
 | bytes | `bytes` objects; None where missing |
@@ -35,11 +35,11 @@ _NOTHING: NDArray[Any] = np.empty(0)
 def frame_of(
     log_time: pa.ChunkedArray[Any], columns: Iterable[tuple[str, pa.ChunkedArray[Any]]]
 ) -> pd.DataFrame:
-    """A frame over Arrow columns.
+    """A frame of Arrow columns.
 
     Args:
-        log_time: For the index.
-        columns: Names and columns of as many rows.
+        log_time: Column for the index.
+        columns: Names and columns, all with the same number of rows.
     """
     data = {name: _array(column) for name, column in columns}
     index = pd.DatetimeIndex(_times(log_time), name="log_time", copy=False)
@@ -53,14 +53,14 @@ def frame_of_intervals(
     end: NDArray[np.int64],
     messages: NDArray[np.int64],
 ) -> pd.DataFrame:
-    """A frame of intervals, one a row.
+    """A frame of intervals, one in each row.
 
     Args:
         names: Ids of recordings.
         recording: int32[n], index into `names`.
         begin: int64[n], ns since the epoch.
         end: int64[n], ns since the epoch.
-        messages: int64[n].
+        messages: int64[n], number of messages.
     """
     chosen = np.array(names, object)[recording] if len(names) else np.empty(0, object)
     data = {
@@ -115,7 +115,7 @@ def _times(column: pa.ChunkedArray[Any]) -> Any:
 
 
 def _integers(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
-    """Durations as nanoseconds, the missing ones NaT."""
+    """Durations as nanoseconds, NaT for missing ones."""
     values = column.cast(pa.int64())
     if values.null_count:
         values = values.fill_null(_NAT)
@@ -124,23 +124,23 @@ def _integers(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
 
 
 def _is_plain(chunk: pa.Array[Any]) -> bool:
-    """Whether the elements of lists are numbers or booleans, all there."""
+    """True if the elements of lists are numbers or booleans, without nulls."""
     kind = chunk.type.value_type
     plain = _types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)
     return bool(plain) and not chunk.flatten().null_count
 
 
 def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None) -> NDArray[Any]:
-    """Fill in the arrays of a chunk; equal ones, as covariances often are, once.
+    """Fill in the arrays of a chunk; equal ones, such as covariances, share one array.
 
     Args:
-        cells: For the arrays.
+        cells: Receives the arrays.
         chunk: Lists of numbers.
-        shared: The array that all rows so far are equal to, empty when they are not; None
+        shared: The array that all rows so far are equal to, empty if they differ; None
             at first.
 
     Returns:
-        The same, for the next chunk.
+        The value of `shared` for the next chunk.
     """
     values = chunk.flatten().to_numpy(zero_copy_only=False)
     values.flags.writeable = False
@@ -164,7 +164,7 @@ def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None
 
 
 def _all_equal(table: NDArray[Any], row: NDArray[Any]) -> bool:
-    """Whether all rows are a row, bit by bit: NaN equals NaN, and -0.0 is not 0.0."""
+    """True if all rows equal one row, bit by bit: NaN equals NaN, -0.0 differs from 0.0."""
     if table.shape[1] != len(row) or not len(row):
         return False
     bits = table.view(f"u{table.itemsize}")
@@ -172,19 +172,19 @@ def _all_equal(table: NDArray[Any], row: NDArray[Any]) -> bool:
     if not (np.array_equal(bits[0], first) and np.array_equal(bits[-1], first)):
         return False
     flat = bits.reshape(-1)
-    # Each row is compared with the next, flat: several times faster than row by row.
+    # Each row is compared with the next in flat form: several times faster than by rows.
     return np.array_equal(flat[len(row) :], flat[: -len(row)])
 
 
 def _objects(chunk: pa.Array[Any]) -> NDArray[Any]:
-    """Any values as Python objects."""
+    """Values of any type as Python objects."""
     cells = np.empty(len(chunk), object)
     cells[:] = chunk.to_pylist()
     return cells
 
 
 def _string_dtype() -> Any:
-    """The strings that pandas itself makes of str from version 3 on, held by Arrow."""
+    """The string type that pandas from version 3 on uses for str, stored by Arrow."""
     if int(pd.__version__.split(".")[0]) >= 3:
         return pd.StringDtype(storage="pyarrow", na_value=np.nan)
     return pd.StringDtype("pyarrow_numpy")

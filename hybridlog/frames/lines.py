@@ -1,4 +1,4 @@
-"""Messages as JSON lines: what each message says, field by field."""
+"""Messages as JSON lines, with all fields."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 
 def lines(planner: Planner) -> Iterator[list[str]]:
-    """The messages of an answer in order, some at a time: one object of JSON a message.
+    """The messages of an answer in order, in batches: one JSON object for each message.
 
-    It has `log_time_ns`, `topic`, `recording` when there are several, and the fields that
-    the message has, those of nested messages by dotted names.
+    It has `log_time_ns`, `topic`, `recording` if there are several, and the fields of the
+    message, with dotted names for those of nested messages.
 
     Raises:
-        DefinitionError: A topic has no definition to read its messages by.
+        DefinitionError: a topic has no definition to read its messages with.
     """
     plan = planner.scan_plan()
     decoder = Decoder(planner, plan.channels)
@@ -68,7 +68,7 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[str]:
 
 
 def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Iterator[str]:
-    """Lines of messages of which every one has every field."""
+    """Lines of messages that all have every field."""
     times = pa.array(block.log_time)
     columns: dict[str, pa.Array[Any]] = {"log_time_ns": times, "topic": _repeated(topic, times)}
     own = {name: array for name, array in block.own.items() if name not in columns}
@@ -93,7 +93,7 @@ def _repeated(text: str, rows: pa.Array[Any]) -> pa.Array[Any]:
 def _firsts(
     decoder: Decoder, number: int, batch: Batch, seq: NDArray[np.int64]
 ) -> list[dict[str, Any]]:
-    """What stands first in the lines of messages: ours."""
+    """The beginnings of the lines of messages: the built-in columns."""
     own = decoder.own_columns(number, batch, seq)
     if "stamp" in own:
         own = dict(decoder.block(number, batch, seq)[0].own)
@@ -110,7 +110,7 @@ def _firsts(
 def _of_objects(
     firsts: Sequence[Mapping[str, Any]], decoded: DecodedObjects, fields: Sequence[str] | None
 ) -> Iterator[str]:
-    """Lines of messages of which each has fields of its own."""
+    """Lines of messages with different fields."""
     wanted = None
     if fields is not None:
         wanted = [path.replace("[]", "").split(".") for path in fields]
@@ -140,7 +140,7 @@ def _flat(message: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _chosen(value: Any, wanted: Sequence[Sequence[str]] | None) -> Any:
-    """What is wanted of a value: of an object those fields, of a list that of each element."""
+    """The wanted part of a value: fields of an object, or of each element of a list."""
     if wanted is None:
         return value
     if isinstance(value, Mapping):
@@ -152,7 +152,7 @@ def _chosen(value: Any, wanted: Sequence[Sequence[str]] | None) -> Any:
 
 
 def _summarise(row: dict[str, Any], fields: Sequence[str]) -> None:
-    """Puts summaries that are asked for into a row, and takes their arrays out of it."""
+    """Add requested summaries to a row, and remove their arrays from it."""
     arrays: dict[str, Any] = {}
     for path in fields:
         summary = summary_of(path)

@@ -1,8 +1,9 @@
-"""Names of columns: those that are ours, and those that are fields.
+"""Names of columns: built-in columns and fields.
 
-Every table has `log_time`, one of several topics `topic`, one of several recordings
-`recording`. A field of one of these names always gets a trailing underscore. The others
-are there when they are asked for; a field of that name gets one then.
+Every table has `log_time`. Tables of several topics also have `topic`, and tables of
+several recordings `recording`. A field of one of these names always gets a trailing
+underscore. The other built-in columns are present on request; a field of that name gets an
+underscore then.
 """
 
 from __future__ import annotations
@@ -13,22 +14,22 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
 RESERVED: Final = ("log_time", "recording", "topic")
-"""Columns that come unasked."""
+"""Columns that are always present."""
 OPTIONAL: Final = ("publish_time", "stamp", "seq", "sequence")
-"""Columns that come when they are asked for: publish time, header stamp, arrival number in
+"""Columns that are present on request: publish time, header stamp, arrival number in
 the recording, and the sender's sequence number."""
 FIELD: Final = b"hybridlog.field"
-"""Arrow metadata of a column that had to be renamed: the path of its field."""
+"""Arrow metadata of a column that was renamed: the path of its field."""
 
 _SUMMARIES = ("n", "min", "max", "mean")
 
 
 def own_columns(asked: Sequence[str] | None, defined: Collection[str]) -> list[str]:
-    """Our columns among the names that are asked for.
+    """The built-in columns among the requested names.
 
     Args:
         asked: Names given to `fields`; None for all fields.
-        defined: Paths that the definitions of the topics have. A name among them is the
+        defined: Paths in the definitions of the topics. A name among them is the
             field, unless it is reserved.
     """
     names = dict.fromkeys(asked or ())
@@ -36,28 +37,28 @@ def own_columns(asked: Sequence[str] | None, defined: Collection[str]) -> list[s
 
 
 def is_own(name: str) -> bool:
-    """Whether a name that is no field stands for a column of ours."""
+    """True if a name that is no field is a built-in column."""
     return name in RESERVED or name in OPTIONAL
 
 
 def free_name(path: str, taken: Collection[str]) -> str:
-    """The name of the column of a field: its path, with underscores as long as it is taken."""
+    """The name of a field's column: its path, with underscores added until it is unique."""
     while path in RESERVED or path in taken:
         path += "_"
     return path
 
 
 def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
-    """Column names in the order in which their fields were asked for.
+    """Column names in the order in which their fields were requested.
 
-    What was not asked for comes first: log time, topic, recording.
+    Columns that were not requested come first: log time, topic, recording.
     """
     if fields is None:
         return list(names)
     asked = [path.replace("[]", "") for path in fields]
 
     def place(name: str) -> int:
-        # A field that is called as a column of ours has an underscore more.
+        # A field with the name of a built-in column has an extra underscore.
         same = {name, name.rstrip("_")} if is_own(name.rstrip("_")) else {name}
         exact = (number for number, path in enumerate(asked) if path in same)
         near = (number for number, path in enumerate(asked) if _is_part(name, path))
@@ -67,21 +68,21 @@ def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
 
 
 def _is_part(name: str, path: str) -> bool:
-    """Whether one of two paths is a part of the other."""
+    """True if one of two paths is a part of the other."""
     return name.startswith(f"{path}.") or path.startswith(f"{name}.")
 
 
 def summary_of(path: str) -> tuple[str, str] | None:
-    """An array and which summary of it a path may mean: `ranges.min`."""
+    """The array and the summary that a path may mean: `ranges.min`."""
     array, dot, what = path.rpartition(".")
     return (array, what) if dot and what in _SUMMARIES else None
 
 
 def is_summary(path: str, known: Mapping[str, str]) -> bool:
-    """Whether a path is a summary of an array or of bytes, and no field.
+    """True if a path is a summary of an array or of bytes, and no field.
 
     Args:
-        path: Dotted.
+        path: Dotted path.
         known: Types of all fields by path.
     """
     found = summary_of(path)

@@ -401,7 +401,7 @@ def put_entry(
     """Read a recording's files and update its catalog row.
 
     Raises:
-        SegmentError: Nothing says what recording it is.
+        SegmentError: The recording cannot be identified.
     """
     try:
         return _put_entry(directory, catalog, label, is_open=is_open)
@@ -447,7 +447,7 @@ def describe_now(
     """Read a recording from its files.
 
     Raises:
-        SegmentError: Nothing says what recording it is.
+        SegmentError: The recording cannot be identified.
     """
     return describe_inventory(catalog, take_inventory(directory, label), is_open=is_open)
 
@@ -458,7 +458,7 @@ def describe_inventory(
     """Make the catalog row of a recording from its inventory.
 
     Raises:
-        SegmentError: Nothing says what recording it is.
+        SegmentError: The recording cannot be identified.
     """
     from hybridlog.indexing import ChunkIndexer
 

@@ -98,10 +98,10 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, label: str) -> list
 
 
 def _repair_tables(directory: StoreDirectory, catalog: Catalog, label: str) -> list[Repaired]:
-    """Make tables again that are damaged."""
+    """Rebuild damaged tables."""
     entry = put_entry(directory, catalog, label)
     if entry.status == "damaged":
-        return []  # tables of what is lost fit again when that is restored
+        return []  # tables of lost data are valid again after its restoration
     damaged = tables.damage(directory, entry)
     if not damaged or not tables.make(directory, entry, damaged):
         return []
@@ -157,7 +157,7 @@ def _put_journal_right(directory: StoreDirectory, label: str) -> list[Repaired]:
     done = []
     if state.torn:
         log.append()
-        done.append(Repaired(label, "journal", f"{state.torn} bytes behind its last line cut off"))
+        done.append(Repaired(label, "journal", f"{state.torn} bytes after its last line cut off"))
     unlisted = [m for m in inventory.misfits if m.is_unlisted]
     if unlisted:
         # It may have listed other segments that are gone; this cannot be excluded.

@@ -1,4 +1,4 @@
-"""Makes, checks and removes the tables of recordings."""
+"""Creates, checks and removes the tables of recordings."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def topics_of(entry: RecordingEntry) -> set[str]:
 
 
 def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
-    """Topics whose tables are missing, or are not what the catalog says.
+    """Topics whose tables are missing, or differ from the catalog.
 
-    Topics of few rows share files, so those of one file are missing together.
+    Topics with few rows share files; those of one file are missing together.
     """
     from hybridlog.tables.reader import Tables
 
@@ -53,7 +53,7 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
 
 
 def together(entry: RecordingEntry, topics: Collection[str]) -> set[str]:
-    """Topics, and those that share a file with one of them."""
+    """Some topics, and those that share a file with one of them."""
 
     def schemas(topic: str) -> set[str]:
         if entry.messages_of(topic) >= OWN_FILE_ROWS:
@@ -71,15 +71,16 @@ def together(entry: RecordingEntry, topics: Collection[str]) -> set[str]:
 def make(
     directory: StoreDirectory, entry: RecordingEntry, topics: Collection[str] | None = None
 ) -> bool:
-    """Make tables of a recording again from its segments.
+    """Create tables of a recording again from its segments.
 
     Args:
         directory: The store.
-        entry: The recording, as the catalog has it.
-        topics: Of which; None for those that are missing.
+        entry: The recording's entry in the catalog.
+        topics: Topics of the tables; None for those that are missing.
 
     Returns:
-        Whether they were made; not if the recording is being written, or the store cannot be.
+        True if tables were created; False if the recording is being written, or the store is
+            read-only.
     """
     if entry.status == "open" or not directory.is_writable:
         return False
@@ -105,13 +106,13 @@ def make(
 def made_for(
     directory: StoreDirectory, entry: RecordingEntry, topic: str, tables: Tables
 ) -> TopicTable | None:
-    """The table of a topic that a question needs, made again if it is missing or damaged.
+    """The table of a topic for a question, created again if it is missing or damaged.
 
-    A topic for which no table can be made is noted, so that it is tried once.
+    A topic for which no table can be made is noted, which prevents another attempt.
 
     Args:
         directory: The store.
-        entry: The recording, as the catalog has it.
+        entry: The recording's entry in the catalog.
         topic: Full name.
         tables: Finds the tables.
     """
@@ -140,7 +141,7 @@ def _chunks(
     topics: Collection[str],
     writer: TableWriter,
 ) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
-    """Chunks with messages of some topics, in order; those that are damaged are left out."""
+    """Chunks with messages of some topics, in order; damaged ones are left out."""
     path = directory.recording(entry.label)
     for number, _, _ in entry.spans:
         with SegmentReader(path / f"{number:06d}.mcap", number) as reader:
@@ -154,7 +155,7 @@ def _chunks(
 
 
 def chunks_with(entry: RecordingEntry, table: ChunkTable, topics: Collection[str]) -> list[bool]:
-    """For each chunk of a segment, whether it has messages of some topics."""
+    """For each chunk of a segment, True if it has messages of some topics."""
     ids = [c.id for c in entry.channels if c.topic in topics]
     chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
     found = np.zeros(len(table.chunks), np.bool_)
@@ -181,7 +182,7 @@ def damage(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, str]:
                 if checked[file.path]:
                     found[topic] = checked[file.path]
         except FileNotFoundError:
-            pass  # there need not be one
+            pass  # a missing table is no problem
         except StoreError as error:
             found[topic] = str(error)
     return found
@@ -191,7 +192,7 @@ def remove(directory: StoreDirectory, recording: str) -> None:
     """Remove all tables of a recording.
 
     Raises:
-        OSError: One cannot be removed.
+        OSError: a table cannot be removed.
     """
     parts = parts_folder(directory.path, recording)
     with suppress(FileNotFoundError):
@@ -210,17 +211,17 @@ def remove(directory: StoreDirectory, recording: str) -> None:
 def sweep(
     directory: StoreDirectory, entries: Iterable[RecordingEntry], present: Collection[str]
 ) -> None:
-    """Remove tables of recordings that are gone, and what a crash has left unfinished.
+    """Remove tables of removed recordings, and unfinished files after a crash.
 
     Args:
         directory: The store.
-        entries: All recordings that are known.
-        present: Keys of all that have a directory.
+        entries: All known recordings.
+        present: Keys of all recordings with a directory.
     """
     for entry in entries:
         parts = parts_folder(directory.path, entry.id)
         with suppress(OSError, StoreError):
-            files.status(parts, depth=files.IN_FOLDER)  # most have none
+            files.status(parts, depth=files.IN_FOLDER)  # most recordings have none
             with directory.writing(entry.label) as mine:
                 if mine:
                     files.remove_tree(parts, depth=files.IN_FOLDER)

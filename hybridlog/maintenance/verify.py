@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segment_reader import ChunkPlace
 
 _REPAIR = "run `hybridlog repair`"
-_RESTORE = "restore the file from a copy; what it held is in `hybridlog losses`"
+_RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
 _KNOWN = frozenset({LOCK, "journal.old"})
 
 
@@ -59,7 +59,7 @@ class Verification:
         messages: Number of messages in them.
         bytes_read: Bytes read from segments and journals.
         findings: All problems.
-        index: Whether the index was compared, too; MongoDB may be unavailable.
+        index: True if the index was compared, too; MongoDB may be unavailable.
     """
 
     recordings: int = 0
@@ -180,7 +180,7 @@ class _Check:
             problem = "it cannot be read" if number else "its first line is not the beginning"
             self.found(where, problem, _REPAIR)
         if state.torn:
-            self.found("journal", f"{state.torn} bytes behind its last line", _REPAIR)
+            self.found("journal", f"{state.torn} bytes after its last line", _REPAIR)
         if state.rebuilt is not None:
             self.found(
                 "journal",

@@ -1,1 +1,1 @@
-"""Questions: times, topics, predicates, plans."""
+"""Questions about messages: times, topics, predicates and plans."""

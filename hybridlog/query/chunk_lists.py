@@ -1,4 +1,4 @@
-"""Chunk entries of recordings that are asked about again and again."""
+"""Chunk entries of recordings that are queried repeatedly."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     Fetch = Callable[[tuple[int, int] | None], list[ChunkEntry]]
     """Asks the database for the chunks of some channels in a time range, or in all times."""
 
-_MOST = 20_000  # entries that are kept of one recording, about 1 kB each
-_BACK_NS = 1_000_000_000  # the last message by a time is looked for so far back first,
-_FURTHER = 64  # and then so many times as far
+_MOST = 20_000  # entries cached for one recording, about 1 kB each
+_BACK_NS = 1_000_000_000  # length of the first span searched for the last message
+_FURTHER = 64  # factor by which each next span is longer
 
 
 class ChunkLists:
-    """Answers which chunks may hold some channels in a time range, without the database.
+    """Finds the chunks that may hold some channels in a time range, without the database.
 
-    The first question about channels of a recording goes to the database, which finds a
-    few chunks among any number. Whoever asks again will ask more: then all chunks of
-    these channels are fetched, if they are not too many, and kept. Recordings that are
-    asked for here do not change.
+    The first question about some channels of a recording goes to the database, which finds
+    a few chunks among any number. The second question fetches all chunks of these channels,
+    unless they are too many, and caches them. The recordings queried here must not
+    change.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class ChunkLists:
             recording: Its id.
             channels: Channel ids.
             bounds: Log time `[begin, end)`, ns.
-            fetch: Asks the database for the chunks of these channels in a time range,
+            fetch: Queries the database for the chunks of these channels in a time range,
                 or in all times.
         """
         kept = self._kept(recording, frozenset(channels), fetch)
@@ -63,11 +63,11 @@ class ChunkLists:
         Args:
             recording: Its id.
             channels: Channel ids.
-            span: Log time of the first message there is, and the time, ns.
+            span: Log time of the first message, and the latest time, ns.
             fetch: As for `find`.
 
         Yields:
-            A chunk, and the log time of the last message, ns, that it or any chunk still to
+            A chunk, and the greatest log time, ns, that it or any later chunk may hold.
             come may hold.
         """
         held = frozenset(channels)
@@ -83,7 +83,7 @@ class ChunkLists:
         channels: frozenset[int],
         fetch: Fetch,
     ) -> _ChunkList | None:
-        """The chunks of some channels; None at the first question, and when they are too many."""
+        """The chunks of some channels; None for a first question, and when they are too many."""
         key = recording, channels
         if key in self._lists:
             return self._lists[key]
@@ -96,7 +96,7 @@ class ChunkLists:
         return kept
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Forget all entries."""
         self._lists.clear()
         self._asked.clear()
 
@@ -106,10 +106,10 @@ def latest_first(
     span: tuple[int, int],
     fetch: Callable[[tuple[int, int]], list[ChunkEntry]],
 ) -> Iterator[tuple[ChunkEntry, int]]:
-    """What `ChunkLists.before` gives, asked of the database piece by piece.
+    """The chunks of `ChunkLists.before`, fetched from the database piece by piece.
 
-    All chunks before a time are many in a long recording, and mostly the last one has what
-    is looked for.
+    A long recording has many chunks before a time, and usually the last one holds the
+    message.
     """
     start, latest = span
     seen: set[tuple[int, int]] = set()
@@ -119,12 +119,12 @@ def latest_first(
             place = chunk.segment, chunk.offset
             if place not in seen:
                 seen.add(place)
-                # Those that were not fetched yet end before this piece begins.
+                # Chunks that are not yet fetched end before this piece begins.
                 yield chunk, max(last, begin - 1)
 
 
 def earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
-    """Where to begin to look for the last message by a time, ns: close to it first."""
+    """Starts of the search for the last message by a time, ns: the nearest first."""
     back = _BACK_NS
     while latest - back > start:
         yield latest - back
@@ -133,7 +133,7 @@ def earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
 
 
 class _ChunkList:
-    """Chunks by the time at which they begin."""
+    """Chunks ordered by the time at which they begin."""
 
     def __init__(self, chunks: Sequence[ChunkEntry], channels: frozenset[int]) -> None:
         held = [(chunk, span) for chunk in chunks if (span := chunk.span(channels)) is not None]
@@ -142,7 +142,7 @@ class _ChunkList:
         spans = np.array([span for _, span in held], np.int64).reshape(-1, 2)
         first, self._last = np.ascontiguousarray(spans.T)
         self._longest = int((self._last - first).max()) if held else 0
-        # As lists: one number is looked up at a time, for which numpy takes ten times as long.
+        # Lists, since single numbers are looked up: numpy takes ten times as long.
         self._first: list[int] = first.tolist()
         self._last_by: list[int] = np.maximum.accumulate(self._last).tolist()
 

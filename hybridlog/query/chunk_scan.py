@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
-_SMALL_CHUNK_BYTES = 128 << 10  # copying such a chunk is faster than decoding it alone
+_SMALL_CHUNK_BYTES = 128 << 10  # copying such a chunk is faster than decoding it by itself
 _MERGED_BYTES = 1 << 20  # small chunks are decoded together up to this size
 
 ChunkKey = tuple[str, int, int]
@@ -44,12 +44,12 @@ ChunkKey = tuple[str, int, int]
 
 @dataclass(frozen=True, slots=True)
 class RowSelection:
-    """The messages of some chunks that an index found.
+    """Messages of some chunks that an index found.
 
     Attributes:
         offsets: Payload offsets in each chunk, sorted, by chunk; int64[k].
-        unindexed: Indexes of channels that no index was asked about: every message of
-            theirs is read, and a filter decides.
+        unindexed: Indexes of the channels without an index. All their messages are read,
+            and a filter decides.
     """
 
     offsets: Mapping[ChunkKey, NDArray[np.int64]]
@@ -57,12 +57,12 @@ class RowSelection:
 
 
 Selector = Callable[[Sequence["ChunkTask"]], RowSelection]
-"""Asks an index which messages of some chunks may match."""
+"""Finds the messages of some chunks that may match, in an index."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingScan:
-    """What to read of one recording.
+    """The part of one recording to read.
 
     Attributes:
         recording: The recording.
@@ -80,7 +80,7 @@ class RecordingScan:
     windows: NDArray[np.int64] | None = None
 
     def touches(self, first: int, last: int) -> bool:
-        """Whether a chunk may have messages in a window.
+        """True if a chunk may have messages in a window.
 
         Args:
             first: Log time of its first message, ns.
@@ -94,7 +94,7 @@ class RecordingScan:
 
 @dataclass(frozen=True, slots=True)
 class ChunkTask:
-    """A chunk to read, and what is wanted from it."""
+    """A chunk to read, and the messages wanted from it."""
 
     scan: RecordingScan
     chunk: ChunkEntry
@@ -104,7 +104,7 @@ class ChunkTask:
 
     @property
     def key(self) -> ChunkKey:
-        """Where the chunk lies."""
+        """Location of the chunk."""
         return self.scan.recording.id, self.chunk.segment, self.chunk.number
 
 
@@ -127,13 +127,13 @@ class MessageRun:
 
 @dataclass(slots=True)
 class ScanPlan:
-    """What to read, in which order.
+    """Everything to read, in order.
 
     Attributes:
         channels: Every channel that is read.
-        scans: What to read of each recording.
+        scans: The part of each recording to read.
         clock: The clock of the bounds.
-        selector: Narrows chunks down to candidates; None reads everything.
+        selector: Reduces chunks to candidates; None reads everything.
         filters: Decides on each message of a channel, by index of the channel.
         reverse: Latest message first.
         counters: Count what is read.
@@ -162,12 +162,12 @@ class ScanPlan:
 
 
 class ChunkScan:
-    """Carries out a plan.
+    """Executes a plan.
 
     Args:
         plan: What to read.
-        reader_of: Gives the reader of a segment, by recording id and number.
-        ahead: Whether to read ahead; a caller that takes a few messages need not.
+        reader_of: Returns the reader of a segment, by recording id and number.
+        ahead: True to read ahead; unnecessary for a caller that takes few messages.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class ChunkScan:
             plan.counters.elapsed_s = time.monotonic() - started
 
     def unordered(self) -> Iterator[MessageRun]:
-        """All messages, one large chunk or many small ones at a time, in no order."""
+        """All messages, unordered, one large chunk or many small ones at a time."""
         plan = self._plan
         started = time.monotonic()
         small: list[MessageRun] = []
@@ -221,7 +221,7 @@ class ChunkScan:
         plan.counters.elapsed_s = time.monotonic() - started
 
     def _selected(self, tasks: list[ChunkTask]) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
-        """Leave out the chunks that hold no candidate."""
+        """Skip the chunks without candidates."""
         selector = self._plan.selector
         if selector is None:
             yield from ((task, None) for task in tasks)
@@ -305,7 +305,7 @@ class ChunkScan:
         return MessageRun(own, seq[rows])
 
     def _filtered(self, run: MessageRun) -> tuple[MessageRun, int]:
-        """The messages that satisfy the predicate, and how many could not be read."""
+        """The messages that satisfy the predicate, and the number of unreadable ones."""
         filters = self._plan.filters
         if not filters or not len(run.batch):
             return run, 0
@@ -363,18 +363,18 @@ class ChunkScan:
 
 
 _Loaded = tuple[MessageRun, int, int]
-"""Messages, bytes read, messages that the predicate could not be asked of."""
+"""Messages, bytes read, messages unreadable for the predicate."""
 
 
 class _Loading(Protocol):
-    """A chunk on its way."""
+    """A chunk that is being read."""
 
     def result(self) -> _Loaded: ...
 
 
 @dataclass(slots=True)
 class _Deferred:
-    """A chunk that is read when its result is asked for."""
+    """A chunk that is read when its result is requested."""
 
     load: Callable[[], _Loaded]
 
@@ -394,7 +394,7 @@ def _is_selected(
 
 
 def _merged(runs: list[MessageRun]) -> MessageRun:
-    """Several runs as one: decoding each alone costs more than copying it."""
+    """Several runs as one: decoding each separately costs more than copying it."""
     return MessageRun(joined([r.batch for r in runs]), np.concatenate([r.seq for r in runs]))
 
 
@@ -415,7 +415,7 @@ def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
 
 
 def _is_in_order(run: MessageRun) -> bool:
-    """Whether a run of one chunk is sorted; strictly rising log times suffice."""
+    """True if a run of one chunk is sorted; strictly increasing log times suffice."""
     return bool((run.batch.log_time[1:] > run.batch.log_time[:-1]).all())
 
 

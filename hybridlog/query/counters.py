@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Counters:
-    """The cost of an answer, and what it lacks.
+    """The cost of an answer, and what is missing from it.
 
     Attributes:
         messages: Messages in the answer.
@@ -23,7 +23,7 @@ class Counters:
         chunks_read: Chunks read and decompressed.
         documents_read: Index documents received from MongoDB.
         reduced: Messages left out because only their fields were recorded.
-        unreadable: Messages a predicate was asked of that do not fit their definition.
+        unreadable: Messages of the predicate's topics that do not fit their definition.
         elapsed_s: Wall time, seconds.
     """
 
@@ -42,20 +42,20 @@ class Counters:
             setattr(self, each.name, each.default)
 
     def add(self, other: Counters) -> None:
-        """Add the counts of a part of the answer; the wall time stays."""
+        """Add the counts of a part of the answer; the wall time is unchanged."""
         for each in fields(self):
             if each.name != "elapsed_s":
                 total = getattr(self, each.name) + getattr(other, each.name)
                 setattr(self, each.name, total)
 
     def add_messages(self, batch: Batch) -> None:
-        """Count messages that go into the answer."""
+        """Count messages of the answer."""
         self.messages += len(batch)
         self.payload_bytes += batch.payload_bytes
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Start at zero and measure the wall time of the block."""
+        """Set every counter to zero and measure the wall time of the block."""
         self.reset()
         started = time.monotonic()
         try:

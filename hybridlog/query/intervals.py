@@ -1,8 +1,8 @@
-"""Intervals of log time: what states, changes and windows around events are answered with.
+"""Intervals of log time: the answers for states, changes and windows around events.
 
 All intervals are half-open, `begin <= time < end`, and each belongs to one recording:
-nothing is ever joined from one recording to the next. They are columns, not objects; an
-`Interval` is made when one is looked at.
+no interval spans two recordings. They are columns, not objects; an `Interval` is made
+on access.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
 MOST_PIECES = 10_000_000
-"""Most intervals that `Intervals.cut` makes."""
+"""Maximum number of intervals that `Intervals.cut` makes."""
 _LAST = np.iinfo(np.int64).max
 
 
 class Events(Protocol):
-    """Messages at some times; a query is one."""
+    """Messages at some times, such as those of a query."""
 
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """In which spans of log time of a recording any message lies."""
+        """Test which spans of log time of a recording contain any message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A stretch of log time of one recording.
+    """A span of log time of one recording.
 
     Attributes:
         recording: Id of the recording.
         begin_ns: First nanosecond, since the epoch.
         end_ns: First nanosecond after it.
-        messages: How many messages it was made from.
+        messages: Number of messages it was made from.
     """
 
     recording: str
@@ -69,19 +69,19 @@ class Interval:
 
     @property
     def duration_ns(self) -> int:
-        """Its length, nanoseconds."""
+        """Length of the interval, nanoseconds."""
         return self.end_ns - self.begin_ns
 
 
 class Intervals:
-    """Intervals, ordered by their beginning. Immutable: each step gives new ones.
+    """Intervals, ordered by their beginning. Immutable: each method returns new ones.
 
     Args:
-        recordings: Ids, in the order in which intervals that begin together are given.
+        recordings: Ids, in the order of intervals that begin at the same time.
         recording: int32[n], index into `recordings`.
         begin: int64[n], ns since the epoch.
         end: int64[n], ns; never before `begin`.
-        messages: int64[n], how many messages each was made from.
+        messages: int64[n], number of messages of each interval.
     """
 
     __slots__ = ("_begin", "_end", "_messages", "_recording", "_recordings")
@@ -103,7 +103,7 @@ class Intervals:
 
     @classmethod
     def of(cls, parts: Iterable[tuple[str, NDArray[np.int64]]]) -> Intervals:
-        """Intervals out of parts of recordings.
+        """Intervals from parts of recordings.
 
         Args:
             parts: Id of a recording, and int64[n, 3]: begin, end, messages. A recording
@@ -119,17 +119,17 @@ class Intervals:
         return cls(tuple(ids), np.concatenate(codes), begin, end, messages)
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of intervals."""
         return len(self._begin)
 
     def __iter__(self) -> Iterator[Interval]:
-        """One by one."""
+        """The intervals, one by one."""
         columns = (self._recording, self._begin, self._end, self._messages)
         for code, begin, end, count in zip(*(c.tolist() for c in columns), strict=True):
             yield Interval(self._recordings[code], begin, end, count)
 
     def __getitem__(self, place: int) -> Interval:
-        """One of them; a negative place counts from the end."""
+        """The interval at an index; a negative index counts from the end."""
         return Interval(
             self._recordings[self._recording[place]],
             int(self._begin[place]),
@@ -141,7 +141,7 @@ class Intervals:
         return f"<Intervals {len(self)}, {format_duration(self.duration_ns)} in all>"
 
     def __eq__(self, other: object) -> bool:
-        """Whether both have the same intervals of the same recordings."""
+        """True if both have the same intervals of the same recordings."""
         return isinstance(other, Intervals) and self._value() == other._value()
 
     def __hash__(self) -> int:
@@ -155,11 +155,11 @@ class Intervals:
 
     @property
     def duration_ns(self) -> int:
-        """Sum of their lengths, nanoseconds; where they overlap, time counts twice."""
+        """Sum of the lengths, nanoseconds; time in which intervals overlap counts twice."""
         return int((self._end - self._begin).sum())
 
     def at_least(self, length: DurationLike) -> Intervals:
-        """Only those of at least this length.
+        """The intervals of at least this length.
 
         Raises:
             TimeError: it is no duration.
@@ -167,22 +167,22 @@ class Intervals:
         return self._take(self._end - self._begin >= parse_duration(length))
 
     def cut(self, length: DurationLike) -> Intervals:
-        """Each cut into as many pieces of exactly this length as fit into it.
+        """Each interval cut into as many pieces of exactly this length as fit.
 
-        The first piece begins where the interval begins, each where the one before it
-        ends; what is left over at the end is dropped. `messages` stays that of the whole.
+        The first piece begins where the interval begins, each next one where the last ends.
+        A shorter rest is dropped. `messages` remains that of the whole interval.
 
         Raises:
-            TimeError: it is no duration.
-            UsageError: it is zero, or there would be too many pieces.
+            TimeError: the length is no duration.
+            UsageError: the length is zero, or there would be too many pieces.
         """
         size = parse_duration(length)
         if size == 0:
-            raise UsageError("Intervals cannot be cut into pieces of no length.")
+            raise UsageError("Intervals cannot be cut into pieces of length 0.")
         count = (self._end - self._begin) // size
         if int(count.sum()) > MOST_PIECES:
             raise UsageError(
-                f"That is {int(count.sum())} intervals; ask for longer ones, or in a time range."
+                f"The cut makes {int(count.sum())} intervals; use a greater length or a time range."
             )
         source = np.repeat(np.arange(len(self)), count)
         number = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
@@ -192,10 +192,10 @@ class Intervals:
         )
 
     def widened(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
-        """Each begins and ends so much earlier and later; they may overlap then.
+        """Intervals that begin earlier and end later by these times; they may overlap.
 
         Raises:
-            TimeError: one of both is no duration.
+            TimeError: `before` or `after` is no duration.
         """
         begin = np.maximum(self._begin, parse_duration(before)) - parse_duration(before)
         later = parse_duration(after)
@@ -203,20 +203,20 @@ class Intervals:
         return Intervals(self._recordings, self._recording, begin, end, self._messages)
 
     def merged(self) -> Intervals:
-        """Those of one recording that overlap or touch as one; empty ones are dropped."""
+        """Overlapping or touching intervals of a recording joined; empty ones dropped."""
         return Intervals.of(
             (name, joined(self._rows_of(code))) for code, name in enumerate(self._recordings)
         )
 
     def common(self, other: Intervals) -> Intervals:
-        """What is in both: times of a recording that intervals of either have.
+        """The intersection: times of a recording that intervals of both cover.
 
-        `messages` is 0: there are no messages that these were made from.
+        `messages` is 0, since no messages belong to the new intervals.
         """
         parts = []
         for name in self._recordings:
             mine, theirs = self.of_recording(name), other.of_recording(name)
-            # Each pair that meets: those of theirs that end after mine begins, and so on.
+            # Each pair that overlaps: the others that end after this one begins, and so on.
             low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")
             high = np.searchsorted(theirs[:, 0], mine[:, 1], "left")
             count = np.maximum(high - low, 0)
@@ -227,13 +227,13 @@ class Intervals:
         return Intervals.of(parts)
 
     def containing(self, events: Events) -> Intervals:
-        """Only those in which the log time of at least one message of a question lies.
+        """The intervals that contain the log time of at least one message of a question.
 
-        The message must be of the interval's own recording. Intervals that overlap
-        are each looked at.
+        The message must be of the interval's own recording. Overlapping intervals are
+        tested separately.
 
         Args:
-            events: A query; its messages, of the same store.
+            events: A query on the same store.
 
         Raises:
             UsageError: it has `limit` or `every`.
@@ -246,7 +246,7 @@ class Intervals:
         return self._take(found)
 
     def within(self, spans: Mapping[str, Span]) -> Intervals:
-        """Each without what lies outside of its recording; they stay as many.
+        """Each interval cut to its recording; the number of intervals is unchanged.
 
         Args:
             spans: `[begin, end)`, ns, by id of the recording.
@@ -258,24 +258,22 @@ class Intervals:
         return Intervals(self._recordings, self._recording, begin, end, self._messages)
 
     def by_id(self, ids: Mapping[str, str]) -> Intervals:
-        """The same, of recordings that may have been named otherwise.
+        """The same intervals, with other names of recordings replaced by ids.
 
         Args:
-            ids: Id of each recording, by its id and by its other names.
+            ids: Id of each recording, by its id and its other names.
 
         Raises:
-            TopicError: one of them is not among these.
+            TopicError: a recording is not in `ids`.
         """
         unknown = [name for name in self._recordings if name not in ids]
         if unknown:
-            raise TopicError(
-                f"An interval is of recording {unknown[0]!r}, which is not in the store."
-            )
+            raise TopicError(f"Recording {unknown[0]!r} of an interval is not in the store.")
         names = tuple(ids[name] for name in self._recordings)
         return Intervals(names, self._recording, self._begin, self._end, self._messages)
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
-        """What of one recording is covered: int64[n, 2], begin and end, apart, in order."""
+        """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
         if recording not in self._recordings:
             return np.empty((0, 2), np.int64)
         return joined(self._rows_of(self._recordings.index(recording)))[:, :2]
@@ -305,9 +303,9 @@ class Intervals:
 def span_of(recording: RecordingEntry) -> Span:
     """Log time of a recording; empty at 0 without messages.
 
-    Stored messages that are lost count, so that relative times mean what they meant before.
-    It ends no later than the last nanosecond that 64 bits can say: a message of just then
-    is in no interval.
+    Stored messages that are lost count, which preserves the meaning of relative times.
+    The span ends at the last nanosecond of 64 bits at the latest: a message of exactly that
+    time is in no interval.
     """
     spans = [*lost_spans(recording)]
     if recording.span is not None:
@@ -319,13 +317,13 @@ def span_of(recording: RecordingEntry) -> Span:
 
 
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Intervals of one recording that overlap or touch, as one; empty ones are dropped.
+    """Intervals of one recording, those that overlap or touch joined, empty ones dropped.
 
     Args:
         rows: int64[n, 3]: begin, end, messages; ordered by begin.
 
     Returns:
-        The same of fewer: messages are added up.
+        Joined intervals in the same form, with the sum of their messages.
     """
     rows = rows[rows[:, 1] > rows[:, 0]]
     if not len(rows):
@@ -338,7 +336,7 @@ def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def clipped(rows: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
-    """Intervals (int64[n, 3]) without what lies outside of a span; none of them empty."""
+    """Intervals (int64[n, 3]) cut to a span, without empty ones."""
     begin = np.maximum(rows[:, 0], span[0])
     end = np.minimum(rows[:, 1], span[1])
     kept = end > begin
@@ -346,13 +344,13 @@ def clipped(rows: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
 
 
 class Holding:
-    """Turns what each message says of a state into the intervals in which it holds.
+    """Turns the state at each message into the intervals in which it holds.
 
-    A message says whether the state holds from its log time on, until the next one, and
-    for at most `max_gap`. Of messages of one log time the last one counts.
+    A message determines the state from its log time until the next message, and for at
+    most `max_gap`. Of messages with the same log time, the last one counts.
 
     Args:
-        max_gap: Most nanoseconds for which a message is believed; None for any.
+        max_gap: Longest time for which a message is valid, ns; None for any.
     """
 
     def __init__(self, max_gap: int | None) -> None:
@@ -365,15 +363,15 @@ class Holding:
     def add(
         self, time: NDArray[np.int64], holds: NDArray[np.bool_], *, counted: bool = True
     ) -> NDArray[np.int64]:
-        """Take the next messages.
+        """Add the next messages.
 
         Args:
-            time: int64[n], log times, ascending, none before those of the last call.
-            holds: bool[n], what each message says.
-            counted: Whether they count as messages of an interval.
+            time: int64[n], log times, ascending, not before those of the last call.
+            holds: bool[n], the state at each message.
+            counted: True if they count as messages of an interval.
 
         Returns:
-            int64[k, 3], begin, end, messages: intervals that are known to have ended.
+            int64[k, 3], begin, end, messages: intervals that have ended.
         """
         time = np.concatenate([self._time, time])
         holds = np.concatenate([self._holds, holds])
@@ -381,17 +379,17 @@ class Holding:
         count[: len(self._count)] = self._count
         if counted:
             count[len(self._count) :] = holds[len(self._count) :]
-        # The last log time may go on in the next call.
+        # The next call may continue the last log time.
         whole = int(np.searchsorted(time, time[-1])) if len(time) else 0
         self._time, self._holds, self._count = time[whole:], holds[whole:], count[whole:]
         following = int(time[-1]) if whole else 0
         return self._extend(time[:whole], holds[:whole], count[:whole], following)
 
     def finish(self, end: int) -> NDArray[np.int64]:
-        """The rest, after the last message.
+        """The remaining intervals, after the last message.
 
         Args:
-            end: Where the recording ends, ns; not before any message.
+            end: End of the recording, ns; not before any message.
         """
         ended = self._extend(self._time, self._holds, self._count, end)
         return np.concatenate([ended, self._open])
@@ -403,7 +401,7 @@ class Holding:
         count: NDArray[np.int64],
         following: int,
     ) -> NDArray[np.int64]:
-        """Intervals of some log times that are complete, the open one first."""
+        """Complete intervals of some log times, the open one first."""
         if not len(time):
             return np.empty((0, 3), np.int64)
         first = np.flatnonzero(np.concatenate([[True], time[1:] != time[:-1]]))
@@ -419,10 +417,10 @@ class Holding:
 
 
 class Changing:
-    """Turns steps, messages that differ from the one before, into changes.
+    """Groups steps (messages that differ from the one before) into changes.
 
     Args:
-        pause: Most nanoseconds between two steps of one change.
+        pause: Longest time between two steps of one change, ns.
     """
 
     def __init__(self, pause: int) -> None:
@@ -430,10 +428,10 @@ class Changing:
         self._open = np.empty((0, 3), np.int64)
 
     def add(self, time: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Take the log times of the next steps, in order.
+        """Add the log times of the next steps, in order.
 
         Returns:
-            int64[k, 3], begin, end, steps: changes that are known to have ended.
+            int64[k, 3], begin, end, steps: changes that have ended.
         """
         if not len(time):
             return np.empty((0, 3), np.int64)
@@ -449,5 +447,5 @@ class Changing:
         return found[:-1]
 
     def finish(self) -> NDArray[np.int64]:
-        """The change that was still open, if any."""
+        """The change that is still open, if any."""
         return self._open

@@ -1,4 +1,4 @@
-"""Decides a predicate on messages that were read."""
+"""Decides a predicate on messages that have been read."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 
 
 _ONLY_INDEXED = ("_meta.inserted_at", "_meta.error", "_meta.ref")
-"""Values that stand in index documents and not in messages."""
+"""Fields of index documents that messages do not have."""
 
 
 def can_decide(predicate: Predicate) -> bool:
-    """Whether the messages alone decide a predicate, without MongoDB."""
+    """True if the messages alone decide a predicate, without MongoDB."""
     if any(path.startswith(_ONLY_INDEXED) for path in predicate.fields()):
         return False
     return not predicate.is_opaque
 
 
 def residual(predicate: Predicate) -> Predicate | None:
-    """The part of a predicate that messages decide when MongoDB has decided the rest.
+    """The part of a predicate left for the messages after MongoDB has answered the rest.
 
     Raises:
-        WhereError: a part that only MongoDB understands is joined to one that it may get
-            wrong by something else than *and*.
+        WhereError: a part that only MongoDB understands and a part that MongoDB may get
+            wrong are not joined by *and*.
     """
     items = predicate.root.items if isinstance(predicate.root, And) else (predicate.root,)
     left = [item for item in items if not isinstance(item, Opaque)]
@@ -53,8 +53,8 @@ class Matches(NamedTuple):
     """The outcome for some messages.
 
     Attributes:
-        holds: bool[n], whether the predicate holds.
-        unreadable: How many do not fit their definition, so that they have no fields.
+        holds: bool[n], True where the predicate holds.
+        unreadable: Number of messages that do not fit their definition and have no fields.
     """
 
     holds: NDArray[np.bool_]
@@ -150,7 +150,7 @@ def meta_array(
     seq: NDArray[np.int64],
     publish_time: pa.Array[Any] | NDArray[np.int64] | None,
 ) -> pa.StructArray:
-    """The same records with a field `_meta` of what a message itself tells.
+    """The records with a field `_meta` of the values that a message itself provides.
 
     Args:
         records: n rows.

@@ -1,8 +1,8 @@
 """Splits a question into parts and chooses an engine for each.
 
 This is the only place that chooses. A part is one topic of one recording: an ended, a
-running and a damaged recording may need different engines. Each engine tells what its
-answer would cost; the cheapest one answers, and if it fails, the next one.
+running and a damaged recording may need different engines. Each engine estimates the cost
+of its answer; the cheapest one answers, and if it fails, the next one.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ class Planner:
         """The question, split by recording and topic; recordings oldest first.
 
         Raises:
-            TimeError: the time range is empty, or outside of all recordings.
-            TopicError: a topic does not have the clock that was asked for.
+            TimeError: the time range is empty, or outside all recordings.
+            TopicError: a topic does not have the requested clock.
         """
         wanted = set(self.question.topics)
         found: list[Part] = []
@@ -117,7 +117,7 @@ class Planner:
         return found
 
     def channels(self) -> list[RecordedChannel]:
-        """Every channel that the question is about."""
+        """Every channel of the question."""
         wanted = set(self.question.topics)
         return [
             channel
@@ -129,7 +129,7 @@ class Planner:
     # Answers.
 
     def count(self) -> int:
-        """Number of messages in the answer; payloads are read only if nothing else can tell."""
+        """Number of messages in the answer; payloads are read only as the last resort."""
         every = self.question.every
         by_topic: dict[str, list[Part]] = defaultdict(list)
         for part in self.parts():
@@ -156,14 +156,14 @@ class Planner:
         return True
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Fields of the messages of a part that match, in order."""
+        """Fields of the matching messages of a part, in order."""
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
     def runs(self, plan: ScanPlan | None = None) -> Iterator[MessageRun]:
         """The messages of the answer, in order.
 
         Args:
-            plan: What `scan_plan` gave, for a caller that needs its channels.
+            plan: The result of `scan_plan`, for a caller that needs its channels.
         """
         question = self.question
         if question.limit == 0:
@@ -176,13 +176,13 @@ class Planner:
             yield run
 
     def unordered(self, plan: ScanPlan) -> Iterator[MessageRun]:
-        """The messages of an answer without `limit` and `every`, in no order."""
+        """The messages of an answer without `limit` and `every`, unordered."""
         for run in ChunkScan(plan, self.session.segment).unordered():
             self.counters.add_messages(run.batch)
             yield run
 
     def scan_plan(self) -> ScanPlan:
-        """What to read for the messages of the answer."""
+        """The plan for reading the messages of the answer."""
         return self._plan_of(self.parts())
 
     def _plan_of(self, parts: Sequence[Part]) -> ScanPlan:

@@ -1,4 +1,4 @@
-"""The question that a user holds: built step by step, answered when it is looked at.
+"""The question that a user holds: built step by step, answered on access.
 
 ```python
 scans = store.topic("scan").between("+10s", "+11s").where("ranges.min < 0.5")
@@ -6,8 +6,8 @@ for message in scans: ...
 frame = scans.to_pandas()
 ```
 
-Each step gives a new query; nothing is read before the answer is asked for. `counters`
-then tells what the answer has cost.
+Each step returns a new query; nothing is read before the answer is accessed. `counters`
+then has the cost of the answer.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Query:
-    """A question about some topics of an open store. Immutable: each step gives a new one.
+    """A question about some topics of an open store. Immutable: each step returns a new one.
 
     Args:
         session: The open store.
@@ -48,7 +48,7 @@ class Query:
 
     Attributes:
         question: The question, as a value that can be compared, hashed and pickled.
-        counters: What the last answer has cost.
+        counters: The cost of the last answer.
     """
 
     def __init__(self, session: Session, question: Question) -> None:
@@ -66,7 +66,7 @@ class Query:
         return f"<Query {'; '.join(parts)}>"
 
     def __eq__(self, other: object) -> bool:
-        """Whether both ask the same of the same open store."""
+        """True if both are the same question to the same open store."""
         if not isinstance(other, Query):
             return NotImplemented
         return self._session is other._session and self.question == other.question
@@ -88,7 +88,7 @@ class Query:
     # Steps.
 
     def copy(self) -> Query:
-        """The same question with counters of its own."""
+        """The same question with separate counters."""
         return Query(self._session, self.question)
 
     def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
@@ -105,7 +105,7 @@ class Query:
         """The time that `between` refers to: `log` (default), `publish` or `header`.
 
         Raises:
-            UsageError: another word.
+            UsageError: an unknown clock.
         """
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
@@ -119,7 +119,7 @@ class Query:
                 filter.
 
         Raises:
-            WhereError: it cannot be understood, does not fit the fields, or is not allowed.
+            WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
         """
         if isinstance(predicate, str):
             checked = self._session.predicate(predicate, self.topics, self.recordings)
@@ -159,7 +159,7 @@ class Query:
         """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
 
         `publish_time`, `stamp` (of the header), `seq` (arrival number), `sequence` (the
-        sender's), `topic` and `recording` are columns, too, where no field is called so.
+        sender's), `topic` and `recording` are also columns, unless a field has that name.
 
         Raises:
             TopicError: no topic of the query has such a field.
@@ -178,7 +178,7 @@ class Query:
         """Only these recordings, by label, name or id.
 
         Raises:
-            TopicError: there is no such recording, or it lacks the topic.
+            TopicError: no such recording exists, or it lacks the topic.
         """
         chosen = [entry.id for entry in self._session.select(names)]
         return self._on(self.topics, chosen)
@@ -190,11 +190,11 @@ class Query:
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
 
-        A message in several of them is given once. Given twice, both must hold.
+        A message in several intervals is returned once. After two calls, both must hold.
 
         Args:
-            intervals: From `intervals`, `changes` or `windows` of any query of this store, or
-                made by hand; recordings go by id or by label.
+            intervals: From `intervals`, `changes` or `windows` of any query of this store,
+                or made by hand; recordings are given by id or by label.
 
         Raises:
             TopicError: an interval is of a recording that is not in the store.
@@ -207,12 +207,12 @@ class Query:
         return self._with(during=intervals.merged())
 
     def before(self, events: Query, length: DurationLike) -> Query:
-        """Only messages that came at most `length` before an event, in its recording.
+        """Only messages at most `length` before an event, in its recording.
 
-        The event's own log time is not part of it: `t - length <= time < t`.
+        The event's own log time is excluded: `t - length <= time < t`.
 
         Args:
-            events: Its messages are the events.
+            events: A query; its messages are the events.
             length: A duration: `"5min"`, seconds, a `timedelta`.
 
         Raises:
@@ -224,12 +224,12 @@ class Query:
         """Only messages near an event, in its recording: `t - before <= time < t + after`.
 
         Args:
-            events: Its messages are the events.
-            before: How long before an event it begins, a duration.
-            after: How long after an event it ends, a duration.
+            events: A query; its messages are the events.
+            before: Time before an event, a duration.
+            after: Time after an event, a duration.
 
         Raises:
-            TimeError: one of both is no duration.
+            TimeError: `before` or `after` is no duration.
             UsageError: both are zero.
         """
         return self.during(events.windows(before, after))
@@ -238,7 +238,7 @@ class Query:
         """Only the message that was current at a time: the last one not after it.
 
         Raises:
-            TopicError: there is none.
+            TopicError: no such message exists.
             UsageError: the question has a time range, or another clock than log time.
         """
         from hybridlog.query.answers.last_message import just_before
@@ -259,20 +259,20 @@ class Query:
             yield from messages_in(plan.channels, run)
 
     def first(self) -> Message | None:
-        """The first message, None when there is none."""
+        """The first message; None if the answer is empty."""
         return next(iter(self.limit(1)), None)
 
     def at(self, moment: TimeLike) -> Message:
-        """The message that `at_time` asks for. Its arrays are read-only: copy to change them.
+        """The message of `at_time`. Its arrays are read-only: copy to change them.
 
         Raises:
-            TopicError: there is none.
+            TopicError: no such message exists.
             UsageError: the question has a time range, or another clock than log time.
         """
         if not self.question.is_unbounded or self.question.clock != "log":
             raise UsageError(
                 "A message at a time is the last one by log time; `between`, `during` and "
-                "`clock` do not fit."
+                "`clock` cannot be combined with it."
             )
         from hybridlog.query.answers.last_message import message_at
 
@@ -285,7 +285,7 @@ class Query:
     def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """The messages in order, many at once; `batch.channel` indexes the channels.
 
-        Messages that gave up their payload are left out; `counters.reduced` counts them.
+        Messages without payload are left out; `counters.reduced` counts them.
         """
         planner = self._planner()
         plan = planner.scan_plan()
@@ -308,7 +308,7 @@ class Query:
             try:
                 found = Planner(self._session, self.question, self.counters).count()
             except IndexChangedError:
-                # Another process has changed the index: ask once more about what is there now.
+                # Another process has changed the index: query its new state once.
                 there = {entry.id for entry in self._session.recordings()}
                 if not there.issuperset(self.recordings):
                     raise
@@ -322,22 +322,22 @@ class Query:
         length: DurationLike | None = None,
         max_gap: DurationLike | None = None,
     ) -> Intervals:
-        """When the predicate of `where` holds: the longest intervals in which it does.
+        """The longest intervals in which the predicate of `where` holds.
 
-        At any time the state is what the last message of the topic by then says (by log
-        time, then arrival); before the first one it is unknown, and no interval. It goes
-        on until the next message, or the end of the recording. The range of `between`
-        cuts intervals off, and what held when it began is known from before. Without
-        `where`, any message holds: with `max_gap`, that is when the topic was alive.
+        At any time, the last message of the topic (by log time, then arrival) determines the
+        state. Before the first message the state is unknown, and no interval covers it.
+        A state lasts until the next message, or the end of the recording. The range of
+        `between` cuts intervals; the message before it determines the state at its start.
+        Without `where`, any message holds: `max_gap` then finds when the topic was active.
 
         Args:
             at_least: Only intervals of at least this length.
-            length: Each interval cut into as many of exactly this length as fit into it,
+            length: Each interval cut into as many pieces of exactly this length as fit,
                 one after the other from its beginning.
-            max_gap: A message is believed for this long; without, until the next one.
+            max_gap: Longest time for which a message is valid; by default, until the next one.
 
         Returns:
-            Their `messages` are those that satisfy the predicate.
+            Intervals; their `messages` are those that satisfy the predicate.
 
         Raises:
             UsageError: several topics, `limit`, `every`, `reverse`, or another clock than
@@ -353,29 +353,29 @@ class Query:
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
     ) -> Intervals:
-        """When fields changed: runs of messages that differ from the one before them.
+        """Changes of fields: runs of messages that differ from the one before them.
 
-        A step is a message of which any of the fields differs from that of the message
-        before it, of those that satisfy `where`, in the same recording. Steps with no more
-        than `pause` between them are one change, whatever lies between. A change begins
+        Steps are found among the messages of one recording that satisfy `where`. A step is a
+        message with any of the fields different from the message before it. Steps at most
+        `pause` apart belong to one change, whatever messages are between them. A change begins
         at the log time of its first step, and ends 1 ns after that of its last one.
 
         Args:
             fields: Paths (`position`, `position.x`); arrays are compared element by element.
             pause: Longest time between steps of one change.
-            tolerance: Numbers that differ by at most so much are the same.
+            tolerance: Numbers are equal if they differ by at most this.
 
         Returns:
-            Their `messages` are the steps.
+            Intervals; their `messages` are the steps.
 
         Raises:
-            TopicError: there is no such field.
+            TopicError: no such field exists.
             UsageError: no field, several topics, `limit`, `every`, `reverse`, or another
                 clock than the log's.
             TimeError: no duration, or a range outside of all recordings.
         """
         if not fields:
-            raise UsageError("Which fields? `hybridlog schema TOPIC` lists them.")
+            raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
         self.fields(*fields)  # refuses unknown fields
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)
@@ -383,14 +383,14 @@ class Query:
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
 
-        There is one a message, so they may overlap; `during` and `merged` join them.
+        One window per message: windows may overlap; `during` and `merged` join them.
 
         Args:
-            before: How long before it the window begins, a duration.
-            after: How long after it the window ends, a duration.
+            before: Time before the message, a duration.
+            after: Time after the message, a duration.
 
         Raises:
-            TimeError: one of both is no duration.
+            TimeError: `before` or `after` is no duration.
             UsageError: both are zero, or `limit` or `every` of several topics.
         """
         with self.counters.timed():
@@ -402,7 +402,7 @@ class Query:
         return IntervalQueries(self._session, self.question, self.counters)
 
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """In which spans of log time of a recording any message lies.
+        """Test which spans of log time of a recording contain any message.
 
         Args:
             recording: Id of the recording.
@@ -443,13 +443,13 @@ class Query:
         return frame
 
     def to_tables(self) -> Iterator[pa.Table]:
-        """The answer in order, in Arrow tables of bounded size; at least one, perhaps empty."""
+        """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
         from hybridlog.frames.answer import stream
 
         return stream(self._planner())
 
     def schema(self) -> pa.Schema | None:
-        """Columns of the tables, where only the messages tell; None where definitions do."""
+        """Columns of the tables where only messages determine them; None where definitions do."""
         from hybridlog.frames.answer import schema_of
 
         return schema_of(Planner(self._session, self.question, Counters()))
@@ -461,15 +461,15 @@ class Query:
         return lines(self._planner())
 
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
-        """Every message as an array (`Message.to_numpy`): stacked when all are alike."""
+        """Every message as an array (`Message.to_numpy`): stacked if all are alike."""
         arrays: list[NDArray[Any]] = [message.to_numpy() for message in self]
         alike = {(a.shape, a.dtype) for a in arrays}
         return np.stack(arrays) if len(alike) == 1 else arrays
 
-    # What is known without asking.
+    # Known without reading messages.
 
     def channels(self) -> list[RecordedChannel]:
-        """Every channel that the question is about."""
+        """Every channel of the question."""
         return Planner(self._session, self.question, self.counters).channels()
 
     def field_types(self) -> dict[str, str] | None:
@@ -477,19 +477,19 @@ class Query:
         return self._session.field_types(self.topics, self.recordings)
 
     def check_range(self) -> None:
-        """Make sure that the time range meets a recording.
+        """Check that the time range overlaps a recording.
 
         Raises:
-            TimeError: it is empty, or outside of all recordings.
+            TimeError: the range is empty, or outside all recordings.
         """
         RangeResolver(self._session, self.question).resolve()
 
     def size_hint(self) -> int:
-        """Bytes of payload, about: the total of a progress bar."""
+        """Approximate bytes of payload, for a progress bar."""
         parts = Planner(self._session, replace(self.question, clock="log"), Counters()).parts()
         return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
-    # How.
+    # Helpers.
 
     def _with(self, **changes: Any) -> Query:
         return Query(self._session, replace(self.question, **changes))

@@ -28,16 +28,16 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked. Immutable, hashable and picklable.
+    """The content of a question. Immutable, hashable and picklable.
 
     Attributes:
         topics: Full names of topics.
         recordings: Ids of recordings.
-        bounds: Time range `[begin, end)` as it was given; None for all times.
+        bounds: Time range `[begin, end)` as given; None for all times.
         clock: The clock that `bounds` refers to.
         predicate: Condition on the fields of a message; None for no condition.
-        limit: Most messages of the answer; None for no limit.
-        every: Keep every n-th message of each topic.
+        limit: Maximum number of messages in the answer; None for no limit.
+        every: Take every n-th message of each topic.
         reverse: Latest message first.
         fields: Field paths for tables; None for all.
         during: Intervals of log time that messages must lie in; None for all times.
@@ -56,17 +56,17 @@ class Question:
 
     @property
     def returns_all(self) -> bool:
-        """Whether every matching message is in the answer: neither `limit` nor `every`."""
+        """True if every matching message is in the answer: neither `limit` nor `every`."""
         return self.limit is None and self.every == 1
 
     @property
     def is_unbounded(self) -> bool:
-        """Whether all times are asked about: neither `between` nor `during`."""
+        """True if the question covers all times: neither `between` nor `during`."""
         return self.bounds is None and self.during is None
 
     @property
     def is_by_log_time(self) -> bool:
-        """Whether the time range, if any, refers to log time."""
+        """True if the time range, if any, refers to log time."""
         return self.bounds is None or self.clock == "log"
 
 
@@ -93,13 +93,13 @@ class RecordedChannel:
 
     @property
     def is_reduced(self) -> bool:
-        """Whether its messages kept their fields but gave up their payloads."""
+        """True if its messages have their fields but not their payloads."""
         return self.channel.message_encoding == REDUCED
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The share of a question that concerns one topic of one recording.
+    """The part of a question for one topic of one recording.
 
     Attributes:
         recording: The recording.
@@ -107,7 +107,7 @@ class Part:
         channels: The topic's channels.
         bounds: `[begin, end)` of `clock`, ns; None for all times.
         clock: The clock of `bounds`.
-        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all times.
+        windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
         predicate: Condition on the fields; None for no condition.
     """
 
@@ -121,17 +121,17 @@ class Part:
 
     @property
     def is_unbounded(self) -> bool:
-        """Whether it covers all times of the recording."""
+        """True if the part covers all times of the recording."""
         return self.bounds is None and self.windows is None
 
     @property
     def is_by_log_time(self) -> bool:
-        """Whether its bounds, if any, refer to log time."""
+        """True if the bounds, if any, refer to log time."""
         return self.bounds is None or self.clock == "log"
 
     @property
     def stats(self) -> list[ChannelStats]:
-        """Statistics of its channels, without those that have no messages."""
+        """Statistics of its channels, except those without messages."""
         wanted = {channel.channel_id for channel in self.channels}
         return [c.stats for c in self.recording.channels if c.id in wanted]
 
@@ -147,7 +147,7 @@ class Part:
 
     @cached_property
     def log_windows(self) -> NDArray[np.int64]:
-        """int64[n, 2]: the log time it covers; bounds of another clock do not narrow it."""
+        """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
         low, high = self.bounds if self.bounds and self.clock == "log" else (0, TIME_LIMIT - 1)
         if self.windows is None:
             return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
@@ -156,7 +156,7 @@ class Part:
 
     @property
     def share(self) -> float:
-        """Fraction of the topic's time that it covers, 0 to 1."""
+        """Fraction of the topic's time in the part, 0 to 1."""
         firsts = [s.first for s in self.stats if s.first is not None]
         lasts = [s.last for s in self.stats if s.last is not None]
         if not firsts:
@@ -171,7 +171,7 @@ def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
     types: dict[str, str] = {}
     for channel in channels:
         if channel.is_reduced:
-            continue  # its fields are those of whole messages
+            continue  # its fields are those of complete messages
         paths = channel.codec.paths()
         if not paths:
             return None

@@ -34,7 +34,7 @@ class RangeResolver:
         """Each recording with its bounds on the question's clock and its windows of log time.
 
         Raises:
-            TimeError: the range is empty, or outside of all recordings.
+            TimeError: the range is empty, or outside all recordings.
         """
         question = self._question
         found = []
@@ -55,16 +55,16 @@ class RangeResolver:
         return found
 
     def spans(self) -> list[tuple[RecordingEntry, Span]]:
-        """The log time `[begin, end)`, ns, of each recording that is asked about.
+        """The log time `[begin, end)`, ns, of each recording of the question.
 
         Raises:
-            TimeError: the range is empty, or outside of all recordings.
+            TimeError: the range is empty, or outside all recordings.
             UsageError: the range refers to another clock.
         """
         question = self._question
         if not question.is_by_log_time:
             raise UsageError(
-                f"Intervals are of log time; a range by {question.clock} does not fit."
+                f"Intervals use log time; a range cannot use the {question.clock} clock."
             )
         found: list[tuple[RecordingEntry, Span]] = []
         for recording, bounds, windows in self.resolve():
@@ -85,7 +85,7 @@ class RangeResolver:
         return found
 
     def beginnings(self) -> Iterator[tuple[RecordingEntry, int]]:
-        """Recordings in which the range begins after the recording does, and when, ns."""
+        """Recordings that begin before the range does, and the beginning of the range, ns."""
         if self._question.clock != "log" and self._question.bounds is not None:
             return
         seen: set[str] = set()
@@ -97,7 +97,7 @@ class RangeResolver:
     def bounds_in(self, recording: RecordingEntry) -> Span | None:
         """The range in one recording, ns; None for all times.
 
-        It may be empty: `2025-01-01` to `end` is, in a recording of the year before.
+        It may be empty: for example `2025-01-01` to `end`, in a recording of 2024.
         """
         if self._question.bounds is None:
             return None
@@ -109,7 +109,7 @@ class RangeResolver:
         )
 
     def _clock_span(self, recording: RecordingEntry) -> Span:
-        """`[first, end)` of the topics asked about, on the clock asked for."""
+        """`[first, end)` of the question's topics, on the question's clock."""
         clock: Clock = self._question.clock
         if clock == "log":
             return span_of(recording)
@@ -127,23 +127,23 @@ class RangeResolver:
         return max(first, 0), min(last + 1, TIME_LIMIT - 1)
 
     def _is_outside(self, bounds: Span, recording: RecordingEntry) -> bool:
-        """Whether a range is empty, or does not meet the recording on the log clock."""
+        """True if a range is empty, or does not overlap the recording on the log clock."""
         start, end = span_of(recording)
         beside = self._question.clock == "log" and (bounds[0] >= end or bounds[1] <= start)
         return beside or bounds[0] >= bounds[1]
 
     def _refuse(self, outside: Sequence[tuple[RecordingEntry, Span]]) -> None:
-        """Refuse a range that meets no recording.
+        """Refuse a range that overlaps no recording.
 
         Raises:
-            TimeError: it ends before it begins, or lies outside of all recordings.
+            TimeError: it ends before it begins, or is outside all recordings.
         """
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
         spans = []
         for recording, (low, high) in outside:
             start, end = self._clock_span(recording)
-            # `2025-01-01` to `end` is no mistake: the recording only ends before.
+            # `2025-01-01` to `end` is no mistake: the recording simply ends before.
             if low < high or low == start or high == end:
                 spans.append(f"{recording.label} spans {format_time(start)} to {format_time(end)}")
         if not spans:

@@ -1,4 +1,4 @@
-"""Chunks that were read for one message each, kept for whoever looks around in a log."""
+"""A cache of chunks that were read for single messages."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _ROW_BYTES = 44  # of a message's columns
 
 
 class RecentChunks:
-    """The chunks that were asked for last. Thread safe.
+    """The most recently used chunks. Thread safe.
 
-    A message at a time is mostly followed by one close to it, which the same chunk holds:
-    to read and unpack it takes longer than all else. Chunks do not change, so what is kept
-    is what lies in the segment; its buffer cannot be written to.
+    The next message requested is usually close by, in the same chunk, and reading and
+    decompressing the chunk dominates the cost. Chunks do not change, so the cached
+    content equals the segment's; its buffer is read-only.
 
     Args:
-        most_bytes: Of all that are kept; a larger chunk is not.
+        most_bytes: Maximum size of the cache; larger chunks are not cached.
     """
 
     def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
@@ -33,11 +33,11 @@ class RecentChunks:
         self._lock = threading.Lock()
 
     def get(self, key: ChunkKey, read: Callable[[], StoredChunk]) -> StoredChunk:
-        """A chunk, read if it is not here.
+        """A chunk, read if it is not cached.
 
         Args:
-            key: Where it lies.
-            read: Reads it; nobody else has it.
+            key: Location of the chunk.
+            read: Reads the chunk; the result has no other owner.
         """
         with self._lock:
             found = self._chunks.get(key)
@@ -45,14 +45,14 @@ class RecentChunks:
                 self._chunks.move_to_end(key)
                 return found
         chunk = read()
-        # Arrays of messages lie over the buffer: who changes one must not change what is kept.
+        # Arrays of messages share the buffer: changes to them must not change the cache.
         chunk.batch.buffer = memoryview(chunk.batch.buffer).toreadonly()
         with self._lock:
             self._keep(key, chunk)
         return chunk
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Forget all chunks."""
         with self._lock:
             self._chunks.clear()
             self._bytes = 0
@@ -60,7 +60,7 @@ class RecentChunks:
     def _keep(self, key: ChunkKey, chunk: StoredChunk) -> None:
         size = _size(chunk)
         if key in self._chunks or size > self._most_bytes:
-            return  # another thread has read it meanwhile, or all others would have to go
+            return  # another thread has read it meanwhile, or it would evict all others
         self._chunks[key] = chunk
         self._bytes += size
         while self._bytes > self._most_bytes:

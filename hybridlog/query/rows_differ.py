@@ -1,4 +1,4 @@
-"""Which rows of Arrow columns differ: numbers by value, strings by their bytes, lists by both."""
+"""Comparison of rows of Arrow columns: numbers by value, strings by bytes, lists by both."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def rows_differ(
 ) -> NDArray[np.bool_]:
     """Compare rows of a column with other rows of it.
 
-    NaN equals NaN, -0 equals 0, and null equals null only. Lists of different lengths differ.
+    NaN equals NaN, -0 equals 0, and null equals only null. Lists of different lengths differ.
 
     Args:
-        column: The column, nested as it may be.
+        column: The column, possibly nested.
         one: intp[n], rows.
-        other: intp[n], the rows that they are compared with.
-        tolerance: Numbers that differ by at most this are the same.
+        other: intp[n], the rows to compare them with.
+        tolerance: Numbers are equal if they differ by at most this.
 
     Returns:
-        bool[n], whether they differ.
+        bool[n], True where they differ.
     """
     kind = column.type
     if pa.types.is_null(kind):
@@ -66,7 +66,7 @@ def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> 
     if left.dtype.kind == "f":
         same |= np.isnan(left) & np.isnan(right)
     if tolerance and left.dtype.kind in "iuf" and pa.types.is_primitive(kind):
-        with np.errstate(invalid="ignore"):  # inf less inf is no number, and not near
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is not near
             same |= np.abs(left.astype(np.float64) - right.astype(np.float64)) <= tolerance
     differs: NDArray[np.bool_] = ~same
     return differs
@@ -75,7 +75,7 @@ def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> 
 def _lists(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> NDArray[np.bool_]:
     length = pc.fill_null(pc.list_value_length(column), 0).to_numpy(zero_copy_only=False)
     length = length.astype(np.int64)
-    start = np.cumsum(length) - length  # of the elements that `flatten` keeps
+    start = np.cumsum(length) - length  # of the elements that `flatten` returns
     elements = column.flatten()
     count = length[one]
     found: NDArray[np.bool_] = count != length[other]

@@ -1,9 +1,9 @@
-"""Times as people write them, turned into integer nanoseconds, exactly.
+"""Times in the forms that people write, converted exactly to integer nanoseconds.
 
-A time is nanoseconds since the Unix epoch, `0 <= t < 2**63`. No text goes through a
-float: `1425407313.123456789` keeps its last digit.
+A time is nanoseconds since the Unix epoch, `0 <= t < 2**63`. No text is converted through
+a float: `1425407313.123456789` retains its last digit.
 
-What `parse_time` takes:
+Forms that `parse_time` accepts:
 
 | written | means |
 |---|---|
@@ -16,10 +16,10 @@ What `parse_time` takes:
 | `5000000000ns` | nanoseconds since the epoch, whatever the size (simulated clocks start at 0) |
 | `+5s`, `+1m30s`, `+500ms`, `+5`, `1m30s` | from the start of the recording (`+5` is seconds) |
 | `-10s`, `-10` | before the end of the recording |
-| `start`, `end`, `now` | as they say |
+| `start`, `end`, `now` | start and end of the recording, current time |
 
-Without a zone a date is UTC on every machine, because logs travel between zones. A blank
-may stand for the `T`.
+A date without a zone is UTC on every machine, because logs travel between zones. A space
+may replace the `T`.
 
 A bare number without a unit is always counted from the epoch, a number with a unit from
 the start of the recording.
@@ -47,13 +47,13 @@ if TYPE_CHECKING:
 TimeLike: TypeAlias = (
     "str | int | float | date | np.datetime64 | np.integer[Any] | np.floating[Any]"
 )
-"""What `parse_time` takes; `datetime` and `pandas.Timestamp` are dates."""
+"""Types that `parse_time` accepts; `datetime` and `pandas.Timestamp` are dates."""
 
 DurationLike: TypeAlias = "str | float | timedelta"
-"""What `parse_duration` takes."""
+"""Types that `parse_duration` accepts."""
 
 TIME_LIMIT = 2**63
-"""Times lie below this many nanoseconds (the year 2262)."""
+"""Times are less than this many nanoseconds (the year 2262)."""
 
 ACCEPTED = (
     "write a time as ISO 8601 (2015-03-03T18:28:33.5Z, UTC when no zone is given; "
@@ -108,12 +108,12 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
         text: A time in one of the forms of this module's table, an int (nanoseconds since
             the epoch), a float (seconds since the epoch, by its shortest decimal form), a
             `datetime` or `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
-        start: Where `+5s` counts from, nanoseconds; None when there is no recording.
-        end: Where `-10s` counts from, nanoseconds: one past the last message, so that
-            `[start, end)` is everything. A time before the epoch becomes 0.
+        start: Origin of `+5s`, nanoseconds; None without a recording.
+        end: Origin of `-10s`, nanoseconds: one past the last message, which makes
+            `[start, end)` the whole recording. A time before the epoch becomes 0.
 
     Raises:
-        TimeError: Not a time, outside of `[0, 2**63)`, or relative to nothing.
+        TimeError: not a time, outside `[0, 2**63)`, or relative without a recording.
     """
     if isinstance(text, str):
         return _checked(_parse_text(text, start, end), text)
@@ -134,13 +134,13 @@ def parse_range(
     """A half-open range `[begin, stop)` in nanoseconds.
 
     Args:
-        begin: First time of the range; None for `start`, or 0 when that is unknown.
+        begin: First time of the range; None for `start`, or 0 if that is unknown.
         stop: First time after the range; None for `end`, or 2**63 - 1.
-        start: First log time there is, for relative times.
-        end: One past the last log time there is, for relative times.
+        start: First log time, for relative times.
+        end: One past the last log time, for relative times.
 
     Raises:
-        TimeError: One of both is no time, or the range is empty.
+        TimeError: `begin` or `stop` is no time, or the range is empty.
     """
     low = (start or 0) if begin is None else parse_time(begin, start=start, end=end)
     if stop is not None:
@@ -165,11 +165,11 @@ def parse_between(
 
     Args:
         between: `"t0..t1"` or a sequence of two times.
-        start: First log time there is, for relative times.
-        end: One past the last log time there is, for relative times.
+        start: First log time, for relative times.
+        end: One past the last log time, for relative times.
 
     Raises:
-        TimeError: Not two times, or an empty range.
+        TimeError: not two times, or an empty range.
     """
     parts: Sequence[TimeLike]
     if isinstance(between, str):
@@ -185,14 +185,14 @@ def parse_between(
 
 
 def parse_duration(text: DurationLike) -> int:
-    """A length of time in nanoseconds, not negative.
+    """A duration in nanoseconds, not negative.
 
     Args:
-        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`; parts stand in
-            falling order, each may have a fraction; a number without unit is seconds.
+        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`. Units are in descending
+            order, each number may have a fraction; a number without unit is seconds.
 
     Raises:
-        TimeError: Not a duration, negative, finer than a nanosecond, or 2**63 and more.
+        TimeError: not a duration, negative, finer than a nanosecond, or 2**63 or more.
     """
     if isinstance(text, str):
         ns = _duration(text.strip()) if len(text) <= _LONGEST_TEXT else None
@@ -223,9 +223,9 @@ def format_time(ns: int) -> str:
 
 
 def format_duration(ns: int) -> str:
-    """A length of time as `parse_duration` reads it: `1h2m3.5s`, `12.5ms`, `250ns`, `0s`.
+    """A duration in the form that `parse_duration` reads: `1h2m3.5s`, `12.5ms`, `250ns`, `0s`.
 
-    A negative one, which only differences are, gets a leading minus.
+    A negative one, which only occurs as a difference, has a leading minus.
     """
     ns = int(ns)
     if ns < 0:
@@ -270,7 +270,7 @@ def _parse_text(text: str, start: int | None, end: int | None) -> int:
 
 
 def _absolute(word: str) -> int | None:
-    """A date or a number since the epoch; None when it is neither."""
+    """A date or a number since the epoch; None if the word is neither."""
     if number := _NUMBER.fullmatch(word):
         return _scaled(int(number[1]), number[2] or "", word)
     if nanoseconds := _NS.fullmatch(word):
@@ -293,14 +293,14 @@ def _relative(word: str, start: int | None, end: int | None) -> int:
 def _base(base: int | None, word: str) -> int:
     if base is None:
         raise TimeError(
-            f"{_shown(word)} counts from a recording, and there is none with messages: "
+            f"{_shown(word)} is relative to a recording, and none has messages: "
             "write a date or a number since the epoch"
         )
     return base
 
 
 def _scaled(whole: int, fraction: str, word: str = "") -> int:
-    """A number since the epoch: seconds when small, nanoseconds when large."""
+    """A number since the epoch: seconds if small, nanoseconds if large."""
     if whole >= _NANOSECONDS_FROM:
         if fraction.strip("0"):
             raise TimeError(
@@ -332,21 +332,21 @@ def _from_iso(iso: re.Match[str], word: str) -> int:
             tzinfo=UTC,
         )
     except ValueError as error:
-        raise TimeError(f"{_shown(word)} is no date there is: {error}") from None
+        raise TimeError(f"{_shown(word)} is no valid date: {error}") from None
     seconds = calendar.timegm(moment.timetuple())
     zone = iso["zone"]
     if zone and zone[0] in "+-":
         digits = zone[1:].replace(":", "").ljust(4, "0")
         hours, minutes = int(digits[:2]), int(digits[2:])
         if hours > 23 or minutes > 59:
-            raise TimeError(f"{_shown(word)} has no zone there is: {zone}")
+            raise TimeError(f"{_shown(word)} has no valid zone: {zone}")
         shift = hours * 3_600 + minutes * 60
         seconds -= shift if zone[0] == "+" else -shift
     return seconds * _SECOND + _nanoseconds(iso["fraction"], word)
 
 
 def _duration(word: str) -> int | None:
-    """Nanoseconds of an unsigned duration; None when it is none."""
+    """Nanoseconds of an unsigned duration; None if the word is no duration."""
     if number := _NUMBER.fullmatch(word):
         return int(number[1]) * _SECOND + _nanoseconds(number[2], word)
     match = _DURATION.fullmatch(word)
@@ -369,7 +369,7 @@ def _duration(word: str) -> int | None:
 def _from_float(number: float) -> int:
     if not math.isfinite(number) or not 0 <= number < TIME_LIMIT:
         raise TimeError(f"{number!r} is not a time: {ACCEPTED}")
-    # The shortest decimal that names this float is what was typed.
+    # The shortest decimal of this float is the text that the user typed.
     exact = Decimal(repr(number))
     return _rounded(exact if exact >= _NANOSECONDS_FROM else exact * _SECOND)
 

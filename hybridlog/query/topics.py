@@ -1,4 +1,4 @@
-"""Topic names as people write them.
+"""Topic names in the forms that people write them.
 
 A pattern is one of:
 
@@ -11,7 +11,7 @@ A pattern is one of:
 * `re:` and a regular expression in RE2's syntax, which must match the whole name; at most
   200 characters.
 
-A name that exists is always that topic, whatever characters it has.
+The full name of an existing topic always means that topic, whatever characters it has.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _LONGEST_REGEX = 200
 
 
 def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
-    """The topics that the patterns name, in the order of the patterns, each once.
+    """The topics that the patterns match, in the order of the patterns, without duplicates.
 
-    A short name is tried as it is written, then without regard to case, and must name
-    one topic. A glob or `re:` gives all its topics in alphabetical order.
+    A short name is compared with case first, then without, and must match one topic.
+    A glob or `re:` returns all its topics in alphabetical order.
 
     Args:
-        patterns: What the user wrote; none gives no topics.
-        topics: The topics there are.
+        patterns: Patterns of the user; without any, the result is empty.
+        topics: All existing topics.
 
     Raises:
-        TopicError: A pattern that names nothing or, as a short name, several topics;
+        TopicError: a pattern that matches no topic or, as a short name, several topics;
             the message lists candidates.
     """
     known = sorted(set(topics))
@@ -48,16 +48,16 @@ def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
 
 
 class TopicMatcher:
-    """Says of each topic whether it is wanted, when the topics are not known before.
+    """Tests each topic as it appears, if the topics are not known in advance.
 
-    A short name matches every topic that ends with it, case counts.
+    A short name matches every topic that ends with it, case-sensitively.
 
     Args:
         include: Patterns; none means all topics.
-        exclude: Patterns of topics that are not wanted although included.
+        exclude: Patterns of topics to leave out of the included ones.
 
     Raises:
-        TopicError: A pattern that is malformed.
+        TopicError: a malformed pattern.
     """
 
     def __init__(self, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
@@ -66,18 +66,18 @@ class TopicMatcher:
         self._used: set[str] = set()
 
     def __call__(self, topic: str) -> bool:
-        """Whether the topic is wanted."""
+        """True if the topic is wanted."""
         included = self._any(self._include, topic) or not self._include
         excluded = self._any(self._exclude, topic)
         return included and not excluded
 
     def unused(self) -> list[str]:
-        """The patterns that have matched no topic so far, as they were given."""
+        """The patterns that have matched no topic so far, as given."""
         patterns = dict.fromkeys((*self._include, *self._exclude))
         return [pattern for pattern in patterns if pattern not in self._used]
 
     def _any(self, table: dict[str, Callable[[str], bool]], topic: str) -> bool:
-        # Every pattern is tried, so that `unused` tells of each.
+        # Every pattern is tested, which makes `unused` complete.
         hits = [pattern for pattern, matches in table.items() if matches(topic)]
         self._used.update(hits)
         return bool(hits)
@@ -104,7 +104,7 @@ def _resolve_one(pattern: str, known: list[str]) -> list[str]:
         wanted = fold(pattern)
         whole = [topic for topic in known if fold(topic) in {wanted, "/" + wanted}]
         hits = whole or [topic for topic in known if fold(topic).endswith("/" + wanted)]
-        # A leading slash says that the name is meant to be whole.
+        # A leading slash marks a full name.
         if pattern.startswith("/"):
             hits = whole
         if len(hits) == 1:
@@ -118,7 +118,7 @@ def _resolve_one(pattern: str, known: list[str]) -> list[str]:
 
 
 def _matches(pattern: str) -> Callable[[str], bool]:
-    """A test of one full topic name."""
+    """A test for one full topic name."""
     _check_length(pattern)
     if pattern.startswith("re:"):
         compiled = _regex(pattern)
@@ -155,7 +155,7 @@ def _regex(pattern: str) -> Regex:
         ) from None
 
 
-# A glob is a list of tokens: a test of one character, and whether it may repeat.
+# A glob is a list of tokens: a test for one character, and a flag for repetition.
 _Token = tuple[Callable[[str], bool], bool]
 
 
@@ -214,10 +214,10 @@ def _glob_class(pattern: str, at: int) -> tuple[Callable[[str], bool], int]:
 
 
 def _glob_match(tokens: list[_Token], name: str, *, anchored: bool) -> bool:
-    """Whether the tokens cover the name or, unless anchored, whole parts at its end.
+    """True if the tokens match the name or, unless anchored, whole parts at its end.
 
-    All ways through the glob are followed at once, so the time is at most the length of
-    the name times the length of the glob.
+    All paths through the glob are followed in parallel, which limits the time to the length
+    of the name times the length of the glob.
     """
     states = _skip_repeats(tokens, {0})
     for index, char in enumerate(name):
@@ -232,7 +232,7 @@ def _glob_match(tokens: list[_Token], name: str, *, anchored: bool) -> bool:
 
 
 def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
-    """Add the states that are reached because a repetition may be empty."""
+    """Add the states that are reachable because a repetition may be empty."""
     reached = set(states)
     for state in states:
         following = state
@@ -245,7 +245,7 @@ def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
 def _unknown(pattern: str, known: list[str]) -> str:
     import difflib
 
-    # Compared by last part and in lower case too: `/scna` is near `/base/scan`.
+    # Compared by last part and in lower case, too: `/scna` is near `/base/scan`.
     nearest: dict[str, None] = {}
     wanted = pattern.casefold().strip("/")
     last = wanted.rsplit("/", 1)[-1]

@@ -1,6 +1,6 @@
 """Columns of the wire reader as Arrow arrays, without copying numbers."""
 
-# Where stubs for pyarrow are installed, they know too little of its buffers.
+# Where stubs for pyarrow are installed, they are incomplete for its buffers.
 # mypy: disable-error-code="no-any-return, arg-type, call-overload, return-value, assignment"
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OFFSET_LIMIT = 2**31 - 1
 
 
 def array_of(column: Column) -> pa.Array[Any]:
-    """One chunk's column as an Arrow array, nested as it is.
+    """One chunk's column as an Arrow array of the same nesting.
 
     Strings and lists of more than 2^31 elements get 64-bit offsets.
     """
@@ -42,7 +42,7 @@ def array_of(column: Column) -> pa.Array[Any]:
 
 
 def records_array(records: Records) -> pa.StructArray:
-    """Records as a struct array: one row a message."""
+    """Records as a struct array, one row for each message."""
     return structs({name: array_of(c) for name, c in records.fields.items()}, records.rows)
 
 
@@ -61,12 +61,12 @@ def numbers(
 def structs(
     fields: Mapping[str, pa.Array[Any]], rows: int, missing: NDArray[np.bool_] | None = None
 ) -> pa.StructArray:
-    """Fields side by side, also when there are none.
+    """Fields side by side; the number of fields may be zero.
 
     Args:
         fields: Arrays of `rows` rows.
         rows: Number of rows.
-        missing: bool[rows], which rows are null.
+        missing: bool[rows], True for null rows.
     """
     kind = pa.struct([pa.field(name, array.type) for name, array in fields.items()])
     return pa.Array.from_buffers(kind, rows, [_validity(missing)], children=list(fields.values()))
@@ -102,7 +102,7 @@ def _strings(strings: Strings) -> pa.Array[Any]:
 
 
 def _validity(missing: NDArray[np.bool_] | None) -> pa.Buffer | None:
-    """Arrow's bitmap of the rows that are there."""
+    """Arrow's bitmap of the valid rows."""
     if missing is None or not missing.any():
         return None
     return pa.py_buffer(np.packbits(~missing, bitorder="little"))

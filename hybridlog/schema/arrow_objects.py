@@ -1,9 +1,9 @@
 """Python objects as Arrow arrays: the exact values of JSON and protobuf messages.
 
-A value that is missing and one that is null are both null in Arrow. A column of one kind
+Missing values and null values are both null in Arrow. A column with one kind
 of value has that type. A column without a common exact type is JSON text
-(`pa.json_()`): values of different kinds, integers beyond 64 bits, and fractions beside
-integers that a double would round.
+(`pa.json_()`). Examples are values of different kinds, integers beyond 64 bits, and
+integers that a double would round beside fractions.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 EXACT = 1 << 53
-"""A double holds every integer up to this, and not the next one."""
+"""A double represents every integer up to this one, and not the next."""
 MAX_NAMES = 10_000
-"""Objects within a message that have more different names are JSON text."""
+"""Objects within a message with more different names than this are JSON text."""
 _INT64, _UINT64 = np.iinfo(np.int64), np.iinfo(np.uint64)
 
 
@@ -35,8 +35,8 @@ def objects_array(
     """Messages as a struct array.
 
     Args:
-        objects: One a row.
-        wanted: Paths of the fields that are wanted; None for all.
+        objects: One for each row.
+        wanted: Paths of the fields to convert; None for all.
     """
     return cast("pa.StructArray", _structs(objects, wanted, 1))
 
@@ -44,11 +44,11 @@ def objects_array(
 def values_array(
     values: Sequence[Any], wanted: Sequence[Sequence[str]] | None = None, depth: int = 1
 ) -> pa.Array[Any]:
-    """Values of any kind as one array, None as null.
+    """Values of any kind as one array, with None as null.
 
     Args:
         values: Objects, lists, strings, bytes, numbers, booleans, None.
-        wanted: Paths within objects that are wanted; None for all.
+        wanted: Paths within objects to convert; None for all.
         depth: Levels above these values.
     """
     kinds = {_kind(kind) for kind in set(map(type, values))} - {type(None)}
@@ -71,7 +71,7 @@ def values_array(
 
 
 def times_array(values: Sequence[int | None], kind: str) -> pa.Array[Any]:
-    """Times or durations in nanoseconds; JSON text when 64 bits do not hold them."""
+    """Times or durations in nanoseconds; JSON text if they exceed 64 bits."""
     present = [value for value in values if value is not None]
     if present and not (_INT64.min <= min(present) and max(present) <= _INT64.max):
         return json_array(values)
@@ -79,20 +79,20 @@ def times_array(values: Sequence[int | None], kind: str) -> pa.Array[Any]:
 
 
 def json_array(values: Sequence[Any]) -> pa.Array[Any]:
-    """Values as JSON text, None as null."""
+    """Values as JSON text, with None as null."""
     texts = [None if value is None else json_text(value) for value in values]
     return pa.ExtensionArray.from_storage(pa.json_(), pa.array(texts, pa.string()))
 
 
 def missing_rows(values: Sequence[object]) -> NDArray[np.bool_] | None:
-    """Rows that are None; None when there are none."""
+    """Mask of the rows that are None; None if there are none."""
     if None not in values:
         return None
     return np.fromiter((value is None for value in values), np.bool_, len(values))
 
 
 def offsets_of(rows: Sequence[Sequence[object] | None]) -> NDArray[np.int64]:
-    """Places of the elements of each row, int64[n + 1]."""
+    """Offsets of the elements of each row, int64[n + 1]."""
     offset = np.zeros(len(rows) + 1, np.int64)
     np.cumsum([0 if row is None else len(row) for row in rows], out=offset[1:])
     return offset
@@ -157,7 +157,7 @@ def _structs(
 
 
 def below(wanted: Sequence[Sequence[str]] | None, name: str) -> Sequence[Sequence[str]] | None:
-    """What is wanted of a field that is wanted; None for all."""
+    """The wanted paths below a wanted field; None for all."""
     if wanted is None:
         return None
     rest = [path[1:] for path in wanted if path[0] == name]

@@ -1,8 +1,8 @@
-"""Protobuf messages as Arrow arrays, of the types that their definition names.
+"""Protobuf messages as Arrow arrays, of the types in their definition.
 
 `bytes` are binary, lists of messages lists of structs, `Timestamp` and `Duration` times.
-A map is a struct with a field for each key. A field that tracks its presence and is not
-set is null.
+A map is a struct with a field for each key. An unset field that tracks its presence is
+null.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _ARROW = {
     },
 }
 _MAX_UNSET = 10_000
-"""Fields of messages that no row has and that get a type all the same."""
+"""Maximum number of fields that no row has and that still get a type."""
 
 
 def messages_array(
@@ -53,15 +53,15 @@ def messages_array(
     """Messages of one type as a struct array.
 
     Args:
-        descriptor: Their type.
-        messages: One a row.
-        wanted: Paths of the fields that are wanted; None for all.
+        descriptor: Type of the messages.
+        messages: One for each row.
+        wanted: Paths of the fields to convert; None for all.
     """
     return cast("pa.StructArray", _Builder().messages(descriptor, messages, wanted, ()))
 
 
 class _Builder:
-    """Builds the arrays of one call, and bounds what a definition alone can unfold to."""
+    """Builds the arrays of one call, and limits the expansion of a definition."""
 
     def __init__(self) -> None:
         self._unset = 0
@@ -73,7 +73,7 @@ class _Builder:
         wanted: Wanted,
         above: tuple[str, ...],
     ) -> pa.Array[Any]:
-        """Messages of one type; null where one is None, or in all rows of an unset recursion."""
+        """Messages of one type; null for None, and in all rows of an unset recursion."""
         missing = missing_rows(messages)
         if above and (missing is None or missing.all()) and not any(messages):
             self._unset += len(descriptor.fields)
@@ -133,7 +133,7 @@ class _Builder:
         wanted: Wanted,
         above: tuple[str, ...],
     ) -> pa.Array[Any]:
-        """One value a row."""
+        """One value for each row."""
         if not is_message(field):
             return pa.array(values, _ARROW[TYPES[field.type]])
         kind = TIMES.get(field.message_type.full_name)

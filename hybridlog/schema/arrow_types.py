@@ -1,9 +1,9 @@
 """The common exact type of Arrow arrays, and arrays converted to it.
 
-A conversion never rounds. Integers become the narrowest integer that holds all of them,
-and doubles only beside doubles and within 2^53. Times beside integers become integers of
-nanoseconds. Structs get the fields of all. What has no common exact type becomes JSON
-text (`pa.json_()`).
+A conversion never rounds. Integers become the narrowest integer type for all of them.
+They become doubles only beside doubles and within 2^53. Times beside integers become
+integers of nanoseconds. Structs get the fields of all. Values without a common exact type
+become JSON text (`pa.json_()`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _types = pa.types
 
 
 def common_type(arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    """The type that holds the values of all arrays exactly."""
+    """The type that represents the values of all arrays exactly."""
     kinds = list(dict.fromkeys(array.type for array in arrays))
     if len(kinds) > 1 and pa.null() in kinds:
         kinds.remove(pa.null())
@@ -43,16 +43,16 @@ def common_type(arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
     found = pa.json_() if merge is None else merge(kinds, arrays)
     if found != pa.json_():
         return found
-    # The type of an array without values, such as the elements of empty lists, is no matter.
+    # The type of an array without values, such as the elements of empty lists, is irrelevant.
     valued = [array for array in arrays if array.null_count < len(array)]
     return common_type(valued) if 0 < len(valued) < len(arrays) else found
 
 
 def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
-    """One schema that holds the values of all tables exactly, columns as they appear.
+    """One schema that represents the values of all tables exactly, columns in first-seen order.
 
     Args:
-        tables: Each is let go before the next one is taken.
+        tables: Each is released before the next one is taken.
     """
     fields: dict[str, pa.Field] = {}
     seen: dict[str, dict[pa.DataType, pa.Array[Any]]] = {}
@@ -70,10 +70,10 @@ def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
 
 
 def converted(array: pa.Array[Any], kind: pa.DataType) -> pa.Array[Any]:
-    """The values of an array in a type that holds them.
+    """The values of an array in another type that represents them.
 
     Raises:
-        pa.ArrowInvalid: The type does not hold them exactly.
+        pa.ArrowInvalid: the type does not represent them exactly.
     """
     if array.type == kind:
         return array
@@ -91,7 +91,7 @@ def converted(array: pa.Array[Any], kind: pa.DataType) -> pa.Array[Any]:
 
 
 def extremes(array: pa.Array[Any]) -> pa.Array[Any]:
-    """Two rows that have the same common type with other arrays as all rows have."""
+    """Two rows that determine the same common type as all rows."""
     kind = array.type
     if _types.is_integer(kind) and len(array):
         found = pc.min_max(array)
@@ -121,14 +121,14 @@ def _example(array: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def is_list(kind: pa.DataType) -> bool:
-    """Whether a type is a list, of whatever length and offsets."""
+    """True if a type is a list, of any length and offset type."""
     return bool(
         _types.is_list(kind) or _types.is_large_list(kind) or _types.is_fixed_size_list(kind)
     )
 
 
 def missing_of(array: pa.Array[Any]) -> NDArray[np.bool_] | None:
-    """Rows of an array that are null; None when there are none."""
+    """Mask of the null rows of an array; None if there are none."""
     if not array.null_count:
         return None
     missing: NDArray[np.bool_] = array.is_null().to_numpy(zero_copy_only=False)
@@ -136,14 +136,14 @@ def missing_of(array: pa.Array[Any]) -> NDArray[np.bool_] | None:
 
 
 def lengths_of(array: pa.Array[Any]) -> NDArray[np.int64]:
-    """Elements of each row of a list array; null rows have none."""
+    """Number of elements of each row of a list array; 0 for null rows."""
     lengths = pc.fill_null(pc.list_value_length(array), 0).cast(pa.int64())
     counts: NDArray[np.int64] = lengths.to_numpy(zero_copy_only=False)
     return counts
 
 
 def with_values(array: pa.Array[Any], values: pa.Array[Any]) -> pa.Array[Any]:
-    """Lists of the lengths of a list array, with other elements.
+    """Lists of the same lengths as those of a list array, with other elements.
 
     Args:
         array: The list array.
@@ -155,9 +155,9 @@ def with_values(array: pa.Array[Any], values: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def plain_values(array: pa.Array[Any]) -> list[Any]:
-    """Values as JSON has them, NaN apart: times in nanoseconds, bytes in base64.
+    """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
 
-    Fields of structs that are null are left out.
+    Null fields of structs are left out.
     """
     kind = array.type
     if kind == pa.json_():
@@ -220,7 +220,7 @@ def _is_time(kind: pa.DataType) -> bool:
 
 
 def _is_number(kind: pa.DataType) -> bool:
-    """A number, or a time, which is one of nanoseconds."""
+    """True for a number, or a time, which is a number of nanoseconds."""
     return bool(_types.is_integer(kind) or _types.is_floating(kind) or _is_time(kind))
 
 
@@ -264,7 +264,7 @@ def _merged_integers(kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any
 
 
 def _range(arrays: Any) -> tuple[int, int]:
-    """Least and greatest integer of some arrays, zero included."""
+    """Least and greatest integer of some arrays, including zero."""
     low = high = 0
     for array in arrays:
         found = pc.min_max(array)

@@ -174,8 +174,8 @@ def parse_definition(schema: Schema) -> MessageType:
         schema: Name, encoding and text of the source.
 
     Raises:
-        DefinitionError: It is missing or malformed, refers to unknown types or to itself,
-            unfolds to too many fields, or uses a type without a portable wire form.
+        DefinitionError: it is missing or malformed, refers to unknown types or to itself,
+            has too many fields, or uses a type without a portable wire form.
     """
     if not schema.encoding:
         raise DefinitionError(f"{schema.name}: no definition in the source")

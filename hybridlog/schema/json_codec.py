@@ -44,7 +44,7 @@ class JsonCodec:
         self._limit = array_limit
 
     def paths(self) -> list[FieldPath]:
-        """No fields are known: a message may hold any content."""
+        """No fields: a message may have any content."""
         return []
 
     def bodies(
@@ -68,7 +68,7 @@ class JsonCodec:
         """Decode the JSON text into Python objects.
 
         Raises:
-            PayloadError: It is not JSON.
+            PayloadError: the payload is not JSON.
         """
         return _parsed(memoryview(payload))
 
@@ -92,7 +92,7 @@ class JsonCodec:
     def objects(
         self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
     ) -> DecodedObjects | None:
-        """What the JSON texts say; see `Codec.objects`."""
+        """The values of the JSON texts; see `Codec.objects`."""
         return objects_of(
             lambda payload: top(_parsed(payload)), payloads_of(buffer, offset, length)
         )

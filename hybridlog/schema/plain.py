@@ -9,7 +9,7 @@ from typing import Any
 from hybridlog.schema.utf8 import repaired_text
 
 MAX_DEPTH = 100
-"""Values that are nested deeper are JSON text in tables."""
+"""Values with deeper nesting are JSON text in tables."""
 
 
 def json_text(value: object) -> str:
@@ -26,7 +26,7 @@ def json_text(value: object) -> str:
 
 
 def without_nan(value: Any) -> Any:
-    """The value with `"NaN"`, `"Infinity"` and `"-Infinity"`, for which JSON has no number."""
+    """The value with `"NaN"`, `"Infinity"` and `"-Infinity"` for numbers that JSON lacks."""
     if isinstance(value, float):
         if math.isnan(value):
             return "NaN"

@@ -1,4 +1,4 @@
-"""Fields of protobuf messages: their types, and whether they are lists or maps."""
+"""Types of protobuf fields, and tests for lists and maps."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _GROUP, _MESSAGE = 10, 11
 
 
 def is_message(field: FieldDescriptor) -> bool:
-    """Whether the field is a message."""
+    """True if the field is a message."""
     return field.type in {_MESSAGE, _GROUP}
 
 
 def is_repeated(field: FieldDescriptor) -> bool:
-    """Whether the field is a list or a map."""
-    # Up to protobuf 5 there is only the label, from 7 on only the property.
+    """True if the field is a list or a map."""
+    # Protobuf up to 5 has only the label, protobuf from 7 on has only the property.
     repeated = getattr(field, "is_repeated", None)
     return field.label == field.LABEL_REPEATED if repeated is None else bool(repeated)
 
 
 def is_map(field: FieldDescriptor) -> bool:
-    """Whether the field is a map."""
+    """True if the field is a map."""
     return field.type == _MESSAGE and bool(field.message_type.GetOptions().map_entry)
 
 
@@ -57,5 +57,5 @@ def nanoseconds_of(message: Message) -> int:
 
 
 def map_key(key: object) -> str:
-    """The name that a key has as a field."""
+    """A map key as a field name."""
     return str(key).lower() if isinstance(key, bool) else str(key)

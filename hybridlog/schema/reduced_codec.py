@@ -1,11 +1,11 @@
 """Reduced messages, whose payload was dropped: size, hash, and the indexed fields.
 
 Under pressure a recorder stores only the small parts of a large message. A reduced message
-is in the segment like any message, on a channel of its own with the encoding `REDUCED`, so
-that the index can be rebuilt from it, too.
+is stored in the segment like any message, on a separate channel with the encoding
+`REDUCED`. The index can therefore be rebuilt from it, too.
 
-Its payload is a head of 40 bytes, with the size (u64, little-endian) and the SHA-256 of
-the dropped payload, and then the BSON elements of the index document without `_meta`.
+Its payload begins with 40 bytes: the size (u64, little-endian) and the SHA-256 of the
+dropped payload. The BSON elements of the index document without `_meta` follow.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def remains_of(payload: Buffer) -> Remains:
     """Size and hash of the dropped payload.
 
     Raises:
-        PayloadError: It is not a reduced message.
+        PayloadError: the payload is not a reduced message.
     """
     if len(payload) < _HEAD.size:
         raise PayloadError("the payload is not a reduced message: it is too short")
@@ -96,7 +96,7 @@ class ReducedCodec:
     reason: str | None = None
 
     def paths(self) -> list[FieldPath]:
-        """No fields of its own: those of whole messages count."""
+        """No fields of its own: the fields are those of complete messages."""
         return []
 
     def bodies(
@@ -111,14 +111,14 @@ class ReducedCodec:
         return {} if isinstance(body, PayloadError) else _document(body)
 
     def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """The fields that were kept; long arrays are summaries."""
+        """The stored fields; long arrays are summaries."""
         return self.fields(payload)
 
     def decode(self, payload: Buffer) -> object:
         """Raise, since the payload cannot be decoded.
 
         Raises:
-            PayloadError: Always.
+            PayloadError: always.
         """
         remains = remains_of(payload)
         raise PayloadError(f"{_GIVEN_UP} ({remains.size} bytes, SHA-256 {remains.sha256.hex()})")
@@ -130,7 +130,7 @@ class ReducedCodec:
         length: NDArray[np.int64],
         fields: Collection[str] | None,
     ) -> DecodedArrow:
-        """What the index documents hold, as Arrow arrays; see `Codec.arrow`.
+        """The values of the index documents, as Arrow arrays; see `Codec.arrow`.
 
         Integers are int64, and arrays over the limit are summaries.
         """
@@ -141,7 +141,7 @@ class ReducedCodec:
     def objects(
         self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
     ) -> DecodedObjects | None:
-        """What the index documents hold."""
+        """The values of the index documents."""
         return objects_of(_fields, payloads_of(buffer, offset, length))
 
 

@@ -42,9 +42,9 @@ class Summary:
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
     """Summarise every row of a ragged array.
 
-    The summary of a row depends on its elements alone, to the last bit. So sums of floats
-    use one `reduceat`, which adds each segment separately and in the same order, or for long
-    rows a sum by blocks, and never a regular-grid reduction, whose order may differ.
+    The summary of a row depends on its elements alone, to the last bit. Sums of floats use
+    one `reduceat`, which adds each segment separately and in the same order. Long rows are
+    summed by blocks. A regular-grid reduction is never used, because its order may differ.
 
     Args:
         values: All elements.

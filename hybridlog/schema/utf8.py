@@ -1,4 +1,4 @@
-"""Strings as their bytes came, made valid UTF-8."""
+"""Repair of byte strings to valid UTF-8."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def repaired(strings: Strings) -> Strings:
-    """The same strings with bytes that are not UTF-8 replaced by U+FFFD.
+    """The same strings with invalid UTF-8 replaced by U+FFFD.
 
-    Strings that are valid already, nearly always all, are not copied.
+    Valid strings, by far the usual case, are not copied.
     """
     low, high = int(strings.offset[0]), int(strings.offset[-1])
     data = strings.data[low:high]
@@ -31,7 +31,7 @@ def repaired(strings: Strings) -> Strings:
 
 
 def repaired_text(text: str) -> str:
-    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
+    """The text, with U+FFFD for unpaired surrogates, which UTF-8 cannot encode."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -40,7 +40,7 @@ def repaired_text(text: str) -> str:
 
 
 def _valid(data: NDArray[np.uint8], offset: NDArray[np.int64]) -> bool:
-    """Whether every string is UTF-8: all bytes are, and none starts within a character."""
+    """True if every string is UTF-8: all bytes are, and no string starts within a character."""
     starts = offset[:-1]
     starts = starts[starts < len(data)]
     if bool(((data[starts] & 0xC0) == 0x80).any()):

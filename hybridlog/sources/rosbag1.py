@@ -1,7 +1,7 @@
 """Reads ROS 1 bags (format 2.0) from the start.
 
-Messages are found by walking the records, so bags without an index (`.bag.active`),
-truncated bags and bags with damage in the middle yield everything that is readable. The
+Messages are found by walking the records, without the index. Unindexed bags
+(`.bag.active`), truncated bags and damaged bags yield everything that is readable. The
 index at the end only serves to count missing messages.
 
 After damage the reader searches for the next valid record. Lost messages are counted with

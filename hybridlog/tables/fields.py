@@ -1,11 +1,11 @@
-"""Fields of messages as columns of a table, and back.
+"""Conversion of message fields to columns of a table, and back.
 
-Arrays over the limit become `{n, min, max, mean}`, as in the index; of strings, bytes and
-messages, `{n}`. A message without fields becomes a boolean, because Parquet has no column
-for it. A column whose name differs from its field's says so in its metadata.
+Arrays over the limit become `{n, min, max, mean}`, as in the index; arrays of strings,
+bytes and messages become `{n}`. A message without fields becomes a boolean, because Parquet
+has no column for it. A column renamed from its field has the field's name in its metadata.
 """
 
-# Where stubs for pyarrow are installed, they know too little of its buffers.
+# Where stubs for pyarrow are installed, they are incomplete for its buffers.
 # mypy: disable-error-code="no-any-return, arg-type, call-overload, return-value, assignment"
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from hybridlog.schema.summary import summarise
 from hybridlog.tables.layout import ORIGINAL, column_names
 
 LIMIT: Final = 32
-"""Elements up to which an array is kept whole."""
+"""Maximum number of elements of an array stored in full."""
 _N: Final = ("n",)
 _SUMMARY: Final = ("n", "min", "max", "mean")
 
 Array = Any
-"""An Arrow array. Its stubs differ too much between versions to be of use here."""
+"""An Arrow array. Its stubs differ too much between versions to be useful here."""
 
 
 class UnfitError(Exception):
@@ -35,9 +35,9 @@ class UnfitError(Exception):
 
 
 class FieldShape:
-    """Turns fields of one topic's messages into columns, always in the same way.
+    """Turns fields of one topic's messages into columns, consistently.
 
-    An array that was too long once is a summary from then on.
+    Once an array was too long, all later ones become summaries.
     """
 
     def __init__(self) -> None:
@@ -100,7 +100,7 @@ class FieldShape:
 
 
 def _may_change(field: Any) -> bool:
-    """Whether a column that is what it was may be something else next time, or is renamed."""
+    """True if a column may change its type later, or is renamed."""
     kind = field.type
     if field.metadata:
         return True
@@ -118,15 +118,15 @@ def _named(column: str, name: str, kind: Any) -> Any:
 
 
 def original_name(field: Any) -> str:
-    """Name of the field that a column holds."""
+    """Name of the field of a column."""
     name = (field.metadata or {}).get(ORIGINAL)
     return field.name if name is None else name.decode()
 
 
 def records_of(columns: Array) -> Array:
-    """Columns as fields of messages again, under their own names.
+    """Columns as fields of messages, under the names of the fields.
 
-    Summaries stay what they are.
+    Summaries remain summaries.
     """
     kind = columns.type
     if pa.types.is_struct(kind):
@@ -145,7 +145,7 @@ def records_of(columns: Array) -> Array:
 
 
 def _is_renamed(field: Any) -> bool:
-    """Whether the name of a column, or of one inside it, differs from its field's."""
+    """True if the name of a column, or of one inside it, differs from its field's."""
     if original_name(field) != field.name:
         return True
     kind = field.type
@@ -155,27 +155,27 @@ def _is_renamed(field: Any) -> bool:
 
 
 def joined(pieces: Sequence[Array]) -> Array:
-    """Columns one after the other, of the type that holds them all.
+    """Columns joined one after the other, with their common type.
 
-    A column that a piece lacks is null there. Where one piece has summaries of an array, all
-    have. Values without a common exact type become JSON text.
+    A column missing from a piece is null there. If one piece has summaries of an array, all
+    get summaries. Values without a common exact type become JSON text.
 
     Raises:
-        UnfitError: There is no such type.
+        UnfitError: no common type exists.
     """
     pieces = alike(pieces)
     return pa.concat_arrays(pieces) if len(pieces) > 1 else pieces[0]
 
 
 def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
-    """Columns of the type that holds them all.
+    """Columns converted to their common type.
 
     Args:
         pieces: The columns.
-        by_type: Whether all values of their types have to fit, not only these.
+        by_type: True if all values of their types must fit, not only these.
 
     Raises:
-        UnfitError: There is no such type.
+        UnfitError: no common type exists.
     """
     kind = pieces[0].type if pieces else None
     if all(piece.type == kind for piece in pieces):
@@ -188,7 +188,7 @@ def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
 
 
 def _common(arrays: Sequence[Array], *, by_type: bool) -> Any:
-    """The type that values of several arrays have in common."""
+    """The common type of several arrays."""
     arrays = [array for array in arrays if not pa.types.is_null(array.type)] or [arrays[0]]
     first = arrays[0].type
     if all(array.type == first for array in arrays):
@@ -226,7 +226,7 @@ def _common_struct(arrays: Sequence[Array], *, by_type: bool) -> Any:
 
 
 def _widens(kinds: Sequence[Any]) -> bool:
-    """Whether all values of some types fit one of them, or a wider one."""
+    """True if all values of some types fit into one of them, or into a wider type."""
     if all(map(pa.types.is_integer, kinds)):
         signed = any(map(pa.types.is_signed_integer, kinds))
         return not (signed and pa.uint64() in kinds)
@@ -237,7 +237,7 @@ def _widens(kinds: Sequence[Any]) -> bool:
 
 
 def _as(array: Array, kind: Any) -> Array:
-    """Values as another type, which `_common` has found."""
+    """Values converted to a type from `_common`."""
     if array.type == kind:
         return array
     if pa.types.is_null(array.type):
@@ -283,7 +283,7 @@ def _is_list(kind: Any) -> bool:
 
 
 def _missing(array: Array) -> Any:
-    """Which rows are null, for Arrow; None if none is."""
+    """Mask of the null rows, for Arrow; None if no row is null."""
     return array.is_null() if array.null_count else None
 
 
@@ -294,7 +294,7 @@ def _struct_of(columns: list[Array], fields: list[Any], rows: int, missing: Any)
 
 
 def _lengths(array: Array) -> Any:
-    """int64[n], elements of each row, 0 where there is none."""
+    """int64[n], number of elements of each row, 0 for null."""
     if pa.types.is_fixed_size_list(array.type):
         lengths = np.full(len(array), array.type.list_size, np.int64)
     else:
@@ -305,7 +305,7 @@ def _lengths(array: Array) -> Any:
 
 
 def _offsets(array: Array) -> Any:
-    """int64[n + 1], where the elements of each row begin."""
+    """int64[n + 1], start of the elements of each row."""
     wide = pa.types.is_large_list(array.type) or pa.types.is_large_binary(array.type)
     dtype = np.dtype(np.int64 if wide else np.int32)
     buffer = array.buffers()[1]
@@ -316,7 +316,7 @@ def _offsets(array: Array) -> Any:
 
 
 def _elements(array: Array) -> Array:
-    """Elements of all rows that are there, one after the other."""
+    """Elements of all rows that are not null, one after the other."""
     return array.flatten()
 
 
@@ -325,8 +325,8 @@ def _with_elements(array: Array, values: Array, *, plain: bool = False) -> Array
 
     Args:
         array: The lists.
-        values: Elements of all rows, those of missing rows left out.
-        plain: Whether the lists lose a fixed size.
+        values: Elements of all rows that are not null.
+        plain: True to turn lists of a fixed size into lists of any size.
     """
     is_plain = pa.types.is_list(array.type)
     if values.type == array.type.value_type and (is_plain or not plain):
@@ -340,7 +340,7 @@ def _with_elements(array: Array, values: Array, *, plain: bool = False) -> Array
 
 
 def _summary(array: Array) -> Array:
-    """Each list as what the index has of a long one."""
+    """Each list as the summary that the index has of a long list."""
     offsets = np.zeros(len(array) + 1, np.int64)
     np.cumsum(_lengths(array), out=offsets[1:])
     numbers = _numbers(_elements(array))
@@ -365,7 +365,7 @@ def _summary(array: Array) -> Array:
 
 
 def _numbers(values: Array) -> tuple[Any, Any] | None:
-    """Numbers as numpy has them, and which of them are there; None for anything else."""
+    """Numbers as a numpy array, and the mask of valid ones; None for other types."""
     kind = values.type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         values = values.view(pa.int64())
@@ -387,8 +387,8 @@ def detached(array: Array, begin: int, end: int) -> Array:
 
     Args:
         array: The array.
-        begin: First address of memory that will be used for something else.
-        end: The address behind it.
+        begin: First address of memory that will be reused.
+        end: The address after its end.
     """
     if any(b is not None and begin <= b.address < end for b in array.buffers()):
         half = len(array) // 2
@@ -397,12 +397,12 @@ def detached(array: Array, begin: int, end: int) -> Array:
 
 
 def without(array: Array, rows: Any, total: int) -> Array:
-    """Rows in their places among others that are null.
+    """Rows at their positions in an array that is null elsewhere.
 
     Args:
         array: k rows.
-        rows: intp[k], their places, ascending.
-        total: How many rows there are.
+        rows: intp[k], their positions, ascending.
+        total: Number of rows of the result.
     """
     if len(rows) == total:
         return array

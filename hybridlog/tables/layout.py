@@ -3,12 +3,12 @@
 ```
 tables/recording=r<id>/topic=<collection>/<schema8>-<segment>.parquet
 tables/recording=r<id>/small/<type>~<schema8>.parquet
-tables.part/r<id>/      files that are being written; only whole ones get a name in `tables`
+tables.part/r<id>/      unfinished files; only finished ones get a name in `tables`
 ```
 
-The folders are hive partitions. The id has a letter in front, because readers that infer
-types read `1e3` and `1000` as one number. The schema is part of the name of a file, so that
-files of one glob have one type.
+The folders are hive partitions. The id has a leading letter, because readers that infer
+types read `1e3` and `1000` as the same number. The schema is in the name of a file, which
+gives all files of one glob the same type.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 TABLES: Final = "tables"
 """Folder of the store that holds finished tables."""
 PARTS: Final = "tables.part"
-"""Folder of the store that holds tables that are being written."""
+"""Folder of the store that holds unfinished tables."""
 SMALL: Final = "small"
-"""Folder of a recording's tables that holds topics of few rows."""
+"""Folder of a recording's tables that holds topics with few rows."""
 SUFFIX: Final = ".parquet"
 NO_TABLE: Final = "no-table"
-"""File in the folder of a topic for which no table can be made."""
+"""File in the folder of a topic that marks that no table can be made."""
 OWN_FILE_ROWS: Final = 1000
-"""Rows from which a topic has a file of its own."""
+"""Number of rows from which a topic has its own file."""
 IN_TABLES: Final = 2
 """Depth of a recording's folder below the store."""
 IN_TOPIC: Final = 4
@@ -56,13 +56,13 @@ OWN_COLUMNS: Final = (
     "error",
     "ref",
 )
-"""Columns that every table has besides the fields of the messages."""
+"""Columns that every table has in addition to the fields of the messages."""
 TOPIC_COLUMN: Final = "topic"
 """Column of a table of several topics."""
 STATES: Final = ("whole", "reduced", "unreadable", "expired")
 """Values of the column `state`."""
 ORIGINAL: Final = b"hybridlog.name"
-"""Metadata of a column: the name of its field, where that differs."""
+"""Metadata of a column: the name of its field, if it differs."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
 VERSION: Final = 1
@@ -81,7 +81,7 @@ def recording_folder(root: Path, recording: str) -> Path:
 
 
 def parts_folder(root: Path, recording: str) -> Path:
-    """Folder of a recording's tables while they are written."""
+    """Folder of a recording's unfinished tables."""
     return root / PARTS / f"r{recording}"
 
 
@@ -91,12 +91,12 @@ def topic_folder(topic: str) -> str:
 
 
 def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[str, str]) -> str:
-    """Hash of all that decides the columns of a channel's messages: 64 hexadecimal digits.
+    """Hash of everything that determines the columns of a channel: 64 hexadecimal digits.
 
     Args:
-        message_encoding: Of the channel.
-        schema: Hash of its schema, if it has one.
-        metadata: Of the channel; a reduced one names its original encoding there.
+        message_encoding: Encoding of the channel.
+        schema: Hash of its schema, if any.
+        metadata: Metadata of the channel; a reduced one names its original encoding there.
     """
     if message_encoding == REDUCED:
         message_encoding = metadata.get(ORIGINAL_ENCODING, "")
@@ -104,7 +104,7 @@ def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[st
 
 
 def table_schema_of(channel: Channel) -> str:
-    """The same of a channel itself."""
+    """The hash of `table_schema` for a channel."""
     schema = schema_hash(channel.schema) if channel.schema is not None else None
     return table_schema(channel.message_encoding, schema, channel.metadata)
 
@@ -114,8 +114,8 @@ def topic_file(schema: str, segment: int, part: int = 0) -> str:
 
     Args:
         schema: See `table_schema`.
-        segment: The last one with messages in it.
-        part: How many such files there are already: columns of one file have one type.
+        segment: The last segment with messages in it.
+        part: Number of such files so far: columns of one file have one type.
     """
     return f"{schema[:8]}-{segment:06d}{f'-{part}' if part else ''}{SUFFIX}"
 
@@ -128,14 +128,14 @@ def small_file(type_name: str, schema: str) -> str:
 def column_names(
     names: Iterable[str], reserved: Collection[str] = _RESERVED
 ) -> Iterator[tuple[str, str]]:
-    """Fields of a message, and the column that each gets.
+    """Fields of a message, and the name of the column for each.
 
-    A field with a name of ours gets `_` behind it, one that differs from an earlier one only
-    in case a number: DuckDB takes such names for the same.
+    A field with a reserved name gets a trailing `_`. A field that differs from an earlier one
+    only in case gets a number, since DuckDB ignores case.
 
     Args:
         names: Names of the fields, in order.
-        reserved: Names that are taken; none inside of a nested message.
+        reserved: Reserved names; none inside a nested message.
     """
     names = list(names)
     taken = {name.casefold() for name in reserved}
@@ -153,21 +153,21 @@ def column_names(
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a file of tables says of itself.
+    """The description of a file of tables, stored in the file itself.
 
     Attributes:
         recording: Id of the recording.
         schema: See `table_schema`.
-        type: Name of the type of the messages, or empty.
-        segments: Digest of each segment that has rows in it, by its number as text.
+        type: Name of the type of the messages, possibly empty.
+        segments: Digest of each segment that has rows in the file, by its number as text.
         topics: Rows of each topic, in the order of the file.
-        bounds: Of each row group: its rows; where the file has one topic, log time and arrival
-            number of the first row, the least, and the same of the last one, else zeros.
+        bounds: For each row group: its rows, then log time and arrival number of its first and
+            last row. The keys are zeros in a file of several topics.
         unreadable: Rows without fields, because their messages do not fit their definition.
         reduced: Rows without fields, because their messages were reduced under pressure.
         body: Bytes before the footer.
-        checksums: CRC-32 of each block of these, 8 hexadecimal digits each.
-        version: Of the writer.
+        checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
+        version: Version of the format.
     """
 
     recording: str
@@ -188,20 +188,20 @@ class About:
         return sum(self.topics.values())
 
     def to_json(self) -> str:
-        """As text."""
+        """The description as JSON text."""
         return json.dumps(asdict(self), separators=(",", ":"))
 
     @classmethod
     def from_json(cls, text: bytes) -> About:
-        """From such a text.
+        """The description from its JSON text.
 
         Raises:
-            StoreError: It is none, or of another version.
+            StoreError: the text is invalid, or of another version.
         """
         try:
             values: dict[str, Any] = json.loads(text)
             if values["version"] != VERSION:
-                raise StoreError("the table is of another version")
+                raise StoreError("the table has another version")
             values["bounds"] = tuple(tuple(map(int, bound)) for bound in values["bounds"])
             about = cls(**values)
             is_sound = (

@@ -1,9 +1,9 @@
-"""Parquet files whose every byte has a checksum.
+"""Parquet files with a checksum for every byte.
 
-Parquet checks pages at most, neither their heads nor the footer. So blocks of the body have
-checksums in the footer, and the footer holds a checksum of itself. Other readers ignore both.
+Parquet has checksums for pages at most, not for page headers or the footer. Here, blocks of
+the body have checksums in the footer, and the footer has its own. Other readers ignore both.
 
-Files are read with `pread`: a mapped file that is cut would kill the process.
+Files are read with `pread`: truncation of a mapped file would kill the process.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 BLOCK: Final = 32 << 10
-"""Bytes of the body that share a checksum."""
-_WRITTEN: Final = 1 << 20  # bytes that are collected before they are written
+"""Bytes of the body with one checksum."""
+_WRITTEN: Final = 1 << 20  # bytes buffered before a write
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _MAX_FOOTER: Final = 256 << 20
-_SAMPLE: Final = 256  # values of a column that show whether a dictionary is worth it
+_SAMPLE: Final = 256  # values of a column that decide about a dictionary
 _RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 _SEAL: Final = re.compile(rb"hybridlog-footer:([0-9a-f]{8})")
 _BLANK: Final = b"hybridlog-footer:00000000"
@@ -47,11 +47,11 @@ class ParquetFileWriter:
 
     Args:
         path: The file, in the folder of a recording's unfinished tables.
-        sample: Rows that stand for all: its schema is the file's.
+        sample: Example rows; their schema is the file's.
         depth: Parts of the path that lie inside the store.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path, sample: pa.Table, *, depth: int) -> None:
@@ -83,7 +83,7 @@ class ParquetFileWriter:
         """Write a row group.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: the row group cannot be written.
         """
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
 
@@ -91,11 +91,11 @@ class ParquetFileWriter:
         """Finish the file.
 
         Args:
-            about: What it says of itself, all but `body` and `checksums`.
+            about: The description of the file, without `body` and `checksums`.
 
         Raises:
-            OSError: It cannot be written.
-            StoreError: Something in it looks like the checksum of a footer.
+            OSError: the file cannot be written.
+            StoreError: some text in it looks like the checksum of a footer.
         """
         try:
             body, checksums = self._sink.end_body()
@@ -110,14 +110,14 @@ class ParquetFileWriter:
             raise
 
     def discard(self) -> None:
-        """Leave nothing of it."""
+        """Delete the unfinished file."""
         self._sink.abandon()
         with suppress(OSError):
             files.unlink(self.path, depth=self._depth)
 
 
 class _Sink:
-    """Where Parquet's bytes go: the body to the disk, the footer to memory until it is sealed."""
+    """Receives Parquet's bytes: the body goes to the disk, the footer to memory until sealed."""
 
     def __init__(self, path: Path, depth: int) -> None:
         self.closed = False
@@ -129,7 +129,7 @@ class _Sink:
         self._footer: bytearray | None = None
 
     def write(self, data: Buffer) -> int:
-        """Take bytes."""
+        """Write bytes."""
         data = memoryview(data).cast("B")
         self._position += len(data)
         if self._footer is not None:
@@ -148,14 +148,14 @@ class _Sink:
         return len(data)
 
     def end_body(self) -> tuple[int, str]:
-        """What is written from here on is the footer; returns size and checksums of the body."""
+        """Begin the footer; returns size and checksums of the body."""
         if self._rest:
             self._checksums.append(_checksum(self._rest))
         self._footer = bytearray()
         return self._position, "".join(self._checksums)
 
     def finish(self) -> None:
-        """Seal the footer, and write what is left."""
+        """Seal the footer, and write all remaining bytes."""
         assert self._footer is not None
         marks = [found.start(1) for found in _SEAL.finditer(self._footer)]
         if len(marks) != 1:
@@ -177,13 +177,13 @@ class _Sink:
         self._waiting.clear()
 
     def flush(self) -> None:
-        """Nothing: what waits is written in larger pieces."""
+        """Do nothing: buffered bytes are written in larger pieces."""
 
     def tell(self) -> int:
         return self._position
 
     def close(self) -> None:
-        """Nothing: the footer follows."""
+        """Do nothing: the footer follows."""
 
 
 class ParquetFileReader:
@@ -193,14 +193,14 @@ class ParquetFileReader:
         path: The file.
 
     Raises:
-        FileNotFoundError: There is none.
-        StoreError: It cannot be read, or is damaged.
+        FileNotFoundError: the file does not exist.
+        StoreError: the file cannot be read, or is damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.number = next(_NUMBERS)
-        """Differs from that of any other reader."""
+        """Unique number of this reader."""
         self._lock = threading.Lock()
         self._fd = -1
         try:
@@ -218,7 +218,7 @@ class ParquetFileReader:
             self.schema: pa.Schema = self._parquet.schema_arrow
             groups = [metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)]
             if groups != [bound[0] for bound in self.about.bounds]:
-                raise StoreError("its row groups are not those that it describes")
+                raise StoreError("its row groups differ from its description")
         except FileNotFoundError:
             raise
         except (OSError, StoreError, pa.ArrowException, KeyError) as error:
@@ -234,7 +234,7 @@ class ParquetFileReader:
         return len(self.about.bounds)
 
     def size(self, group: int, leaves: Sequence[int]) -> int:
-        """Bytes of some columns of a row group, as they are stored."""
+        """Stored bytes of some columns of a row group."""
         found = self._parquet.metadata.row_group(group)
         return sum(found.column(leaf).total_compressed_size for leaf in leaves)
 
@@ -243,10 +243,10 @@ class ParquetFileReader:
 
         Args:
             group: Its number.
-            leaves: Numbers of columns as Parquet counts them: single values, depth first.
+            leaves: Column numbers in Parquet's order: single values, depth first.
 
         Raises:
-            StoreError: They are damaged.
+            StoreError: the columns are damaged.
         """
         try:
             with self._lock:
@@ -257,14 +257,14 @@ class ParquetFileReader:
         except (OSError, StoreError, pa.ArrowException, ValueError) as error:
             raise self._damaged(error) from error
         if table.num_rows != self.about.bounds[group][0]:
-            raise self._damaged(StoreError("a row group has another number of rows"))
+            raise self._damaged(StoreError("a row group has the wrong number of rows"))
         return table
 
     def check(self) -> None:
-        """Read every byte, and every value.
+        """Read every byte and every value.
 
         Raises:
-            StoreError: Something is damaged.
+            StoreError: a part is damaged.
         """
         leaves = range(len(list(_leaves(self.schema))))
         try:
@@ -280,7 +280,7 @@ class ParquetFileReader:
 
 
 class _Source:
-    """Where Parquet's bytes come from: each is held against its checksum first."""
+    """Provides Parquet's bytes, after verifying the checksum of each block."""
 
     def __init__(self, fd: int) -> None:
         self.closed = False
@@ -303,19 +303,19 @@ class _Source:
             raise StoreError("the checksum of its footer differs")
 
     def trust(self, about: About) -> None:
-        """Read the body from now on."""
+        """Allow reading of the body."""
         if about.body != self._body or len(about.checksums) != -(-about.body // BLOCK) * 8:
-            raise StoreError("its body has another size than its footer says")
+            raise StoreError("the size of its body differs from that in its footer")
         text = about.checksums.encode()
         self._checksums = [text[at : at + 8] for at in range(0, len(text), 8)]
 
     def check(self) -> None:
-        """Read the whole body."""
+        """Read and verify the whole body."""
         for at in range(0, self._body, 64 * BLOCK):
             self._checked(at, min(at + 64 * BLOCK, self._body))
 
     def read(self, size: int = -1) -> bytes:
-        """Read at the position."""
+        """Read from the current position."""
         begin = self._position
         end = self._size if size < 0 else min(begin + size, self._size)
         self._position = max(begin, end)
@@ -340,7 +340,7 @@ class _Source:
     def _raw(self, offset: int, size: int) -> bytes:
         data = os.pread(self._fd, size, offset)
         if len(data) != size:
-            raise StoreError("it was cut")
+            raise StoreError("it was truncated")
         return data
 
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
@@ -358,18 +358,18 @@ class _Source:
         return True
 
     def close(self) -> None:
-        """Nothing: the file stays open as long as its reader."""
+        """Do nothing: the file remains open as long as its reader."""
 
 
 def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]]:
-    """Columns as Parquet counts them: the names on the way to each, lists left out."""
+    """Columns in Parquet's order, each as the names on its path, without lists."""
     for top in schema:
         for names, _, kind in _walk(top):
             yield names, kind
 
 
 def _leaves(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
-    """The same by their dotted paths in the file."""
+    """The columns of `leaves_of` by their dotted paths in the file."""
     for top in schema:
         for _, path, kind in _walk(top):
             yield path, kind
@@ -395,7 +395,7 @@ def _is_list(kind: pa.DataType) -> bool:
 
 
 def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
-    """The first values of each column as Parquet counts them."""
+    """The first values of each column, in Parquet's order."""
     for top, column in zip(table.schema, table.columns, strict=True):
         head = column.slice(0, _SAMPLE)
         array = head.combine_chunks()
@@ -418,7 +418,7 @@ def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Arr
 
 
 def _repeats(array: pa.Array[Any]) -> bool:
-    """Whether a dictionary is worth it: half of the first values occur again."""
+    """True if a dictionary is worthwhile: half of the first values are repeated."""
     if pa.types.is_boolean(array.type):
         return False
     some = array.slice(0, 4 * _SAMPLE)
@@ -426,7 +426,7 @@ def _repeats(array: pa.Array[Any]) -> bool:
 
 
 def _runs(path: str, kind: pa.DataType) -> bool:
-    """Whether neighbours differ by little: times and numbers that run."""
+    """True if adjacent values differ by little: times and counters."""
     if path in _RUNNING or pa.types.is_timestamp(kind):
         return True
     return path.endswith(".seq") and bool(pa.types.is_integer(kind))

@@ -1,9 +1,9 @@
-"""Reads tables of topics, as long as the catalog confirms them.
+"""Reads tables of topics that the catalog confirms.
 
-A table is believed if its files are of this recording, topic and type, every segment with
-rows in it has the digest that the catalog knows, and it has as many rows as the catalog has
-messages of the topic. Every byte that is read is held against a checksum. Whatever is not
-so is no table, and other ways answer.
+A table is valid if its files belong to this recording, topic and type. Every segment with
+rows in it must have the catalog's digest, and the number of rows must be the catalog's
+number of messages. All bytes read are verified by checksum. An invalid table is ignored,
+and other engines answer.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 MAX_BYTES: Final = 64 << 20
-"""Most memory that decoded columns take."""
+"""Maximum memory of decoded columns."""
 _OPEN_FILES: Final = 256
 _TYPES: Final = 64  # of which a table remembers what they are
 _OWN: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN})
@@ -77,13 +77,13 @@ class TableRows:
         return len(self.t)
 
     def take(self, rows: NDArray[np.intp]) -> TableRows:
-        """The chosen rows, in the order chosen."""
+        """The selected rows, in the order given."""
         places = pa.array(rows)
         own = {name: column.take(places) for name, column in self.own.items()}
         return TableRows(self.t[rows], self.seq[rows], own, self.records.take(places))
 
     def slice(self, begin: int, end: int) -> TableRows:
-        """Rows from one place to another."""
+        """Rows from one index to another."""
         if begin == 0 and end == len(self):
             return self
         own = {name: column.slice(begin, end - begin) for name, column in self.own.items()}
@@ -91,7 +91,7 @@ class TableRows:
         return TableRows(self.t[begin:end], self.seq[begin:end], own, records)
 
     def behind(self, key: _Key) -> int:
-        """Place of the first row that comes after a time and arrival number."""
+        """Index of the first row after a log time and arrival number."""
         first, end = (int(np.searchsorted(self.t, key[0], side)) for side in _SIDES)
         return first + int(np.searchsorted(self.seq[first:end], key[1], "right"))
 
@@ -107,8 +107,8 @@ class _Part(NamedTuple):
         group: Number of the row group.
         begin: First row of the topic in it.
         rows: Number of its rows.
-        first: Key of the first row, or less.
-        last: Key of the last row, or more.
+        first: Key of the first row, or a lower bound of it.
+        last: Key of the last row, or an upper bound of it.
     """
 
     file: ParquetFileReader
@@ -120,12 +120,12 @@ class _Part(NamedTuple):
 
 
 class _Leaf(NamedTuple):
-    """A column as Parquet counts them.
+    """A column in Parquet's order.
 
     Attributes:
-        top: Name of the table's column that it is in.
-        is_own: Whether that is one of ours, not a field's.
-        names: Names of the fields on the way to it.
+        top: Name of the table's column that contains it.
+        is_own: True for a column of the table itself, not of a field.
+        names: Names of the fields on the path to it.
     """
 
     top: str
@@ -139,14 +139,14 @@ class TopicTable:
     Args:
         topic: Full name.
         parts: Its rows.
-        cache: Of decoded columns.
+        cache: Cache of decoded columns.
 
     Attributes:
         topic: Full name.
         rows: Number of messages.
         unreadable: Messages without fields, because they do not fit their definition.
         reduced: Messages without fields, because they were reduced under pressure.
-        files: The files it is in.
+        files: The files with its rows.
     """
 
     def __init__(self, topic: str, parts: Sequence[_Part], cache: _Cache) -> None:
@@ -164,10 +164,10 @@ class TopicTable:
         """Type of `TableRows.records`.
 
         Args:
-            paths: Dotted paths of fields, brackets left out or empty; None for all.
+            paths: Dotted paths of fields, with or without empty brackets; None for all.
 
         Raises:
-            UnfitError: The files have no common type.
+            UnfitError: the files have no common type.
         """
         return self.empty(paths).type
 
@@ -177,7 +177,7 @@ class TopicTable:
         return any(not leaf.is_own for leaves in self._leaves.values() for leaf in leaves)
 
     def has(self, path: str) -> bool:
-        """Whether there is a field."""
+        """True if the field exists."""
         names = _names(path)
         return any(
             not leaf.is_own and leaf.names[: len(names)] == names
@@ -186,7 +186,7 @@ class TopicTable:
         )
 
     def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:
-        """Bytes to be read for some fields, as they are stored.
+        """Stored bytes to read for some fields.
 
         Args:
             paths: As for `fields`.
@@ -206,15 +206,15 @@ class TopicTable:
         own: Collection[str] = (),
         spans: Sequence[Span] | None = None,
     ) -> Iterator[TableRows]:
-        """Messages by log time and arrival, a row group at a time.
+        """Messages by log time and arrival, one row group at a time.
 
         Args:
-            paths: Dotted paths of fields, each with all below it; None for all.
+            paths: Dotted paths of fields, including all fields below them; None for all.
             own: Columns of the table itself besides log time and arrival number.
-            spans: Ranges of log time, ns, apart and in order; None for all times.
+            spans: Ranges of log time, ns, disjoint, in order; None for all times.
 
         Raises:
-            StoreError: What is read is damaged.
+            StoreError: the data read is damaged.
         """
         kind = self.empty(paths)
         streams = [self._read_run(run, paths, own, spans, kind) for run in self._runs]
@@ -269,7 +269,7 @@ class TopicTable:
     def _chosen(
         self, file: ParquetFileReader, paths: Collection[str] | None, own: Collection[str]
     ) -> list[int]:
-        """Numbers of the columns that hold these."""
+        """Numbers of the columns for these fields."""
         wanted = None if paths is None else list(map(_names, paths))
         return [
             number
@@ -278,10 +278,10 @@ class TopicTable:
         ]
 
     def empty(self, paths: Collection[str] | None) -> Any:
-        """No rows, of the type that the rows of all files have in common.
+        """An empty array with the common type of the rows of all files.
 
         Raises:
-            UnfitError: They have none.
+            UnfitError: the files have no common type.
         """
         key = None if paths is None else frozenset(paths)
         if key not in self._types:
@@ -305,7 +305,7 @@ class TopicTable:
 
 
 class _Cache:
-    """Decoded columns, those that were used last. Thread safe."""
+    """A cache of the most recently used decoded columns. Thread safe."""
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
@@ -314,7 +314,7 @@ class _Cache:
         self._lock = threading.Lock()
 
     def get(self, file: ParquetFileReader, group: int, top: str, leaves: tuple[int, ...]) -> Any:
-        """A column of a row group, or the parts of it that are wanted."""
+        """A column of a row group, or the requested parts of it."""
         key = file.number, group, top, leaves
         with self._lock:
             if key in self._columns:
@@ -342,7 +342,7 @@ class Tables:
 
     Args:
         root: The store.
-        most_bytes: Most memory that decoded columns take.
+        most_bytes: Maximum memory of decoded columns.
     """
 
     def __init__(self, root: Path, *, most_bytes: int = MAX_BYTES) -> None:
@@ -354,7 +354,7 @@ class Tables:
         self._lock = threading.Lock()
 
     def invalidate(self) -> None:
-        """Forget everything: files, columns, and what is no table."""
+        """Forget all files, columns and invalid tables."""
         with self._lock:
             self._generation += 1
             self._found.clear()
@@ -365,7 +365,7 @@ class Tables:
         """The table of a topic in a recording; None without one that the catalog confirms.
 
         Args:
-            recording: As the catalog has it.
+            recording: The recording's entry in the catalog.
             topic: Full name.
         """
         key = recording.id, topic
@@ -381,13 +381,13 @@ class Tables:
         return found
 
     def forget(self, recording: RecordingEntry, topic: str) -> None:
-        """Look for the table again when it is asked for next."""
+        """Look for the table again at the next request."""
         with self._lock:
             self._found.pop((recording.id, topic), None)
             self._small.clear()
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
-        """A table was found to be damaged when it was read: there is none from now on."""
+        """Ignore the table from now on, because it was found to be damaged."""
         self._remember((recording.id, topic), None, self._generation)
 
     def _remember(self, key: tuple[str, str], found: TopicTable | None, generation: int) -> None:
@@ -401,8 +401,8 @@ class Tables:
         """The table of a topic in a recording.
 
         Raises:
-            FileNotFoundError: There is none.
-            StoreError: There is one that is damaged, or that the catalog does not confirm.
+            FileNotFoundError: no table exists.
+            StoreError: the table is damaged, or the catalog does not confirm it.
         """
         if recording.status == "open":
             raise FileNotFoundError
@@ -451,7 +451,7 @@ class Tables:
                 yield _Part(file, group, 0, rows, first, last)
 
     def _small_parts(self, path: Path, topic: str) -> Iterator[_Part]:
-        """Rows of a topic in a file of several."""
+        """Rows of a topic in a file of several topics."""
         file = self._small_file(path)
         begin = 0
         for name, rows in file.about.topics.items():
@@ -480,20 +480,20 @@ class Tables:
 
 
 def _confirm(file: ParquetFileReader, recording: RecordingEntry, topic: str, schema: str) -> None:
-    """Hold what a file says of itself against the catalog.
+    """Compare the description of a file with the catalog.
 
     Raises:
-        StoreError: They differ.
+        StoreError: they differ.
     """
     about = file.about
     if about.recording != recording.id or topic not in about.topics or about.schema != schema:
-        raise StoreError(f"The table {file.path} is of something else.")
+        raise StoreError(f"The table {file.path} belongs to other data.")
     if not about.segments.items() <= recording.digests.items():
-        raise StoreError(f"The table {file.path} is of segments that are not there any more.")
+        raise StoreError(f"Segments of the table {file.path} are missing.")
 
 
 def _runs(parts: Sequence[_Part]) -> Iterator[list[_Part]]:
-    """Row groups in as few sequences as possible, each of which is in order."""
+    """Row groups in as few ordered sequences as possible."""
     if all(part.first == _FIRST for part in parts):
         yield list(parts)  # of a file in which the topic's rows are in order
         return
@@ -509,7 +509,7 @@ def _runs(parts: Sequence[_Part]) -> Iterator[list[_Part]]:
 
 
 def _merged(streams: Sequence[Iterator[TableRows]]) -> Iterator[TableRows]:
-    """Rows of several sequences, each of which is in order, in order."""
+    """Rows of several ordered sequences, merged in order."""
     heads: list[tuple[TableRows, Iterator[TableRows]]] = []
     for stream in streams:
         head = next(stream, None)
@@ -546,7 +546,7 @@ def _leaves(schema: Any) -> Iterator[_Leaf]:
 
 
 def _renamed(field: Any) -> Any:
-    """A column under the name of its field, and so are all inside it."""
+    """A column under the name of its field, including all columns inside it."""
     kind = field.type
     if pa.types.is_struct(kind):
         kind = pa.struct([_renamed(kind.field(number)) for number in range(kind.num_fields)])
@@ -558,7 +558,7 @@ def _renamed(field: Any) -> Any:
 
 
 def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: str) -> Any | None:
-    """A column with those parts alone that are chosen; None without any."""
+    """A column with only the chosen parts; None if no part is chosen."""
     names = (*above, original_name(field))
     kind = field.type
     if pa.types.is_struct(kind):

@@ -1,11 +1,11 @@
-"""Writes the tables of a recording while it is indexed.
+"""Writes the tables of a recording during indexing.
 
-Payloads of small messages are put together and decoded by columns, 8 MiB at a time. Rows
-wait in memory until their segment is sealed, or there are too many of them: then they
+Payloads of small messages are collected and decoded by columns, 8 MiB at a time. Rows
+remain in memory until their segment is sealed, or until there are too many. Then they
 become row groups of an unfinished file. A file gets its name once the segment is sealed and
-all of its messages are in.
+all of its messages are written.
 
-Tables are derived. Whatever fails, the recording goes on, and a topic has no table.
+Tables are derived. After any failure the recording continues, and a topic has no table.
 """
 
 from __future__ import annotations
@@ -55,33 +55,33 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
 
 GROUP_ROWS: Final = 131_072
-"""Most rows of a row group."""
+"""Maximum number of rows in a row group."""
 GROUP_BYTES: Final = 32 << 20
-"""Most bytes of its columns in memory."""
-_ARENA = 8 << 20  # bytes of payloads that are put together: each topic's part costs a millisecond
-_ENOUGH = 4 << 20  # a chunk of so many is decoded where it is
-_ROWS = 1 << 18  # messages that are put together
-_PENDING = 48 << 20  # bytes of rows that wait in memory
-_LEFT = _PENDING // 4  # of the smallest topics, which go on waiting until there is more of them
-_ROW = 64  # bytes that a row takes besides its fields
-_RESERVE = 256 << 20  # bytes of the disk that are the segments' alone
-_OPEN_FILES = 128  # unfinished files at a time
-_WHOLE, _REDUCED, _UNREADABLE = 0, 1, 2  # places in `STATES`
+"""Maximum bytes of the columns of a row group in memory."""
+_ARENA = 8 << 20  # bytes of payloads collected: each topic's part costs a millisecond
+_ENOUGH = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
+_ROWS = 1 << 18  # messages collected
+_PENDING = 48 << 20  # bytes of rows waiting in memory
+_LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
+_ROW = 64  # bytes of a row in addition to its fields
+_RESERVE = 256 << 20  # bytes of the disk reserved for segments
+_OPEN_FILES = 128  # maximum number of unfinished files
+_WHOLE, _REDUCED, _UNREADABLE = 0, 1, 2  # indexes in `STATES`
 _log = logging.getLogger(__name__)
 
 
 class _Messages(NamedTuple):
-    """Messages by columns: where their payloads lie in memory, and what the table says of them.
+    """Messages by columns: location of their payloads in memory, and values for the table.
 
     Attributes:
-        at: int64[n], where each payload starts in the buffer that holds it now.
+        at: int64[n], start of each payload in its current buffer.
         length: int64[n], bytes of each payload.
         channel: int32[n], ids of channels.
         log_time: int64[n], ns.
         seq: int64[n], arrival numbers.
         publish_time: int64[n], ns.
         chunk: int32[n], number of the chunk in its segment.
-        offset: int64[n], where each payload starts in the chunk.
+        offset: int64[n], start of each payload in the chunk.
     """
 
     at: NDArray[np.int64]
@@ -95,7 +95,7 @@ class _Messages(NamedTuple):
 
     @classmethod
     def of(cls, chunk: StoredChunk, begin: int) -> _Messages:
-        """Those of a chunk, of which the payloads are copied to a place `-begin` bytes on."""
+        """Messages of a chunk, whose payloads are copied to a buffer `-begin` bytes further on."""
         batch = chunk.batch
         number = np.full(len(batch), chunk.number, np.int32)
         return cls(
@@ -111,7 +111,7 @@ class _Messages(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[_Messages]) -> _Messages:
-        """Several, one after the other."""
+        """Several batches, one after the other."""
         if len(parts) == 1:
             return parts[0]
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -127,9 +127,9 @@ class _Piece:
     Attributes:
         segment: Number of the segment.
         messages: The messages.
-        fields: Their columns, a struct each; None if there are none.
-        errors: Rows that are unreadable, and why.
-        state: Place of the state of all other rows in `STATES`.
+        fields: Their columns, a struct each; None without columns.
+        errors: Unreadable rows, each with the reason.
+        state: Index in `STATES` of the state of all other rows.
     """
 
     segment: int
@@ -168,11 +168,11 @@ class _Topic:
         self.pieces: list[_Piece] = []
         """Rows in memory."""
         self.size = 0
-        """Bytes of these."""
+        """Bytes of the rows in memory."""
         self.files: dict[int, list[_File]] = {}
-        """Unfinished files of segments that are not cut yet."""
+        """Unfinished files of segments that are not closed yet."""
         self.finished: Counter[int] = Counter()
-        """Number of files that were finished, by the segments that they are named after."""
+        """Number of finished files, by the segments in their names."""
         self.has_failed = False
 
     def add(self, piece: _Piece) -> None:
@@ -181,14 +181,14 @@ class _Topic:
         self.size += piece.size
 
     def take(self, segments: Collection[int]) -> list[_Piece]:
-        """The rows in memory that are of some segments; they are not held any more."""
+        """Remove and return the rows in memory that belong to some segments."""
         found = [piece for piece in self.pieces if piece.segment in segments]
         self.pieces = [piece for piece in self.pieces if piece.segment not in segments]
         self.size = sum(piece.size for piece in self.pieces)
         return found
 
     def give_up(self) -> None:
-        """Have no table of it."""
+        """Make no table of the topic."""
         self.has_failed = self.is_wanted
         self.is_wanted = False
         self.pieces.clear()
@@ -200,7 +200,7 @@ class _Topic:
 
 
 class _File:
-    """An unfinished file of one topic, or of several of one type."""
+    """An unfinished file of one topic, or of several topics of one type."""
 
     def __init__(self, path: Path, has_publish_time: Mapping[int, bool]) -> None:
         self.path = path
@@ -217,8 +217,8 @@ class _File:
         """Write rows of a topic, in order of log time and arrival, as row groups.
 
         Raises:
-            OSError: They cannot be written.
-            UnfitError: Their fields have another type than those that are in the file.
+            OSError: the rows cannot be written.
+            UnfitError: the type of their fields differs from the file's.
         """
         table = self._table(topic, pieces)
         if self._schema is not None and table.schema != self._schema:
@@ -233,8 +233,8 @@ class _File:
         """Write the rows of several topics, one topic after the other.
 
         Raises:
-            OSError: They cannot be written.
-            UnfitError: Their fields have no common type.
+            OSError: the rows cannot be written.
+            UnfitError: their fields have no common type.
         """
         import pyarrow as pa
 
@@ -253,7 +253,7 @@ class _File:
             self._count(name, pieces)
 
     def _count(self, topic: str, pieces: list[_Piece]) -> None:
-        """Rows of a topic were written."""
+        """Count rows of a topic that were written."""
         self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
         self.segments.update(piece.segment for piece in pieces)
         for piece in pieces:
@@ -261,7 +261,7 @@ class _File:
             self.unreadable += sum(len(rows) for rows, _ in piece.errors)
 
     def _write(self, table: Any) -> Iterator[tuple[int, int]]:
-        """Write row groups; yields first rows, and those behind the last."""
+        """Write row groups; yields the first row of each, and the row after its end."""
         from hybridlog.tables.parquet_file import ParquetFileWriter
 
         if self._writer is None:
@@ -281,8 +281,8 @@ class _File:
         Args:
             topic: The topic.
             pieces: Its rows.
-            kind: Type of their fields, if there is one; else that which they have in common.
-            with_topic: Whether the topic is a column.
+            kind: Type of their fields; None for their common type.
+            with_topic: True to make the topic a column.
         """
         import pyarrow as pa
 
@@ -317,7 +317,7 @@ class _File:
         return table if order is None else table.take(pa.array(order))
 
     def _fitting(self, table: Any) -> Any:
-        """Rows with the columns that the file has."""
+        """Rows with the columns of the file."""
         import pyarrow as pa
 
         from hybridlog.tables.fields import UnfitError, joined
@@ -329,25 +329,26 @@ class _File:
         return pa.Table.from_struct_array(fitting).cast(self._schema)
 
     def close(self, about: About) -> None:
-        """Finish it."""
+        """Finish the file."""
         assert self._writer is not None
         self._writer.close(about)
 
     def discard(self) -> None:
-        """Leave nothing of it."""
+        """Delete the unfinished file."""
         if self._writer is not None:
             self._writer.discard()
 
 
 class TableWriter:
-    """Writes the tables of one recording, which this process holds for writing.
+    """Writes the tables of one recording, which this process has locked for writing.
 
     Args:
         root: The store.
         recording: Id of the recording.
-        topics: Those wanted; None for all.
-        is_new: Whether the recording has no tables yet. A file of a new one gets its name as
-            soon as its segment is cut; else all files of a topic are exchanged at the end.
+        topics: The topics with tables; None for all.
+        is_new: True if the recording has no tables yet. Files of a new recording get their
+            names as soon as their segments are closed. Otherwise all files of a topic are
+            replaced at the end.
     """
 
     def __init__(
@@ -377,30 +378,30 @@ class TableWriter:
         self._has_publish_time: dict[int, bool] = {}
         self._seen: Counter[int] = Counter()  # messages of each segment
         self._sealed: dict[int, tuple[str, int]] = {}  # digest and messages
-        self._cut: dict[int, str] = {}  # segments that are cut, and their digests
+        self._cut: dict[int, str] = {}  # digests of the closed segments
         self._finished: dict[str, list[tuple[Path, str]]] = {}  # by folder, until the end
-        self._lock = threading.Lock()  # of what is sealed
+        self._lock = threading.Lock()  # protects the sealed segments
 
     @property
     def rows_in_memory(self) -> int:
-        """Rows that wait to be written."""
+        """Number of rows waiting to be written."""
         return self._held_rows + sum(
             piece.rows for topic in self._topics.values() for piece in topic.pieces
         )
 
     def seal(self, segment: int, digest: str, messages: int) -> None:
-        """A segment is sealed. Thread safe.
+        """Register a sealed segment. Thread safe.
 
         Args:
             segment: Its number.
-            digest: As the catalog has it.
+            digest: Its digest in the catalog.
             messages: Number of its messages.
         """
         with self._lock:
             self._sealed[segment] = digest, messages
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Take what is in a chunk; its buffer is not needed any more afterwards."""
+        """Add the messages of a chunk; its buffer is not used afterwards."""
         if self._has_ended:
             return
         with self._harmless():
@@ -411,11 +412,11 @@ class TableWriter:
             self._cut_sealed()
 
     def cut(self, segment: int, digest: str) -> None:
-        """No more messages of a segment come.
+        """Register that a segment gets no more messages.
 
         Args:
             segment: Its number.
-            digest: As the catalog has it.
+            digest: Its digest in the catalog.
         """
         if not self._has_ended:
             with self._harmless():
@@ -426,7 +427,7 @@ class TableWriter:
         """Finish all tables.
 
         Args:
-            entry: The whole recording; topics of which it has more or fewer messages get none.
+            entry: The complete recording; topics with another number of messages get no table.
         """
         if not self._has_ended:
             with self._harmless():
@@ -434,7 +435,7 @@ class TableWriter:
         self.discard()
 
     def discard(self) -> None:
-        """Write no more, and leave nothing unfinished."""
+        """Stop writing, and delete all unfinished files."""
         self._has_ended = True
         for topic in self._topics.values():
             topic.give_up()
@@ -450,7 +451,7 @@ class TableWriter:
 
     @contextmanager
     def _harmless(self) -> Iterator[None]:
-        """Whatever fails here, the recording goes on without tables."""
+        """Continue the recording without tables after any failure."""
         try:
             yield
         except Exception as error:
@@ -480,7 +481,7 @@ class TableWriter:
         self._filled += size
 
     def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
-        """Make rows of what was collected."""
+        """Make rows of the collected messages."""
         if not self._held:
             return
         if data is None:
@@ -495,7 +496,7 @@ class TableWriter:
                     topic.add(self._piece(topic, codec, part, data, is_reduced=is_reduced))
 
     def _by_topic(self, messages: _Messages) -> Iterator[tuple[_Topic, Codec, bool, _Messages]]:
-        """Messages, those of each topic and encoding by themselves."""
+        """The messages, grouped by topic and encoding."""
         numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
         found = {number: self._topic_of(number) for number in numbers}
         kinds = list(dict.fromkeys((topic, codec, r) for topic, codec, r in found.values()))
@@ -555,7 +556,7 @@ class TableWriter:
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
-        """What fails of one topic costs this topic its table; a full disk costs all."""
+        """Limit a failure to the table of one topic; a full disk ends all tables."""
         try:
             yield
         except (OSError, MemoryError):
@@ -571,7 +572,7 @@ class TableWriter:
         return sum(topic.size for topic in self._topics.values())
 
     def _spill(self) -> None:
-        """Write rows of the largest topics, if too many wait in memory."""
+        """Write rows of the largest topics if too many are waiting in memory."""
         if self._pending < _PENDING:
             return
         self._decode()
@@ -586,12 +587,12 @@ class TableWriter:
                 continue
             for segment in sorted({piece.segment for piece in topic.pieces}):
                 with self._only(topic):
-                    # What waits of segments that are cut has no file to go to.
+                    # Waiting rows of closed segments have no file to go to.
                     place = segment if segment not in self._cut else max(self._seen)
                     opened += self._write(topic, place, topic.take({segment}))
 
     def _write(self, topic: _Topic, segment: int, pieces: list[_Piece]) -> int:
-        """Write rows to the unfinished file of a segment; returns how many files were begun."""
+        """Write rows to the unfinished file of a segment; returns the number of new files."""
         from hybridlog.tables.fields import UnfitError
 
         if not pieces:
@@ -613,7 +614,7 @@ class TableWriter:
     def _new_part(self) -> Path:
         if not self._has_parts:
             with suppress(FileNotFoundError):
-                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # of a crash
+                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # left from a crash
             files.make_folders(self._parts, depth=files.IN_FOLDER)
             self._has_parts = True
         self._numbers += 1
@@ -624,7 +625,7 @@ class TableWriter:
             raise OSError(errno.ENOSPC, "the disk is nearly full")
 
     def _cut_sealed(self) -> None:
-        """Finish files of segments that are sealed, and of which all messages have come."""
+        """Finish files of sealed segments of which all messages have been added."""
         if not self._sealed:
             return
         with self._lock:
@@ -641,7 +642,7 @@ class TableWriter:
             self._cut_segment(segment, digest)
 
     def _cut_segment(self, segment: int, digest: str) -> None:
-        """Finish the files of a segment; topics of few rows wait for the next one."""
+        """Finish the files of a segment; topics with few rows wait for the next one."""
         self._cut[segment] = digest
         for topic in self._topics.values():
             with self._only(topic):
@@ -651,7 +652,7 @@ class TableWriter:
                 self._finish(topic)
 
     def _finish(self, topic: _Topic) -> None:
-        """Finish a topic's files of segments that are cut."""
+        """Finish a topic's files of closed segments."""
         for segment in sorted(topic.files.keys() & self._cut.keys()):
             for file in topic.files.pop(segment):
                 name = topic_file(topic.schema, segment, topic.finished[segment])
@@ -674,7 +675,7 @@ class TableWriter:
         )
 
     def _publish(self, folder: str, path: Path, name: str) -> None:
-        """Give a finished file its name now, or remember which one it gets."""
+        """Give a finished file its name now, or record the name for the end."""
         if not self._is_new:
             self._finished.setdefault(folder, []).append((path, name))
             return
@@ -716,7 +717,7 @@ class TableWriter:
         return failed | {name for name in rows if rows[name] != entry.messages_of(name)}
 
     def _write_small(self) -> None:
-        """Topics of few rows, those of one type in one file."""
+        """Write topics with few rows, those of one type into one file."""
         by_schema: dict[str, list[_Topic]] = {}
         for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.pieces:
@@ -736,7 +737,7 @@ class TableWriter:
             self._publish(SMALL, file.path, small_file(topics[0].type, schema))
 
     def _exchange(self, place: Path, finished: list[tuple[Path, str]]) -> None:
-        """Put finished files in the place of those that are there."""
+        """Replace existing files with finished ones."""
         files.make_folders(place, depth=IN_TOPIC - 1)
         target = place
         if place.name != SMALL:
@@ -754,7 +755,7 @@ class TableWriter:
 
 
 def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.intp] | None:
-    """Rows by log time and arrival; None if they are in this order already."""
+    """Order of the rows by log time and arrival; None if they are in order already."""
     later = log_time[1:] > log_time[:-1]
     if not later.all():
         same = log_time[1:] == log_time[:-1]
@@ -806,7 +807,7 @@ def _own_columns(
 
 
 def _errors(pieces: Sequence[_Piece], states: NDArray[np.int8]) -> Any:
-    """Why messages are unreadable; their states are set."""
+    """Reasons why messages are unreadable; sets their states."""
     import pyarrow as pa
 
     if not any(piece.errors for piece in pieces):

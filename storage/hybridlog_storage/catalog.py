@@ -148,11 +148,10 @@ class RecordingEntry:
         tags: Tags given by the user.
         source: The recorded log: path, kind, profile, bytes, fingerprint.
         created: Time of recording, ns.
-        status: `open` (being recorded), `unfinished` (cut short by a crash, in a store that
-            cannot be written), `complete`, `recovered` (from a crash), `damaged`
-            (its source was, or a part of it is), `unproven` (its journal was lost, so other
-            losses could not be noticed).
-            end: The state at its end: losses, damage.
+        status: `open` (being recorded), `unfinished` (cut short by a crash, in a read-only
+            store), `complete`, `recovered` (from a crash), `damaged` (the source or a part of
+            the recording), or `unproven` (the journal was lost).
+        end: The state at its end: losses, damage.
         channels: Its channels.
         stored_bytes: Size of its segments.
         segments: Number of segments.

@@ -1,7 +1,7 @@
 """Writes a recording: groups messages into chunks, and chunks into segments.
 
-A channel with large payloads has chunks of its own, bounded in bytes and in log time, so
-that a slice of a scan reads little else. Channels with small payloads share chunks. Worker
+A channel with large payloads has chunks of its own, bounded in bytes and in log time. A
+slice of a scan therefore reads little else. Channels with small payloads share chunks. Worker
 threads compress, another thread writes. Chunks reach the file in the order in which they
 were closed, each with its indexes in one write. Only then the indexer gets them: **log
 first, index second**.

@@ -128,7 +128,7 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
         (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
         (("intervals", *GRIPPER, "--where", "position ="), "value"),
         (("intervals", *GRIPPER, "--at-least", "soon"), "not a duration"),
-        (("intervals", *GRIPPER, "--length", "0"), "no length"),
+        (("intervals", *GRIPPER, "--length", "0"), "length 0"),
         (("changes", *GRIPPER, "--fields", "positoin"), "position"),
         (("changes", *GRIPPER, "--fields", "position,"), "commas"),
         (("changes", *GRIPPER, "--fields", "position", "--tolerance", "-1"), "tolerance"),

@@ -149,7 +149,7 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
     assert sum(row["count"] for row in rows) == lost
     assert {row["cause"] for row in rows} == {"throttle"}
     assert run("losses", "--json", "-t", "/joint_states", store=store).json == []
-    assert "thinned out by wish" in run("fetch", "-t", "imu/data", "--count", store=store).err
+    assert "left out by a throttle" in run("fetch", "-t", "imu/data", "--count", store=store).err
     assert "/imu/data" in run("losses", store=store).out
 
 

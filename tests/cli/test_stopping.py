@@ -37,7 +37,7 @@ def test_a_stopped_record_leaves_nothing(
         process.send_signal(number)
         assert process.wait(60) == 128 + number
     text = (tmp_path / "out").read_text()
-    assert f"Nothing of {logs / 'robot.bag'} is kept. 1 recording made before stay" in text
+    assert f"Nothing of {logs / 'robot.bag'} is stored. 1 recording stored before" in text
     assert "Traceback" not in text
     assert recordings(fresh) == ["odd", "small"]
     assert {r["recording"] for r in run("ls", "--json", store=fresh).json} == {"odd", "small"}

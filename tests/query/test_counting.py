@@ -188,7 +188,7 @@ def test_containing_keeps_to_what_is_asked(plain: hl.Store) -> None:
     assert len(windows.containing(plain.topic("/other"))) == 0
     assert len(state.windows("5s", "5s").containing(state.where("s == 1"))) == 10
     for wrong in (state.limit(1), state.every(2)):
-        with pytest.raises(UsageError, match="do not fit"):
+        with pytest.raises(UsageError, match="cannot be combined"):
             windows.containing(wrong)
 
 

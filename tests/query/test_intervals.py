@@ -175,7 +175,7 @@ def test_intervals_as_a_frame() -> None:
 
 def test_intervals_refuse_what_cannot_be() -> None:
     found = intervals(("a", 0, 10**15))
-    with pytest.raises(UsageError, match="no length"):
+    with pytest.raises(UsageError, match="length 0"):
         found.cut(0)
     with pytest.raises(UsageError, match="intervals"):
         found.cut("1ns")
@@ -594,21 +594,21 @@ def test_without_mongodb_windows_still_choose(plain: hl.Store) -> None:
 def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
     state = plain.topic("/state")
     for wrong in (state.limit(1), state.every(2), state.reverse()):
-        with pytest.raises(UsageError, match="do not fit"):
+        with pytest.raises(UsageError, match="cannot be combined"):
             wrong.intervals()
-        with pytest.raises(UsageError, match="do not fit"):
+        with pytest.raises(UsageError, match="cannot be combined"):
             wrong.changes("s")
     with pytest.raises(UsageError, match="name one of /other, /state"):
         plain.all_topics().intervals()
-    with pytest.raises(UsageError, match="publish does not fit"):
+    with pytest.raises(UsageError, match="cannot use the publish clock"):
         state.clock("publish").between("+1s", "+2s").intervals()
-    with pytest.raises(UsageError, match="no time"):
+    with pytest.raises(UsageError, match="max_gap is 0"):
         state.intervals(max_gap=0)
-    with pytest.raises(UsageError, match="Which fields"):
+    with pytest.raises(UsageError, match="Name at least one field"):
         state.changes()
     with pytest.raises(UsageError, match="tolerance"):
         state.changes("s", tolerance=math.nan)
-    with pytest.raises(UsageError, match="How long"):
+    with pytest.raises(UsageError, match="give before, after or both"):
         state.windows()
     with pytest.raises(UsageError, match="one topic"):
         plain.all_topics().limit(1).windows("1s")

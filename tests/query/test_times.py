@@ -153,7 +153,7 @@ def test_message_lists_the_forms() -> None:
 
 @pytest.mark.parametrize("text", ["+5s", "-5s", "5s", "start", "end"])
 def test_relative_to_nothing(text: str) -> None:
-    with pytest.raises(TimeError, match="counts from a recording"):
+    with pytest.raises(TimeError, match="relative to a recording"):
         parse_time(text, start=None, end=None)
 
 

@@ -100,7 +100,7 @@ def test_a_file_that_is_cut_while_it_is_open(path: Path, table: pa.Table) -> Non
     reader = ParquetFileReader(path)
     with path.open("r+b") as file:
         file.truncate(1000)
-    with pytest.raises(StoreError, match="it was cut"):
+    with pytest.raises(StoreError, match="it was truncated"):
         reader.read(1, [1])
 
 

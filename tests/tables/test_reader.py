@@ -294,7 +294,7 @@ def test_tables_of_other_recordings_are_not_believed(recorded: hl.Store, tmp_pat
     assert all(tables.of(other, topic) for topic in topics_of(other))
     problems = [f.problem for f in recorded.verify(["log"]).findings]
     assert len(problems) == 3
-    assert all("something else" in problem for problem in problems)
+    assert all("belongs to other data" in problem for problem in problems)
     recorded.repair()
     assert compare(recorded) == 3600
 

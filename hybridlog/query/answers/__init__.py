@@ -1,1 +1,1 @@
-"""What a question is answered with besides a count: intervals, single messages."""
+"""Answers other than counts: intervals and single messages."""

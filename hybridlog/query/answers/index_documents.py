@@ -31,7 +31,7 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
     planner = Planner(session, question, counters)
     mongo = Mongo(session, counters)
     streams = [_of_part(planner, mongo, part, reverse=question.reverse) for part in planner.parts()]
-    # Keys are in the order of log time, recording and arrival, over all topics.
+    # Keys are ordered by log time, recording and arrival, over all topics.
     merged = heapq.merge(*streams, key=lambda pair: pair[1]["_id"], reverse=question.reverse)
     seen: Counter[str] = Counter()
     given = 0

@@ -1,4 +1,4 @@
-"""Intervals from messages: where a predicate holds, when fields change, time around events."""
+"""Intervals from messages: states, changes of fields, windows around events."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class IntervalQueries:
         self._planner = Planner(session, question, counters)
 
     def states(self, max_gap: DurationLike | None) -> Intervals:
-        """Where the predicate holds; see `Query.intervals`."""
+        """Intervals in which the predicate holds; see `Query.intervals`."""
         self._check("A state")
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
-            raise UsageError("A message that is believed for no time makes no interval.")
+            raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
         return Intervals.of(
             (part.recording.id, rows)
             for part, span in self._spans()
@@ -51,10 +51,10 @@ class IntervalQueries:
         )
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
-        """When fields change; see `Query.changes`."""
+        """Intervals in which fields change; see `Query.changes`."""
         self._check("A change")
         if not tolerance >= 0 or tolerance == np.inf:
-            raise UsageError(f"A tolerance is a number from 0 on, not {tolerance}.")
+            raise UsageError(f"A tolerance is a number that is 0 or greater, not {tolerance}.")
         quiet = parse_duration(pause)
         paths = [field.replace("[*]", "").replace("[]", "") for field in fields]
         return Intervals.of(
@@ -71,7 +71,7 @@ class IntervalQueries:
                 "without `limit` and `every`."
             )
         if parse_duration(before) == parse_duration(after) == 0:
-            raise UsageError("How long before or after? A window needs one of them.")
+            raise UsageError("A window needs a length: give before, after or both.")
         found = []
         for entry, times in self._times():
             rows = np.stack([times, times, np.ones_like(times)], axis=1)
@@ -82,7 +82,7 @@ class IntervalQueries:
         return wide.within({e.id: _extent(e) for e in self._session.recordings()})
 
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """In which spans of log time of a recording any message lies.
+        """Test which spans of log time of a recording contain any message.
 
         Args:
             recording: Id of the recording.
@@ -96,7 +96,7 @@ class IntervalQueries:
         """
         question = self._question
         if not question.returns_all:
-            raise UsageError("Any message counts: limit and every do not fit.")
+            raise UsageError("limit and every cannot be combined with a test for any message.")
         if recording not in question.recordings or not len(spans):
             return np.zeros(len(spans), np.bool_)
         rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
@@ -126,7 +126,7 @@ class IntervalQueries:
                 yield part.recording, found.log_time[found.holds]
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
-        """The one part of each recording, unbounded, with each span that is asked about."""
+        """The one part of each recording, without a time range, with each span of the question."""
         whole = replace(self._question, bounds=None, during=None)
         parts = {
             p.recording.id: p for p in Planner(self._session, whole, self._planner.counters).parts()
@@ -139,7 +139,7 @@ class IntervalQueries:
         holding = Holding(gap)
         before = self._last_before(part, span)
         if before is not None:
-            # The last message before the range still speaks for its beginning.
+            # The last message before the range determines the state at its beginning.
             time, holds = before
             yield clipped(holding.add(np.array([time]), np.array([holds]), counted=False), span)
         for found in self._planner.outcomes(_bounded(part, span)):
@@ -188,7 +188,7 @@ class IntervalQueries:
             )
         if not question.returns_all or question.reverse:
             raise UsageError(
-                f"{subject} is found in all messages: limit, every and reverse do not fit."
+                f"{subject} uses all messages; it cannot be combined with limit, every or reverse."
             )
 
 
@@ -197,7 +197,7 @@ _FURTHER = 64
 
 
 def _earlier(part: Part, span: Span) -> Iterator[int]:
-    """Beginnings of ever longer spans that end where a span begins; the recording's last."""
+    """Starts of ever longer spans that end where a span begins; the last is the recording's."""
     entry_span = part.recording.span
     if entry_span is None or span[0] <= entry_span[0]:
         return
@@ -215,7 +215,7 @@ def _bounded(part: Part, span: Span) -> Part:
 def _steps(
     carried: pa.StructArray | None, records: pa.StructArray, tolerance: float
 ) -> tuple[NDArray[np.bool_], pa.StructArray]:
-    """Which rows differ from the row before them, and the last row."""
+    """Find the rows that differ from the row before them; also returns the last row."""
     import pyarrow as pa
 
     from hybridlog.query.rows_differ import rows_differ
@@ -236,7 +236,7 @@ def _steps(
 
 
 def _extent(entry: RecordingEntry) -> Span:
-    """Log time in which a recording has messages, or may have some by now."""
+    """Span of log time in which a recording has messages, or may have some by now."""
     if entry.span is None:
         return 0, TIME_LIMIT - 1
     begin, end = span_of(entry)

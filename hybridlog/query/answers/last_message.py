@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
-    """The last message not after a time, in whichever recording it is; None if there is none."""
+    """The last message not after a time, in any recording; None if none exists."""
     moments: list[tuple[int, int, RecordingEntry]] = []
     for recording in session.chosen(question.recordings):
         start, end = span_of(recording)
@@ -36,7 +36,7 @@ def message_at(
         if start < end and start <= now:
             moments.append((min(now, end - 1), start, recording))
     best: tuple[tuple[int, str, int], Message] | None = None
-    # The recording that could hold the latest message is asked first: mostly it does.
+    # Ask the recording that could hold the latest message first: it usually does.
     for latest, start, recording in sorted(moments, key=itemgetter(0), reverse=True):
         if best is not None and latest < best[0][0]:
             break
@@ -119,9 +119,9 @@ class Found:
 
     Attributes:
         log_time: ns.
-        seq: Arrival number in its recording.
+        seq: Arrival number in the recording.
         batch: The messages of its chunk; `channel` holds channel ids.
-        row: Which of them it is.
+        row: Index of the message in the batch.
     """
 
     log_time: int
@@ -136,16 +136,16 @@ def last_message(
     latest: int,
     read: Callable[[ChunkEntry], StoredChunk],
 ) -> Found | None:
-    """The message with the greatest log time, of several the one that arrived last.
+    """The message with the greatest log time; of equal times, the one that arrived last.
 
     Args:
-        chunks: Those of one recording that may hold it, see `ChunkLists.before`.
-        channels: Ids of the channels that are asked about.
+        chunks: Chunks of one recording that may hold it, see `ChunkLists.before`.
+        channels: Ids of the channels in question.
         latest: The time, ns.
-        read: Gives the content of a chunk.
+        read: Returns the content of a chunk.
 
     Raises:
-        SegmentError: a chunk is not there, or damaged.
+        SegmentError: a chunk is missing or damaged.
     """
     best: Found | None = None
     for entry, last in chunks:
@@ -165,11 +165,11 @@ def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> in
     """The row of the last message; `channels` is None when the batch has no others."""
     fits = batch.log_time <= latest
     if channels is not None:
-        is_wanted = np.zeros(max(channels) + 2, np.bool_)  # the last one stands for all others
+        is_wanted = np.zeros(max(channels) + 2, np.bool_)  # last: all others
         is_wanted[list(channels)] = True
         fits &= is_wanted.take(batch.channel, mode="clip")
     (rows,) = fits.nonzero()
     if not len(rows):
         return None
-    # Rows are in the order of arrival: of equal times the last one counts.
+    # Rows are in order of arrival: of equal times, the last one is wanted.
     return int(rows[-1 - batch.log_time[rows][::-1].argmax()])

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 def in_force(
     session: Session, question: Question, counters: Counters
 ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
-    """Latched messages from before the time range of a question, to be put in front of it.
+    """Latched messages from before the time range of a question, which precede its answer.
 
-    Their log time becomes the beginning of the range, so that the slice spans no more
-    than was asked for; the publish time keeps saying when they were sent.
+    Their log time becomes the beginning of the range, which keeps the slice within the
+    range. The publish time remains the time at which they were sent.
     """
     latching: dict[str, set[str]] = {}
     for channel in Planner(session, question, counters).channels():

@@ -1,1 +1,1 @@
-"""The ways of answering a part of a question; they all give the same answer."""
+"""The engines that answer parts of a question; all give the same answer."""

@@ -1,4 +1,4 @@
-"""The protocol of the engines, and what they answer with."""
+"""The protocol of the engines and the types of their answers."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
 
 
 class UndecidedError(HybridlogError):
-    """An engine cannot tell what it was asked: another one has to."""
+    """An engine cannot decide; another engine has to."""
 
 
 class Need(Enum):
-    """What is asked of an engine."""
+    """Kind of answer requested from an engine."""
 
     COUNT = auto()
-    """How many messages match."""
+    """The number of matching messages."""
     OUTCOMES = auto()
-    """For each message, whether it matches."""
+    """For each message, True if it matches."""
     VALUES = auto()
-    """Fields of the messages that match."""
+    """Fields of the matching messages."""
     SELECTION = auto()
-    """Where the messages that match lie."""
+    """References to the matching messages."""
 
 
 class Outcomes(NamedTuple):
-    """What a predicate says of messages, in order of log time and arrival.
+    """Result of a predicate for each message, in order of log time and arrival.
 
     Attributes:
         log_time: int64[n], ns.
         seq: int64[n], arrival numbers.
-        holds: bool[n], whether each message matches.
+        holds: bool[n], True where the message matches.
     """
 
     log_time: NDArray[np.int64]
@@ -49,7 +49,7 @@ class Outcomes(NamedTuple):
 
 
 class Values(NamedTuple):
-    """Fields of messages that match, in order of log time and arrival.
+    """Fields of matching messages, in order of log time and arrival.
 
     Attributes:
         log_time: int64[n], ns.
@@ -65,43 +65,43 @@ class Values(NamedTuple):
 class Engine(Protocol):
     """One way of answering a part of a question.
 
-    All engines that can answer a part give the same answer. The planner asks `cost` first
-    and calls only what the cost was asked for.
+    All engines that can answer a part give the same answer. The planner calls `cost`
+    first, and then only the methods for which `cost` returned a figure.
     """
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
-        """Seconds that the answer takes, about; None if the engine cannot give it.
+        """Estimated seconds for the answer; None if the engine cannot give it.
 
         Args:
             part: The part of the question.
-            need: What is wanted.
+            need: The kind of answer.
             fields: Paths of the fields wanted, for `Need.VALUES`; None for all.
         """
 
     def count(self, parts: Sequence[Part]) -> int:
-        """Number of messages that match, in all of the parts."""
+        """Number of matching messages in all parts."""
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """For each message of the part's topic and time, whether it matches."""
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Fields of the messages that match."""
+        """Fields of the matching messages."""
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Where the messages that match lie, in the chunks of some tasks."""
+        """References to the matching messages in the chunks of some tasks."""
 
 
 class Counting:
     """An engine that only counts."""
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError

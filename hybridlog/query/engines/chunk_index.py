@@ -1,7 +1,7 @@
 """Counts messages in ranges of log time from the chunk index.
 
-The entry of a chunk says how many messages of each channel it holds, from when to when. A
-chunk inside a range is counted without reading it. For a chunk that reaches over an end,
+The entry of a chunk has the number of messages of each channel, and their first and last
+time. A chunk inside a range is counted without reading it. For a chunk that crosses an end,
 the message indexes are read from the segment: 16 bytes a message, and no payload. The
 entry holds their checksum.
 """
@@ -31,11 +31,11 @@ _ENTRY_S = 2e-5  # seconds to fetch the entry of a chunk
 _READ_S = 1e-4  # seconds to read the message indexes of a chunk
 _TIME_S = 2e-7  # seconds to sort the log time of a message
 _OPEN_S = 1.0
-"""An open recording is counted here only when MongoDB is unavailable: the catalog lags."""
+"""An open recording is counted here only if MongoDB is unavailable: the catalog lags."""
 
 
 class ChunkIndex:
-    """Answers by log time alone, without a predicate.
+    """Answers questions about log time alone, without a predicate.
 
     Args:
         session: The open store.
@@ -66,15 +66,15 @@ class ChunkIndex:
         """Number of messages in the windows of the parts.
 
         Raises:
-            SegmentError: a segment cannot be read, or is damaged where it is needed.
+            SegmentError: a segment cannot be read, or is damaged in a part that is needed.
         """
         return sum(map(self._count, parts))
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
-        """All log times in the windows, sorted; arrival numbers are not known and 0.
+        """All log times in the windows, sorted; arrival numbers are unknown and 0.
 
         Raises:
-            SegmentError: a segment cannot be read, or is damaged where it is needed.
+            SegmentError: a segment cannot be read, or is damaged in a part that is needed.
         """
         windows = part.log_windows
         channels = [channel.channel_id for channel in part.channels]
@@ -94,11 +94,11 @@ class ChunkIndex:
         yield Outcomes(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError
 
     def _count(self, part: Part) -> int:
@@ -126,14 +126,14 @@ def count_in_chunks(
     """Number of messages of some channels of a recording within some ranges.
 
     Args:
-        chunks: All that may hold such messages.
+        chunks: All chunks that may hold such messages.
         channels: Ids of the channels.
         windows: int64[n, 2], `[begin, end)` of log time, ns, apart and in order.
-        reader_of: Gives the reader of a segment, by its number.
+        reader_of: Returns the reader of a segment, by its number.
         counters: Count the bytes that are read.
 
     Raises:
-        SegmentError: a segment cannot be read, or is damaged where it is needed.
+        SegmentError: a segment cannot be read, or is damaged in a part that is needed.
     """
     held = [
         (number, channel, stats.first, stats.last, stats.messages)
@@ -144,7 +144,7 @@ def count_in_chunks(
     if not held or not len(windows):
         return 0
     number, channel, first, last, messages = np.array(held, np.int64).T
-    # Of the windows only the first that ends after a chunk has begun can hold all of it.
+    # Only the first window that ends after the start of a chunk can contain the whole chunk.
     window = np.searchsorted(windows[:, 1], first, "right")
     begin, end = np.append(windows, [[np.iinfo(np.int64).max] * 2], axis=0)[window].T
     touched = begin <= last

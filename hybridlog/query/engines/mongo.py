@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.index_columns import KeyColumns
 
-_QUESTION_S = 0.4e-3  # seconds of a question to MongoDB
-_LOOK_S = 0.7e-6  # seconds to look at a document
+_QUESTION_S = 0.4e-3  # seconds for a query to MongoDB
+_LOOK_S = 0.7e-6  # seconds to examine a document
 _DOCUMENT_S = 4e-6  # seconds to send a document
 _WINDOWS_A_QUESTION = 14
 _BATCH = 50_000
@@ -40,7 +40,7 @@ _READABLE: _Filter = {"_meta.error": {"$exists": False}}
 
 
 class Mongo:
-    """Finds index documents. Fields are never taken from them: messages hold the exact values.
+    """Finds index documents. Fields come from the messages, which hold the exact values.
 
     Args:
         session: The open store.
@@ -68,7 +68,7 @@ class Mongo:
         )
 
     def filter_of(self, part: Part) -> MongoFilter:
-        """The predicate of a part as MongoDB understands it."""
+        """The predicate of a part as a MongoDB filter."""
         if part.predicate is None:
             return to_mongo(And(()))
         found = to_mongo(part.predicate.root, part.field_types)
@@ -77,15 +77,15 @@ class Mongo:
             return found
         if all(path.startswith("_meta") for path in part.predicate.fields()):
             return found
-        # A message that cannot be read has no fields to be asked for.
+        # An unreadable message has no fields.
         possible, certain = (joined(_READABLE, f) for f in (found.filter, found.certain))
         return MongoFilter(possible, certain, found.is_exact)
 
     def undecided(self, part: Part) -> int:
-        """Number of documents that do not tell whether their message matches.
+        """Number of documents that cannot decide whether their message matches.
 
         Long arrays are summaries there, some integers are rounded, and MongoDB does not
-        search with patterns: what it finds may be more than what matches.
+        search with patterns. Its candidates may be more than the matches.
 
         Raises:
             DatabaseError: MongoDB is unavailable.
@@ -123,7 +123,7 @@ class Mongo:
         return sum(index.count_each(asked))
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
-        """Keys of the documents that match merged with keys of those that do not."""
+        """Keys of the matching documents merged with keys of the others."""
         own = self.filter_of(part).filter
         collection = collection_of(part.topic)
         for condition in conditions(part):
@@ -134,7 +134,7 @@ class Mongo:
             yield from _merged(yes, no)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Not answered here: `cost` says None."""
+        """Not supported: `cost` returns None."""
         raise NotImplementedError
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
@@ -151,7 +151,7 @@ class Mongo:
                 "_id": {"$gte": key_bound(low), "$lt": key_bound(high + 1)},
                 "_meta.rec": part.recording.key,
             }
-            # With the order, MongoDB weighs the range against an index of the user's.
+            # With the order, MongoDB compares the range with an index of the user's.
             for raw in index.find_raw(
                 collection_of(part.topic),
                 joined(condition, self.filter_of(part).filter),
@@ -188,7 +188,7 @@ class Mongo:
         return self._session.index_for("A predicate", entries)
 
     def _keys(self, part: Part, collection: str, asked: _Filter) -> Iterator[KeyColumns]:
-        """Keys of the documents that a filter finds, in order, never an empty batch."""
+        """Keys of the documents that a filter finds, in order; no batch is empty."""
         index = self._index([part])
         for raw in index.find_raw(collection, asked, KEY, sort=[("_id", 1)], batch_size=_BATCH):
             keys = key_columns(raw)
@@ -206,7 +206,7 @@ def _is_older(part: Part) -> bool:
 
 
 def joined(condition: _Filter, predicate: Mapping[str, object]) -> _Filter:
-    """Both filters as one."""
+    """Both filters joined by *and*."""
     return {"$and": [condition, dict(predicate)]} if predicate else condition
 
 
@@ -228,10 +228,10 @@ def _between(span: Span) -> _Filter:
 
 
 def _merged(yes: Iterator[KeyColumns], no: Iterator[KeyColumns]) -> Iterator[Outcomes]:
-    """Two streams of keys as one in order, with the stream that each comes from."""
+    """Two ordered streams of keys as one, with the stream of each key."""
     left, right = next(yes, None), next(no, None)
     while left is not None and right is not None:
-        # No later key of either stream lies before the nearer end.
+        # No later key of either stream precedes the nearer end.
         end = min((int(k.time[-1]), int(k.seq[-1])) for k in (left, right))
         here, there = left.place_after(*end), right.place_after(*end)
         time = np.concatenate([left.time[:here], right.time[:there]])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.session import Session
 
-_START_S = 1e-3  # seconds to begin
+_START_S = 1e-3  # seconds to start
 _BYTE_S = 2e-9  # seconds to read and decompress a byte
 _ROW_S = 1.5e-6  # seconds to decode a message by columns
 _OBJECT_S = 20e-6  # seconds to make a Python object of a message
@@ -25,7 +25,7 @@ _BY_COLUMNS = {"ros1", "cdr"}
 
 
 class PayloadScan:
-    """Reads the chunks of the parts; needs nothing but the segments.
+    """Reads the chunks of the parts; needs only the segments.
 
     Args:
         session: The open store.
@@ -88,15 +88,15 @@ class PayloadScan:
                 yield Values(own.batch.log_time[good], own.seq[good], decoded.records)
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Nothing is known before the messages are read."""
+        """No selection: nothing is known before the messages are read."""
         return RowSelection({})
 
     def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
-        """What to read for some parts.
+        """The plan for reading some parts.
 
         Args:
-            parts: Of one question.
-            filtered: Whether only messages that match are wanted.
+            parts: Parts of one question.
+            filtered: True for only the matching messages.
         """
         channels: list[RecordedChannel] = []
         filters: dict[int, MessageFilter] = {}
@@ -114,7 +114,7 @@ class PayloadScan:
         return ScanPlan(channels, scans, clock, filters=filters, counters=self._counters)
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
-        """The chunks of a recording that may hold what is wanted."""
+        """The chunks of a recording that may hold wanted messages."""
         bounds, clock = part.bounds, part.clock
         if part.windows is not None and part.is_by_log_time:
             windows = part.log_windows

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 class Statistics(Counting):
-    """Knows how many messages each channel has; reads nothing."""
+    """Uses the number of messages of each channel; reads nothing."""
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
-        """Nothing for a count without predicate and time range."""
+        """Zero for a count without predicate and time range."""
         is_plain = part.predicate is None and part.is_unbounded
         return 0.0 if need is Need.COUNT and is_plain else None
 

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog.tables.reader import TableRows, TopicTable
 
-_OPEN_S = 2e-4  # seconds to ask a table that is open
+_OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
 _FIXED_ARRAY = re.compile(r"\[(\d+)\]$")
-_WHOLE = 32  # elements; tables hold longer arrays as summaries
+_WHOLE = 32  # elements; longer arrays are summaries in tables
 
 
 class TablesEngine:
-    """Reads the columns that a question is about, and nothing else.
+    """Reads only the columns of the question.
 
     Args:
         session: The open store.
@@ -73,16 +73,16 @@ class TablesEngine:
         return None if is_older else table
 
     def count(self, parts: Sequence[Part]) -> int:
-        """Number of rows of which the predicate holds.
+        """Number of rows for which the predicate holds.
 
         Raises:
-            UndecidedError: the columns of a table cannot tell.
+            UndecidedError: the columns of a table cannot decide.
             StoreError: a table is damaged.
         """
         return sum(map(self.check, parts))
 
     def check(self, part: Part) -> int:
-        """The count of one part; afterwards it is known that the columns can tell."""
+        """The count of one part; confirms that the columns can decide."""
         if part not in self._counts:
             rows = self._rows(part)
             self._counts[part] = sum(int(holds.sum()) for _, holds in rows)
@@ -95,7 +95,7 @@ class TablesEngine:
             yield Outcomes(rows.t, rows.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Columns of the rows of which the predicate holds, in order."""
+        """Columns of the rows for which the predicate holds, in order."""
         self.check(part)
         for rows, holds in self._rows(part, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
@@ -103,7 +103,7 @@ class TablesEngine:
                 yield Values(chosen.t, chosen.seq, _only(chosen.records, fields))
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Places of the rows of which the predicate holds."""
+        """References of the rows for which the predicate holds."""
         wanted = {task.key for task in tasks}
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         for part in parts:
@@ -135,15 +135,15 @@ class TablesEngine:
     def _rows(
         self, part: Part, fields: Collection[str] | None = (), own: Collection[str] = ()
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
-        """Rows of the part's time with the outcome for each.
+        """Rows of the part's time, with the outcome for each.
 
         Raises:
-            UndecidedError: the columns cannot tell.
-            StoreError: the table is damaged, or gone.
+            UndecidedError: the columns cannot decide.
+            StoreError: the table is damaged or missing.
         """
         table = self._session.tables.of(part.recording, part.topic)
         if table is None:
-            raise StoreError(f"The table of {part.topic} is not there any more.")
+            raise StoreError(f"The table of {part.topic} is missing.")
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
         columns = {*own}
         if part.predicate is not None and "_meta.pub" in part.predicate.fields():
@@ -178,13 +178,13 @@ _REFERENCE = ("seg", "chunk", "off")
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
-    """Columns that the predicate of a part is about."""
+    """Columns of the predicate of a part."""
     found: set[str] = set()
     for condition in part.predicate.conditions() if part.predicate is not None else ():
         path = condition.field.names
         if path.startswith("_meta"):
             continue
-        # `ranges.min` is a column of its own, or the array that it is the least element of.
+        # `ranges.min` is a column of its own, or the least element of an array.
         while "." in path and not table.has(path):
             path = path.rpartition(".")[0]
         found.add(path)
@@ -192,14 +192,14 @@ def _paths(table: TopicTable, part: Part) -> set[str]:
 
 
 def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> set[str] | None:
-    """Columns to read: those of the predicate and those asked for; None for all."""
+    """Columns to read: those of the predicate and the requested ones; None for all."""
     if fields is None:
         return None
     return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}
 
 
 def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructArray:
-    """The records without what only the predicate is about."""
+    """The records without the columns that only the predicate needs."""
     if fields is None:
         return records
     return _pruned(records, [path.replace("[]", "").split(".") for path in fields])
@@ -222,7 +222,7 @@ def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.Struc
 
 
 def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
-    """Whether tables hold these fields as the messages do: no array that may be a summary."""
+    """True if tables hold these fields in full: no array that may be a summary."""
     types = part.field_types
     if types is None:
         return False

@@ -1,1 +1,1 @@
-"""Predicates over the fields of messages: one tree, and what is made of it."""
+"""Predicates over the fields of messages: one tree, and the forms it is translated to."""

@@ -1,10 +1,10 @@
-"""Predicates out of MongoDB filters that a user wrote.
+"""Predicates from MongoDB filters that a user wrote.
 
-Only operators that compare values are let through. Everything that runs code on the
-server (`$where`, `$function`, `$accumulator`), reads something else, or is not known here
-is refused, and so are values that carry code. What the language can say becomes the same
-tree as its text; the rest stays a piece of a filter that only MongoDB answers. Patterns
-have RE2's syntax, and stand where the language can say them.
+Only operators that compare values are allowed. Operators that run code on the server
+(`$where`, `$function`, `$accumulator`), read other data or are unknown are refused. Values
+with code in them are refused, too. Conditions that the language has become the same tree as
+its text; the rest remains a filter that only MongoDB answers. Patterns have RE2's syntax,
+and are allowed where the language has them.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from hybridlog_storage.errors import WhereError
 MAX_DEPTH = 100
 """Deepest nesting; MongoDB itself takes up to 180 levels."""
 MAX_NODES = 20_000
-"""Most keys and values in all."""
+"""Maximum number of keys and values in total."""
 MAX_CHARACTERS = 1_000_000
-"""Most characters in all keys and strings."""
+"""Maximum number of characters in all keys and strings."""
 
 _ORDERS: dict[str, Order] = {"$lt": "<", "$lte": "<=", "$gt": ">", "$gte": ">="}
 _LOGICAL = {"$and", "$or", "$nor"}
@@ -66,7 +66,7 @@ _EXPRESSIONS = frozenset(
         *("$multiply", "$pow", "$round", "$sqrt", "$subtract", "$trunc"),
         *("$sin", "$cos", "$tan", "$asin", "$acos", "$atan", "$atan2"),
         *("$degreesToRadians", "$radiansToDegrees"),
-        # arrays; none that makes one longer than its input
+        # arrays; no operator makes one longer than its input
         *("$allElementsTrue", "$anyElementTrue", "$arrayElemAt", "$filter", "$first", "$last"),
         *("$in", "$indexOfArray", "$isArray", "$map", "$size", "$slice"),
         *("$avg", "$max", "$min", "$sum", "$stdDevPop", "$stdDevSamp"),
@@ -85,15 +85,15 @@ _BSON_VALUES = {"ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
 
 
 def from_mongo(query: Mapping[str, object]) -> Predicate:
-    """The predicate that a filter means.
+    """The predicate that is equivalent to a filter.
 
-    Numpy scalars are taken as Python numbers, tuples as lists, compiled patterns as `$regex`.
+    Numpy scalars become Python numbers, tuples become lists, compiled patterns become `$regex`.
 
     Args:
         query: A filter as `pymongo` takes it.
 
     Raises:
-        WhereError: What is not allowed and where it stands.
+        WhereError: a part is not allowed; the message has its place.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
@@ -160,7 +160,7 @@ class _Reader:
         return found[0] if len(found) == 1 else And(tuple(found))
 
     def _operand(self, operator: str, value: object, path: _Path, depth: int) -> object:
-        """What stands behind an operator, in plain Python values."""
+        """The operand of an operator, in plain Python values."""
         if operator in _LITERAL or operator in _PLAIN:
             return self._literal(value, path, depth + 1)
         if operator in _LISTS:
@@ -190,7 +190,7 @@ class _Reader:
         return self._operators(name, inner, path, depth + 1)
 
     def _element(self, value: object, path: _Path, depth: int) -> dict[str, object]:
-        """What an element must satisfy, as a filter: only MongoDB can answer it."""
+        """The condition on an element, as a filter: only MongoDB can answer it."""
         inner = _mapping(value, path)
         keys = [key for key in inner if isinstance(key, str) and key.startswith("$")]
         if keys and not set(keys) & _LOGICAL:
@@ -357,7 +357,7 @@ def _plain_number(value: object) -> object:
 
 def _plain_text(value: object) -> str:
     text = str(value)
-    text.encode()  # half a surrogate pair is a ValueError
+    text.encode()  # half a surrogate pair raises a ValueError
     return text
 
 
@@ -373,7 +373,7 @@ def _plain_date(value: object) -> object:
 
 _SCALARS: tuple[tuple[Callable[[object], bool], Callable[[object], object]], ...] = (
     (lambda value: value is None or isinstance(value, bool), lambda value: value),
-    # bson.code.Code is a str, so the module is looked at first.
+    # bson.code.Code is a str, so its module is tested first.
     (
         lambda value: _is_bson(value) and type(value).__name__ in _BSON_VALUES | {"Int64"},
         lambda value: value,
@@ -395,16 +395,16 @@ _SCALARS: tuple[tuple[Callable[[object], bool], Callable[[object], object]], ...
 
 
 def _comparison(name: str, operator: str, operand: object) -> Node | None:
-    """A condition as a node of the language; None when it says something else.
+    """A condition as a node of the language; None if the language has no equivalent.
 
-    MongoDB's equality with null also finds missing fields, and its orders know values
-    that the language does not put in order.
+    MongoDB's equality with null also finds missing fields, and MongoDB orders values that
+    have no order in the language.
     """
     asked = _field(name)
     if asked is None:
         return None
     if isinstance(operand, int) and not isinstance(operand, bool):
-        operand = int(operand)  # an Int64 of BSON is one
+        operand = int(operand)  # also converts an Int64 of BSON
     if operator in {"$in", "$nin"} and isinstance(operand, list):
         values = tuple(value for value in operand if _is_value(value))
         member = Member(asked, values, negated=False) if len(values) == len(operand) else None
@@ -422,12 +422,12 @@ def _comparison(name: str, operator: str, operand: object) -> Node | None:
 
 
 def _is_value(operand: object) -> TypeGuard[Value]:
-    """Whether an operand means for MongoDB what it means in the language."""
+    """True if an operand has the same meaning for MongoDB and in the language."""
     return type(operand) in {bool, int, float, str}
 
 
 def _field(name: str) -> Field | None:
-    """The field of a path; None when only MongoDB understands it."""
+    """The field of a path; None if only MongoDB understands it."""
     parts = name.split(".")
     if not all(parts) or parts[0] == "_id" or name == "_meta.inserted_at":
         return None
@@ -457,7 +457,7 @@ def _check_width(value: object, path: _Path) -> None:
 
 
 def _has_operators(value: Mapping[str, object], path: _Path) -> bool:
-    """Whether a mapping consists of operators, not of names."""
+    """True if a mapping has operators as keys, not names."""
     marked = [isinstance(key, str) and key.startswith("$") for key in value]
     if any(marked) and not all(marked):
         raise _refused(path, "mixes operators and names")

@@ -1,4 +1,4 @@
-"""Comparisons of numbers and strings, exact whatever their types."""
+"""Exact comparisons of numbers and strings of any types."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeGuard
 from hybridlog.query.predicate.tree import Value
 
 LOW, HIGH = -(2**63), 2**63 - 1
-"""Ends of int64."""
+"""Smallest and greatest int64."""
 ORDERS: dict[str, Callable[[float | str, float | str], bool]] = {
     "<": lambda one, other: one < other,  # type: ignore[operator]
     "<=": lambda one, other: one <= other,  # type: ignore[operator]
@@ -19,17 +19,17 @@ ORDERS: dict[str, Callable[[float | str, float | str], bool]] = {
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is an integer or a float; booleans are neither."""
+    """True if a value is an integer or a float; booleans are neither."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_nan(value: object) -> bool:
-    """Whether a value is NaN."""
+    """True if a value is NaN."""
     return isinstance(value, float) and math.isnan(value)
 
 
 def equal(value: object, wanted: Value) -> bool:
-    """Whether two values are equal: numbers by value, NaN with NaN, nothing across kinds."""
+    """True if two values are equal: numbers by value, NaN with NaN, no other types mixed."""
     if is_number(value) and is_number(wanted):
         return value == wanted or (is_nan(value) and is_nan(wanted))
     if isinstance(wanted, str) or wanted is None or isinstance(wanted, bool):
@@ -38,14 +38,14 @@ def equal(value: object, wanted: Value) -> bool:
 
 
 def ordered(order: str, value: object, wanted: Value) -> bool:
-    """Whether an order holds; numbers and strings have one, nothing else has."""
+    """True if an order holds; only numbers and strings have one."""
     if isinstance(value, str) and isinstance(wanted, str):
         return ORDERS[order](value, wanted)
     return is_number(value) and is_number(wanted) and ORDERS[order](value, wanted)
 
 
 def nearest(value: float) -> float:
-    """The nearest double; beyond the largest, an infinity."""
+    """The nearest double; an infinity beyond the largest."""
     try:
         return float(value)
     except OverflowError:
@@ -53,11 +53,11 @@ def nearest(value: float) -> float:
 
 
 def for_doubles(order: str, value: float) -> tuple[str, float]:
-    """The comparison with a double that holds for the same doubles; `== nan` never comes back.
+    """The equivalent comparison of doubles with a double; it is never `== nan`.
 
     Args:
         order: `<`, `<=`, `>` or `>=`.
-        value: What they are compared with: an int may be no double.
+        value: The value they are compared with; an int may not be a double.
     """
     near = nearest(value)
     if near == value:
@@ -70,10 +70,10 @@ def for_doubles(order: str, value: float) -> tuple[str, float]:
 
 
 def for_integers(order: str, value: float) -> tuple[str, int] | bool:
-    """The comparison with an integer that holds for the same integers.
+    """The equivalent comparison of integers with an integer.
 
     Returns:
-        Order and bound; or whether the comparison holds for all, or for none.
+        Order and bound; or a bool if the comparison holds for all or for none.
     """
     if isinstance(value, int):
         return order, value
@@ -85,5 +85,5 @@ def for_integers(order: str, value: float) -> tuple[str, int] | bool:
         return order, int(value)
     if order == "==":
         return False
-    # Between two integers: x < 1.5 is x < 2, x <= 1.5 is x <= 1.
+    # Between two integers: x < 1.5 becomes x < 2, x <= 1.5 becomes x <= 1.
     return order, (math.ceil if order in {"<", ">="} else math.floor)(value)

@@ -13,26 +13,26 @@ r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "la
     value       = integer | 0xff | 1e-3 | inf | nan | "string" | true | false | null
                 | t"2015-03-03T18:28:33.5Z" | 5ms | 1m30s
 
-Words of the language may be written in any case, names not. A name that is no
-identifier, or is a word of the language at the beginning of a condition, stands in
-backquotes: `` `a-b` ``. A path through an array (`status[].level`, `status.level`) asks
-for *any* element; several conditions on one array may be met by different elements, and
-`0 < x < 5` is no more than `0 < x and x < 5`. Times and durations are integer nanoseconds,
-as they are stored.
+Keywords may be in any case; names are case-sensitive. A name that is no
+identifier, or that is a keyword at the beginning of a condition, needs
+backquotes: `` `a-b` ``. A path through an array (`status[].level`, `status.level`) means
+*any* element. Different elements may satisfy several conditions on one array:
+`0 < x < 5` means `0 < x and x < 5`. Times and durations are integer nanoseconds,
+as stored.
 
-`!=`, `not in` and `!~` hold only where the field exists, and say of an array that no
-element is (or matches) that. `not (...)` is plain negation: it also holds where the field
-is missing. Numbers are compared by value whatever their type; a comparison of things of
+`!=`, `not in` and `!~` hold only where the field exists. For an array, they mean that no
+element equals or matches the operand. `not (...)` is plain negation: it also holds where
+the field is missing. Numbers are compared by value, whatever their type. A comparison of
 different kinds (a number and a string) is false. NaN equals NaN and is neither less nor
 greater than anything. `== null` finds a stored null, not a missing field.
 
-The pattern of `~` is found anywhere in the string unless anchored; its backslashes stand
-for themselves. It has RE2's syntax, so that it takes linear time.
+The pattern of `~` is found anywhere in the string unless anchored; its backslashes have no
+escaping of their own. It has RE2's syntax and takes linear time.
 
 `x.min`, `x.max`, `x.mean` and `x.n` of an array are its least and greatest finite element,
-their mean, and the number of elements. Where the types of the fields are not known, a
-field of that name in an element comes before them. An order asks for any finite element
-of an array.
+their mean, and the number of elements. Where the types of the fields are unknown, a
+field of that name in an element takes precedence. An order holds for an array if it
+holds for any finite element.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from hybridlog.query.predicate.tree import (
 from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 50
-"""Deepest nesting of brackets and negations."""
+"""Maximum nesting of brackets and negations."""
 
 _ORDERS: dict[str, Order] = {
     "==": "==",
@@ -83,17 +83,17 @@ _VALUE_WORDS: dict[str, Value] = {
 
 
 def parse(text: str) -> Predicate:
-    """Read a predicate.
+    """Parse a predicate.
 
     Raises:
-        WhereError: Not of the grammar; too long, too deep; a pattern that is refused.
+        WhereError: a syntax error, too long, too deep, or a refused pattern.
     """
     if not isinstance(text, str):
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
     return _parsed(text)
 
 
-@lru_cache(maxsize=128)  # of a small topic, reading the predicate takes as long as the answer
+@lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
 def _parsed(text: str) -> Predicate:
     return _Parser(text).parse()
 
@@ -278,7 +278,7 @@ class _Parser:
         return self._tokens[self._at]
 
     def _take(self, *words: str) -> bool:
-        """Go past the next token if it is one of these words or operators."""
+        """Consume the next token if it is one of these words or operators."""
         token = self._peek()
         if (token.text if token.kind == "operator" else token.keyword or None) in words:
             self._at += 1

@@ -6,17 +6,17 @@ from functools import lru_cache
 from typing import Protocol
 
 MAX_LENGTH = 1_000
-"""Longest pattern, characters."""
-_MAX_BYTES = 8 << 20  # of a compiled pattern; also what Arrow allows
+"""Maximum length of a pattern, characters."""
+_MAX_BYTES = 8 << 20  # of a compiled pattern; Arrow has the same limit
 _SPECIAL = frozenset("\\.[](){}*+?^$|\0")
 _BYTE = "matches a byte, and strings are characters"
 
 
 class RegexError(ValueError):
-    """Why a pattern is refused.
+    """The reason why a pattern is refused.
 
     Attributes:
-        position: Index of the character at fault.
+        position: Index of the offending character.
     """
 
     def __init__(self, reason: str, position: int = 0) -> None:
@@ -39,11 +39,11 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
     """Compile a pattern in RE2's syntax.
 
     Args:
-        pattern: As the user wrote it.
-        max_length: Longest pattern, characters.
+        pattern: The pattern as the user wrote it.
+        max_length: Maximum length of the pattern, characters.
 
     Raises:
-        RegexError: With the reason and the place.
+        RegexError: the pattern is refused; has the reason and the place.
     """
     if len(pattern) > max_length:
         raise RegexError(f"longer than {max_length} characters", max_length)
@@ -65,7 +65,7 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
 
 
 def text_of(value: str) -> str:
-    """The text, with U+FFFD for halves of surrogate pairs, which UTF-8 has no form for."""
+    """The text, with U+FFFD for unpaired surrogates, which UTF-8 cannot encode."""
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -74,16 +74,16 @@ def text_of(value: str) -> str:
 
 
 def is_literal(pattern: str) -> bool:
-    """Whether a pattern asks for a text as it stands, possibly at the beginning.
+    """True if a pattern is plain text, possibly anchored at the beginning.
 
-    Any engine finds such a text, within any limit of its steps.
+    Every engine finds such a text, within any limit on steps.
     """
     text = pattern.removeprefix("^")
     return bool(text) and not _SPECIAL.intersection(text)
 
 
 def _refusal(pattern: str, reported: bytes | str) -> RegexError:
-    """The error for what RE2 says, such as `missing ): (a`."""
+    """The error for a message of RE2, such as `missing ): (a`."""
     text = reported.decode(errors="replace") if isinstance(reported, bytes) else str(reported)
     reason, _, fault = text.partition(": ")
     place = max(pattern.find(fault), 0) if fault else 0
@@ -96,7 +96,7 @@ def _refusal(pattern: str, reported: bytes | str) -> RegexError:
 
 
 def _byte_escape(pattern: str) -> int | None:
-    r"""Index of `\\C`, None when there is none."""
+    r"""Index of `\\C`, None if not found."""
     at = pattern.find("\\")
     while at >= 0:
         if pattern[at + 1 : at + 2] == "C":

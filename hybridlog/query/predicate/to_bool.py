@@ -1,8 +1,8 @@
-"""Predicates on one message in memory: the reference meaning.
+"""Predicates on one message in memory: the reference semantics.
 
-Every other engine gives the answer that `to_bool` gives on the decoded message. Arrays may
-be summarised, as index documents and reduced messages have them. A condition that a summary
-cannot decide is neither true nor false, and a predicate holds when it is surely true.
+Every other engine gives the same answer as `to_bool` on the decoded message. Arrays may
+be summarised, as in index documents and reduced messages. A condition that a summary
+cannot decide is neither true nor false, and a predicate holds when it is certainly true.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hybridlog_storage.errors import WhereError
 Message: TypeAlias = Mapping[str, object]
 """A decoded message: dict, list, str, bytes, bool, int, float, None."""
 Truth: TypeAlias = bool | None
-"""None when a summary cannot decide."""
+"""None if a summary cannot decide."""
 Decision: TypeAlias = Callable[[Message], Truth]
 
 _Parts: TypeAlias = tuple[str | int, ...]
@@ -53,15 +53,15 @@ def to_bool(
     *,
     summarised: bool = False,
 ) -> Test:
-    """A predicate as a test of one message after the other.
+    """A predicate as a test of single messages.
 
     Args:
         node: The predicate.
-        types: Types of the fields; None when each message decides.
-        summarised: Whether long arrays are summaries in messages without types.
+        types: Types of the fields; None if each message decides.
+        summarised: True if messages without types have summaries for long arrays.
 
     Raises:
-        WhereError: Only MongoDB can answer a part of it.
+        WhereError: only MongoDB can answer a part of it.
     """
     decide = to_truth(node, types, summarised=summarised)
     return lambda message: decide(message) is True
@@ -73,7 +73,7 @@ def to_truth(
     *,
     summarised: bool = False,
 ) -> Decision:
-    """A predicate as a function that is None for messages whose summaries cannot decide.
+    """A predicate as a function that returns None when a summary cannot decide.
 
     Args:
         node: The predicate.
@@ -81,18 +81,18 @@ def to_truth(
         summarised: As for `to_bool`.
 
     Raises:
-        WhereError: Only MongoDB can answer a part of it.
+        WhereError: only MongoDB can answer a part of it.
     """
     reader = _Reader(FieldTypes.of(types), summarised)
     return _node(root_of(node), reader)
 
 
 def numbers_at(message: Message, path: str) -> list[float]:
-    """The numbers that a path such as `pose.position.x` or `ranges.min` leads to.
+    """The numbers at a path such as `pose.position.x` or `ranges.min`.
 
     Args:
         message: A message or an index document.
-        path: Names and places with dots between them.
+        path: Names and indexes separated by dots.
     """
     parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
     found = _Reader(FieldTypes.of(None), summarised=False).leaves(message, Field(parts))
@@ -102,15 +102,15 @@ def numbers_at(message: Message, path: str) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class _Hidden:
-    """Elements, or fields of elements, of an array of which only a summary is there.
+    """Elements, or fields of elements, of an array that is present only as a summary.
 
     Attributes:
-        least: The least finite element; None when it is not known, or there is none.
+        least: The least finite element; None if unknown, or if there is none.
         greatest: The greatest finite element, or None.
-        surely: Whether the path leads to something in any case.
-        elements: Whether the path leads to the array itself.
-        numeric: Whether the elements are numbers or booleans.
-        booleans: Whether they are booleans; None when that is not known.
+        surely: True if the path certainly leads to a value.
+        elements: True if the path leads to the array itself.
+        numeric: True if the elements are numbers or booleans.
+        booleans: True if they are booleans; None if unknown.
     """
 
     least: object
@@ -121,7 +121,7 @@ class _Hidden:
     booleans: bool | None
 
     def may_equal(self, wanted: Value) -> bool:
-        """Whether an element may be equal to a value."""
+        """True if an element may be equal to a value."""
         if not self.numeric:
             return True
         if isinstance(wanted, bool):
@@ -137,7 +137,7 @@ class _Hidden:
         return low <= nearest(wanted) <= high
 
     def is_ordered(self, order: str, wanted: Value) -> Truth:
-        """Whether an element is in order."""
+        """True if an element satisfies the order; None if the summary cannot decide."""
         if not self.numeric:
             return None
         if not self.elements:
@@ -154,7 +154,7 @@ class _Hidden:
 
 
 _UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
-"""What a name leads to in the summary of an element: nothing, if that is an array."""
+"""Result for a name in the summary of an element: nothing, if that is an array."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,14 +163,14 @@ class _Reader:
 
     Attributes:
         types: Types of the fields.
-        summarised: Whether arrays without types may be summaries.
+        summarised: True if arrays without types may be summaries.
     """
 
     types: FieldTypes
     summarised: bool
 
     def leaves(self, message: Message, asked: Field) -> list[object]:
-        """What a path leads to: values, whole arrays, statistics of arrays, hidden elements."""
+        """Everything at a path: values, whole arrays, statistics of arrays, hidden elements."""
         parts = asked.parts
         stat = self.types.statistic(parts)
         if stat is None:
@@ -216,7 +216,7 @@ class _Reader:
     def _reach(
         self, value: object, parts: _Parts, names: _Names, *, element: bool = False
     ) -> Iterator[object]:
-        """What a path leads to; through an array, each element that it leads into."""
+        """The values at a path; through an array, those of each element."""
         if self._is_summary(value, names, element=element):
             if not self.types.known and len(parts) == 1 and parts[0] in value and "min" in value:
                 yield value[str(parts[0])]
@@ -233,7 +233,7 @@ class _Reader:
         elif isinstance(value, list):
             if isinstance(part, int) and part < len(value):
                 yield from self._reach(value[part], rest, names, element=True)
-            # MongoDB takes a number for a name, too.
+            # MongoDB also accepts a number as a name.
             for inner in value:
                 if self._is_summary(inner, names, element=True):
                     yield _UNKNOWN
@@ -243,7 +243,7 @@ class _Reader:
     def _values(
         self, value: object, parts: _Parts, names: _Names, *, element: bool = False
     ) -> Iterator[object]:
-        """What a path leads to, as a whole: arrays are not gone into at its end."""
+        """The values at a path as a whole: a last array is not split into elements."""
         if not parts:
             yield value
             return
@@ -253,7 +253,7 @@ class _Reader:
         part, rest = parts[0], parts[1:]
         if isinstance(part, int) and isinstance(value, list) and part < len(value):
             yield from self._values(value[part], rest, names, element=True)
-        # MongoDB takes a number for a name, too.
+        # MongoDB also accepts a number as a name.
         for inner in value if isinstance(value, list) else [value]:
             if isinstance(inner, Mapping) and str(part) in inner:
                 yield from self._values(inner[str(part)], rest, (*names, str(part)))
@@ -264,7 +264,7 @@ def _hidden(
     parts: _Parts,
     booleans: bool | None,  # noqa: FBT001
 ) -> Iterator[_Hidden]:
-    """What stands behind a summary when a path goes on with these parts."""
+    """The hidden values behind a summary when a path continues with these parts."""
     count = summary.get("n")
     first = parts[0] if parts else None
     if isinstance(first, int) and isinstance(count, int) and first >= count:
@@ -286,14 +286,14 @@ def _hidden(
 
 
 def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
-    """Whether an array has a statistic, and its elements have no field of that name."""
+    """True if an array has a statistic, and its elements have no field of that name."""
     if stat == "n":
         return not any(isinstance(value, Mapping) and stat in value for value in values)
     return all(isinstance(value, int | float) for value in values)
 
 
 def statistic(stat: Stat, values: Sequence[object]) -> float | None:
-    """A statistic of an array, as its summary in the index has it."""
+    """A statistic of an array, equal to that in its summary in the index."""
     if stat == "n":
         return len(values)
     numbers = [value for value in values if isinstance(value, int | float)]
@@ -379,11 +379,11 @@ def _exists(reader: _Reader, asked: Field, message: Message) -> Truth:
 
 
 _Leaf: TypeAlias = Callable[[object, bool], Truth]
-"""Tests a value; the second argument says whether it is an element of an array."""
+"""Tests a value; the second argument is True for an element of an array."""
 
 
 def _holds(reader: _Reader, asked: Field, test: _Leaf, message: Message) -> Truth:
-    """Whether a test holds of any value that a path leads to."""
+    """True if a test holds for any value at a path."""
     unknown = False
     for leaf in reader.leaves(message, asked):
         if isinstance(leaf, list):
@@ -398,7 +398,7 @@ def _holds(reader: _Reader, asked: Field, test: _Leaf, message: Message) -> Trut
 
 
 def _test_of(node: Condition) -> _Leaf:
-    """The test of a condition; of a negated one, what must not hold."""
+    """The test of a condition; of a negated one, the test that must fail."""
     match node:
         case Compare(order="==" | "!=", value=value):
             return partial(_is_one_of, (value,))

@@ -1,8 +1,8 @@
 """Predicates on Arrow columns of decoded messages.
 
-Columns say less than messages: a null is a missing field or a null, and a summary stands
-for a long array. So each condition gives two masks: where it may hold, and where it surely
-does. Where both differ in the end, the columns cannot tell.
+Columns have less information than messages: a null is a missing field or a null, and a
+summary replaces a long array. Each condition therefore gives two masks: rows for which it
+may hold, and rows for which it certainly holds. If they differ in the end, the columns
 """
 
 from __future__ import annotations
@@ -70,16 +70,16 @@ def to_mask(
     types: FieldTypes | Mapping[str, str] | None,
     records: Records,
 ) -> Mask | None:
-    """Of which rows a predicate holds.
+    """Mask of the rows for which a predicate holds.
 
     Args:
         node: The predicate.
-        types: Types of the fields; None when each message decides.
+        types: Types of the fields; None if each message decides.
         records: Decoded messages with at least the fields of the predicate. Arrays are
-            whole, or structs of `n`, `min`, `max` and `mean`.
+            complete, or structs of `n`, `min`, `max` and `mean`.
 
     Returns:
-        bool[rows]; None when these columns cannot tell.
+        bool[rows]; None if these columns cannot decide.
     """
     compiled = FieldTypes.of(types)
     root = root_of(node)
@@ -91,7 +91,7 @@ def to_mask(
 
 
 def _parts(records: Records) -> Iterator[pa.StructArray]:
-    """The records piece by piece."""
+    """The records in pieces."""
     if isinstance(records, pa.Table):
         yield from (batch.to_struct_array() for batch in records.to_batches())
     elif isinstance(records, pa.RecordBatch):
@@ -113,25 +113,25 @@ def _mask(root: Node, types: FieldTypes, records: pa.StructArray) -> Mask | None
 
 
 class _UnfitError(Exception):
-    """The columns do not have what is asked for."""
+    """The columns lack the requested field."""
 
 
 class _Pair(NamedTuple):
-    """Where something may hold, and where it surely holds: bool[rows] each."""
+    """Masks of possible and of certain results: bool[rows] each."""
 
     possible: Mask
     certain: Mask
 
 
 class _Leaves(NamedTuple):
-    """Values that a path leads to, in any order.
+    """Values at a path, in any order.
 
     Attributes:
-        values: One entry a value.
+        values: One entry for each value.
         rows: The row of each value.
-        is_element: Whether they are elements of an array: a null is one then, not missing.
-        is_hidden: Whether they are summaries that hide what the path leads to.
-        is_summary: Whether they are summaries that stand for the arrays themselves.
+        is_element: True for elements of an array: a null is then null, not missing.
+        is_hidden: True for summaries that hide the values at the path.
+        is_summary: True for summaries that replace the arrays themselves.
     """
 
     values: pa.Array
@@ -148,7 +148,7 @@ class _Columns:
         self._count = len(records)
 
     def node(self, node: Node) -> _Pair:
-        """Where a predicate may hold, and where it surely does."""
+        """Masks of the rows for which a predicate may hold and certainly holds."""
         match node:
             case And(items):
                 return self._joined(np.logical_and, items, start=True)
@@ -196,7 +196,7 @@ class _Columns:
         return _Pair(possible, certain)
 
     def _holds(self, node: Compare | Member | Match) -> _Pair:
-        """Where a value satisfies a condition, as if it was not negated."""
+        """Masks of the rows with a value that satisfies a condition, without its negation."""
         possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
         for leaves in self._leaves(node.field):
             for each in _elements(leaves):
@@ -208,10 +208,10 @@ class _Columns:
     # Paths.
 
     def _leaves(self, asked: Field) -> list[_Leaves]:
-        """What a path leads to.
+        """The values at a path.
 
         Raises:
-            _UnfitError: These columns do not tell.
+            _UnfitError: the columns cannot decide.
         """
         parts = asked.parts
         top = self._records.type
@@ -238,7 +238,7 @@ class _Columns:
         return _computed(leaves, stat)
 
     def _either(self, leaves: _Leaves, stat: Stat) -> Iterator[_Leaves]:
-        """A statistic of an array, or a field of that name, where no types are known."""
+        """A statistic of an array, or a field of that name, where types are unknown."""
         kind = leaves.values.type
         if leaves.is_hidden or _is_scalar(kind):
             if leaves.is_hidden:
@@ -246,7 +246,7 @@ class _Columns:
             return
         if pa.types.is_struct(kind):
             if set(_names(kind)) == {"n"}:
-                raise _UnfitError  # it may be the summary of an array of anything
+                raise _UnfitError  # it may be the summary of an array of any type
             yield from self._reach(leaves, (stat,), ())
             return
         if not _is_list(kind) or pa.types.is_struct(kind.value_type):
@@ -262,7 +262,7 @@ class _Columns:
         parts: tuple[str | int, ...],
         names: tuple[str, ...],
     ) -> Iterator[_Leaves]:
-        """What a path leads to from some values; through an array, from each element."""
+        """The values at a path, from some values on; through an array, from each element."""
         values, rows = _plain(leaves.values), leaves.rows
         kind = values.type
         if pa.types.is_null(kind):
@@ -289,14 +289,14 @@ class _Columns:
     def _into_list(
         self, values: pa.Array, rows: Rows, parts: tuple[str | int, ...], names: tuple[str, ...]
     ) -> Iterator[_Leaves]:
-        """What a path leads to through lists."""
+        """The values at a path through lists."""
         part = parts[0]
         elements = _flattened(values, rows)
         inside = elements.values.type
         named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
         if isinstance(part, int):
             if named:
-                raise _UnfitError  # a place, or a field that is called as one
+                raise _UnfitError  # an index, or a field with a number as its name
             yield from self._reach(_at_place(values, rows, part), parts[1:], names)
         elif named:
             yield from self._reach(elements, parts, names)
@@ -311,9 +311,9 @@ class _Columns:
         return set(_names(kind)) in _SUMMARIES
 
     def _behind(self, leaves: _Leaves, parts: tuple[str | int, ...]) -> Iterator[_Leaves]:
-        """What stands behind summaries when a path goes on with some parts."""
+        """The values behind summaries when a path continues with some parts."""
         if not self._types.known:
-            # It may as well be a message with fields of these names.
+            # It may also be a message with fields of these names.
             stat = len(parts) == 1 and parts[0] in _names(leaves.values.type)
             if not stat:
                 raise _UnfitError
@@ -344,10 +344,10 @@ def _not(pair: _Pair) -> _Pair:
 
 
 def _plain(values: pa.Array) -> pa.Array:
-    """Values without dictionaries.
+    """Values without dictionary encoding.
 
     Raises:
-        _UnfitError: They stand for something else, such as JSON text.
+        _UnfitError: they have another representation, such as JSON text.
     """
     if isinstance(values.type, pa.BaseExtensionType):
         raise _UnfitError
@@ -405,19 +405,19 @@ def _some(values: pa.Array, rows: Rows, chosen: Mask) -> tuple[pa.Array, Rows]:
 
 
 def _flattened(values: pa.Array, rows: Rows) -> _Leaves:
-    """The elements of lists; a list that is null has none."""
+    """The elements of lists; a null list has none."""
     parents = _numpy(pc.list_parent_indices(values))
     return _Leaves(pc.list_flatten(values), rows[parents], is_element=True)
 
 
 def _lengths(values: pa.Array) -> NDArray[np.int64]:
-    """Elements of each list, 0 of a null."""
+    """Number of elements of each list, 0 for a null."""
     lengths = _numpy(pc.fill_null(pc.list_value_length(values), 0)).astype(np.int64)
     return np.where(_valid(values), lengths, 0)
 
 
 def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
-    """The element at a place of each list that is long enough."""
+    """The element at an index of each list that is long enough."""
     values, rows = _some(values, rows, _lengths(values) > place)
     if not len(values):
         return _Leaves(pa.nulls(0, values.type.value_type), rows, is_element=True)
@@ -425,7 +425,7 @@ def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
 
 
 def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
-    """A statistic of lists, as their summaries in the index have it."""
+    """A statistic of lists, equal to that of their summaries in the index."""
     from hybridlog.schema.column import Scalars
     from hybridlog.schema.summary import summarise
 
@@ -447,10 +447,10 @@ def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
 
 
 def _as_integers(values: pa.Array) -> pa.Array:
-    """Times and durations as nanoseconds; other values as they are.
+    """Times and durations as nanoseconds; other values unchanged.
 
     Raises:
-        _UnfitError: They are in another unit.
+        _UnfitError: they have another unit.
     """
     if not _is_time(values.type):
         return values
@@ -463,7 +463,7 @@ def _as_integers(values: pa.Array) -> pa.Array:
 
 
 def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
-    """The values themselves, or the elements of those that are lists; and nulls."""
+    """The values that are no lists, the elements of lists, and nulls."""
     values, rows = leaves.values, leaves.rows
     if leaves.is_hidden or leaves.is_summary:
         yield leaves
@@ -479,7 +479,7 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
 
 
 def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
-    """Which values may satisfy a condition, and which surely do: bool[values] each."""
+    """Masks of the values that may satisfy a condition and certainly do: bool[values] each."""
     if leaves.is_hidden or leaves.is_summary:
         return _of_summaries(node, leaves, types)
     match node:
@@ -519,12 +519,12 @@ def _matching(values: pa.Array, pattern: str) -> Mask:
 
 
 def _filled(found: pa.Array) -> Mask:
-    """A mask of Arrow as one of numpy, False for null."""
+    """A mask of Arrow as a numpy mask, False for null."""
     return _numpy(pc.fill_null(found, fill_value=False))
 
 
 def _compared(values: pa.Array, order: str, value: Value) -> Mask:
-    """Which values are in order with a value of the same kind; none of another kind."""
+    """Mask of the values that satisfy an order; False for values of another kind."""
     none = np.zeros(len(values), np.bool_)
     kind = values.type
     if isinstance(value, bool):
@@ -555,7 +555,7 @@ def _texts_compared(values: pa.Array, order: str, value: str) -> Mask:
 
 
 def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
-    """Integers with any number, exactly."""
+    """Compare integers with any number, exactly."""
     bound = for_integers(order, value)
     if isinstance(bound, bool):
         return bound
@@ -569,7 +569,7 @@ def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
 
 
 def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
-    """Floats with any number, exactly."""
+    """Compare floats with any number, exactly."""
     wide = numbers.astype(np.float64, copy=False)
     if is_nan(value):
         return np.isnan(wide) if order == "==" else False
@@ -584,7 +584,7 @@ def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
 
 
 def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
-    """Conditions on elements of arrays of which only summaries are there."""
+    """Conditions on elements of arrays that are present only as summaries."""
     summaries = leaves.values
     there = _valid(summaries)
     none = np.zeros(len(summaries), np.bool_)
@@ -613,19 +613,19 @@ def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldT
 
 
 def _values_of(node: Compare | Member | Match) -> tuple[Value, ...]:
-    """What a field is compared with."""
+    """The values that a field is compared with."""
     if isinstance(node, Match):
         return ()
     return (node.value,) if isinstance(node, Compare) else node.values
 
 
 def _is_rounded(end: pa.Array, value: Value) -> bool:
-    """Whether ends may be integers that were rounded to the double they are compared with."""
+    """True if ends may be integers that were rounded to the double they are compared with."""
     return pa.types.is_floating(end.type) and is_number(value) and abs(nearest(value)) >= 2**53
 
 
 def _may_equal(low: pa.Array, high: pa.Array, value: Value) -> Mask:
-    """Whether an element between two ends may be equal to a value."""
+    """True if an element between two ends may be equal to a value."""
     always = np.ones(len(low), np.bool_)
     if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
         return always

@@ -1,9 +1,9 @@
 """Predicates as MongoDB filters.
 
-Index documents say less than messages: long arrays are summaries, integers beyond int64 are
-doubles, and MongoDB gives up on expensive patterns without a word. So a predicate becomes
-two filters: one that finds at least the messages for which it holds, and one that finds
-only such messages. Negation exchanges them. Where both are the same, MongoDB's answer is
+Index documents have less information than messages: long arrays are summaries, integers
+beyond int64 are doubles, and MongoDB silently stops on expensive patterns. A predicate
+therefore becomes two filters: one finds at least the messages for which it holds, one finds
+only such messages. Negation exchanges them. If both are the same, MongoDB's answer is
 exact.
 """
 
@@ -53,8 +53,8 @@ class MongoFilter:
     Attributes:
         filter: Finds at least all messages for which the predicate holds.
         certain: Finds only messages for which it holds.
-        is_exact: Whether both find the same. If not, what `filter` finds and `certain`
-            does not is to be decided on the messages.
+        is_exact: True if both find the same messages. If not, the messages that only `filter`
+            finds must be decided on their payloads.
     """
 
     filter: Filter
@@ -68,15 +68,15 @@ def to_mongo(
     """A predicate as a MongoDB filter.
 
     Args:
-        node: The predicate; fields that the types do not list are taken as they come.
-        types: Types of the fields; None when each message decides.
+        node: The predicate; fields that the types do not list may have any type.
+        types: Types of the fields; None if each message decides.
     """
     found = _Compiler(FieldTypes.of(types)).node(root_of(node))
     return MongoFilter(found.possible, found.certain, found.is_exact)
 
 
 class _Pair(NamedTuple):
-    """What may hold, and what surely holds."""
+    """Filters for possible and for certain results."""
 
     possible: Filter
     certain: Filter
@@ -115,12 +115,12 @@ def _any_of(pairs: Sequence[_Pair]) -> _Pair:
 
 
 def _perhaps(found: Filter) -> _Pair:
-    """Documents that do not tell."""
+    """Documents that cannot decide."""
     return _Pair(found, _NOTHING)
 
 
 class _Bounds(NamedTuple):
-    """A comparison of stored numbers with a value: operators that may hold, or surely do."""
+    """A comparison of stored numbers with a value: operators for possible and certain results."""
 
     possible: Filter
     certain: Filter | None
@@ -162,7 +162,7 @@ class _Compiler:
         return _all_of([self._exists(asked), _not(self._positive(node))])
 
     def _positive(self, node: Compare | Member | Match) -> _Pair:
-        """A condition as if it was not negated."""
+        """A condition without its negation."""
         match node:
             case Compare(asked, "==" | "!=", value):
                 return self._of_values(asked, "==", (value,))
@@ -173,13 +173,13 @@ class _Compiler:
             case Match(asked, pattern):
                 return self._of_pattern(asked, pattern)
 
-    # What there is.
+    # The structure of the documents.
 
     def _stat(self, asked: Field) -> Stat | None:
         return self._types.statistic(asked.parts)
 
     def _arrays(self, asked: Field) -> list[Field]:
-        """The arrays on the way to a path, itself apart, whose summaries may hide it."""
+        """The arrays above a path, without itself, whose summaries may hide it."""
         parts = asked.parts
         if parts[0] == "_meta":
             return []
@@ -193,7 +193,7 @@ class _Compiler:
         return found
 
     def _may_be_array(self, asked: Field) -> bool:
-        """Whether an array may stand at a path."""
+        """True if an array may be at a path."""
         if asked.parts[0] == "_meta":
             return False
         if self._types.is_open(asked):
@@ -201,27 +201,27 @@ class _Compiler:
         return isinstance(asked.parts[-1], str) and asked.names in self._types.arrays
 
     def _is_single(self, asked: Field) -> bool:
-        """Whether a path leads to one value of its own, if to any."""
+        """True if a path leads to at most one value."""
         return not (
             self._may_be_array(asked) or self._arrays(asked) or self._stat(asked) is not None
         )
 
     def _summary(self, array: Field) -> Filter:
-        """Finds at least all documents in which a summary stands for an array."""
+        """Finds at least all documents in which an array is a summary."""
         if f"{array.names}.n" in self._types.types and not self._arrays(array):
-            # Its elements have a field `n`, so that is no sign of a summary.
+            # Its elements have a field `n`, which therefore does not identify a summary.
             return {array.path: {"$exists": True, "$not": {"$type": "array"}}}
         return {f"{array.path}.n": {"$exists": True}}
 
     def _summary_of_others(self, array: Field) -> Filter:
-        """The same of arrays that are not of numbers only."""
+        """The same for arrays that do not consist of numbers only."""
         found = self._summary(array)
         if len(array.parts) > 1 or f"{array.names}.min" in self._types.types:
             return found
         return {**found, f"{array.path}.min": {"$exists": False}}
 
     def _behind_summaries(self, asked: Field) -> list[_Pair]:
-        """Documents in which a summary on the way hides what a path leads to."""
+        """Documents in which a summary above a path hides the values at the path."""
         parts = asked.parts
         return [
             _perhaps(
@@ -249,16 +249,16 @@ class _Compiler:
         return _any_of([*found, *self._behind_summaries(asked)])
 
     def _named_by_numbers(self, array: Field) -> list[_Pair]:
-        """Lists that a path may lead to because a number in it is the name of a field."""
+        """Lists that a path may reach because a number in it is the name of a field."""
         if all(isinstance(part, str) for part in array.parts):
             return []
         return [_perhaps({array.path: {"$type": "array"}})]
 
     def _unambiguous(self, array: Field, stat: Stat) -> Filter:
-        """Finds documents in which a field called as a statistic means what it says.
+        """Finds documents in which a field named like a statistic is that field.
 
-        An element of a list may be the summary of a list within it. And where there is an
-        `n` and no `min`, elements that are hidden may have a field `n` of their own.
+        An element of a list may be the summary of an inner list. If there is an `n` and
+        no `min`, hidden elements may have a field `n` of their own.
         """
         found: Filter = {array.path: {"$not": {"$type": "array"}}}
         if stat == "n":
@@ -273,7 +273,7 @@ class _Compiler:
     # Values.
 
     def _of_values(self, asked: Field, order: str, values: Sequence[Value]) -> _Pair:
-        """Whether any value, or any element, is equal to one of some values, or in order."""
+        """The condition that any value or element equals one of some values, or is in order."""
         stat = self._stat(asked)
         if stat is not None and self._types.known:
             return self._of_statistic(Field(asked.parts[:-1]), stat, order, values)
@@ -288,13 +288,13 @@ class _Compiler:
         lists = [self._of_open_lists(array, stat, order, value) for value in values]
         lists += self._named_by_numbers(array)
         if stat == "n":
-            # A list in a list may be a summary, which has an `n` and is no message with one.
+            # A list in a list may be a summary, which has an `n` and is not a message with one.
             summaries: Filter = {array.path: {"$type": "array"}, asked.path: {"$exists": True}}
             lists.append(_perhaps(summaries))
         return _any_of([found, *lists, *self._behind_summaries(asked)])
 
     def _of_open_lists(self, array: Field, stat: Stat, order: str, value: Value) -> _Pair:
-        """A condition on a statistic of lists that are in the index, where types are unknown."""
+        """A condition on a statistic of lists in the index, where types are unknown."""
         if value is None:
             return _exact({"$expr": _anywhere(array.parts, _Counted(stat, None))})
         if not is_number(value) or is_nan(value):
@@ -325,10 +325,10 @@ class _Compiler:
         return found
 
     def _at_element(self, asked: Field, test: Filter) -> Filter:
-        """A condition on a value, or on any element of it.
+        """A condition on a value, or on any of its elements.
 
-        MongoDB looks into an array that a name leads to, but not into one that is itself an
-        element.
+        MongoDB searches the elements of an array at a path, but not those of an array within
+        an array.
         """
         found: Filter = {asked.path: test}
         if isinstance(asked.parts[-1], str) or not self._types.is_open(asked):
@@ -336,7 +336,7 @@ class _Compiler:
         return {"$or": [found, {asked.path: {"$elemMatch": test}}]}
 
     def _summaries_with(self, asked: Field, value: Value) -> list[Filter]:
-        """Find at least the summaries of arrays that may have an element of some value."""
+        """Find at least the summaries of arrays that may have an element with a value."""
         if not is_number(value) or (isinstance(value, float) and not math.isfinite(value)):
             return [self._summary(asked)]
         if self._types.kind(asked.names) == "bool":
@@ -348,7 +348,7 @@ class _Compiler:
         return [between, *self._others(asked)]
 
     def _others(self, asked: Field) -> list[Filter]:
-        """Find the summaries of arrays of which not all elements are numbers, if there are any."""
+        """Find the summaries of arrays with elements that are no numbers, if there are any."""
         return [self._summary_of_others(asked)] if self._types.is_open(asked) else []
 
     def _in_order(self, asked: Field, order: str, value: Value) -> list[_Pair]:
@@ -369,7 +369,7 @@ class _Compiler:
         ]
 
     def _of_elements(self, asked: Field, order: str, bounds: _Bounds) -> _Pair:
-        """An order of a value, or of the finite elements of a list."""
+        """An order for a value, or for the finite elements of a list."""
         path = asked.path
         if self._types.are_int64(asked.names):
             return _exact({path: bounds.possible})
@@ -388,7 +388,7 @@ class _Compiler:
         )
 
     def _of_extremes(self, asked: Field, order: str, bounds: _Bounds) -> _Pair:
-        """An order of the finite elements of a list of which there is a summary."""
+        """An order for the finite elements of a list that is a summary."""
         end = f"{asked.path}.{'min' if order in {'<', '<='} else 'max'}"
         if self._types.is_open(asked):
             return _perhaps({end: bounds.possible})
@@ -414,7 +414,7 @@ class _Compiler:
     # Numbers.
 
     def _is_plain(self, value: Value, asked: Field) -> bool:
-        """Whether equality in the index is equality of the values in messages."""
+        """True if equality in the index is equality of the values in messages."""
         if not is_number(value) or is_nan(value):
             return True
         names = asked.names
@@ -437,7 +437,7 @@ class _Compiler:
     # Statistics, where the types are known.
 
     def _of_statistic(self, array: Field, stat: Stat, order: str, values: Sequence[Value]) -> _Pair:
-        """A condition on what the summary of an array says, or would say of a short one."""
+        """A condition on the summary of an array, or on the equivalent for a short one."""
         tests = [
             self._statistic_test(array, stat, order, value)
             for value in values
@@ -455,7 +455,7 @@ class _Compiler:
         if is_nan(value):
             return stored  # a statistic is finite
         if stat == "mean":
-            # MongoDB adds up in another order, so the last digit may differ.
+            # MongoDB adds in another order, so the last digit may differ.
             return _any_of([stored, _perhaps({array.path: {"$type": "array"}})])
         lists = self._pair(lambda test: self._of_lists(array, stat, test), bounds)
         return _any_of([stored, lists])
@@ -470,14 +470,14 @@ class _Compiler:
         return _Bounds(exact, exact)
 
     def _of_lists(self, array: Field, stat: Stat, test: Filter | None) -> Filter:
-        """A condition on a statistic of arrays that the index holds element by element."""
+        """A condition on a statistic of arrays that the index holds in full."""
         each = _Test(stat, self._types.kind(array.names), test)
         return {"$expr": self._step("", array.parts, (), each)}
 
     def _step(
         self, here: str, parts: tuple[str | int, ...], seen: tuple[str, ...], test: _Test
     ) -> object:
-        """An aggregation expression: whether the test holds of any value at the path."""
+        """An aggregation expression that is true if the test holds for any value at the path."""
         # `here` is "", "$a.b" or "$$v.b"; `seen` are the names passed so far.
         for index, part in enumerate(parts):
             rest = parts[index + 1 :]
@@ -508,8 +508,8 @@ class _Test:
 
     Attributes:
         stat: The statistic.
-        base: Kind of the elements; `any` when it is not known.
-        test: One operator and its value; None when the statistic must be null.
+        base: Kind of the elements; `any` if unknown.
+        test: One operator and its value; None if the statistic must be null.
     """
 
     stat: Stat
@@ -517,7 +517,7 @@ class _Test:
     test: Filter | None
 
     def on(self, here: str) -> object:
-        """The aggregation expression for the value at `here`; false when it is no list."""
+        """The aggregation expression for the value at `here`; false if it is no list."""
         compared: object = {"$eq": ["$$s", None]}
         if self.test is not None:
             ((operator, value),) = self.test.items()
@@ -537,7 +537,7 @@ class _Test:
             "$filter": {
                 "input": numbers,
                 "as": "v",
-                # NaN sorts before -inf, everything that is no number after inf.
+                # NaN sorts before -inf, and every value that is no number sorts after inf.
                 "cond": {"$and": [{"$gt": ["$$v", -_INF]}, {"$lt": ["$$v", _INF]}]},
             }
         }
@@ -547,12 +547,12 @@ class _Test:
 
 @dataclass(frozen=True, slots=True)
 class _Counted:
-    """Whether a value is a list that has a statistic, and no field of that name.
+    """Tests for a list that has a statistic, and no field of that name.
 
     Attributes:
         stat: The statistic.
-        test: One operator and its value; None when the statistic must be null, empty when
-            any will do.
+        test: One operator and its value; None if the statistic must be null, empty if
+            any value is accepted.
     """
 
     stat: Stat
@@ -572,9 +572,9 @@ class _Counted:
 
 
 def _anywhere(parts: tuple[str | int, ...], test: _Counted) -> object:
-    """An aggregation expression: whether a test holds of any value that a path leads to.
+    """An aggregation expression that is true if a test holds for any value at a path.
 
-    Any value on the way may be an array.
+    Any value above it may be an array.
     """
     return _further(f"${parts[0]}", parts[1:], test, 0)
 
@@ -595,7 +595,7 @@ def _further(here: str, parts: tuple[str | int, ...], test: _Counted, depth: int
 
 
 def _none_of(values: Sequence[Value]) -> Filter:
-    """The condition on a path that it leads to something, and to none of the values."""
+    """The condition that a path has a value, and none of these."""
     others = [value for value in values if value is not None]
     test: Filter = {"$exists": True}
     if others:
@@ -610,7 +610,7 @@ def _operator(order: str) -> str:
 
 
 def _limited(value: float) -> float:
-    """The value, or an infinity for an int that int64 does not hold."""
+    """The value, or an infinity for an int beyond int64."""
     if isinstance(value, int) and not LOW <= value <= HIGH:
         return _INF if value > 0 else -_INF
     return value
@@ -628,7 +628,7 @@ def _of_doubles(order: str, value: float) -> Filter:
 
 
 def _rounded(order: str, value: float) -> _Bounds:
-    """Operators for numbers of which those beyond int64 are rounded to doubles."""
+    """Operators for numbers that are rounded to doubles beyond int64."""
     near = nearest(value)
     if order == "==":
         return _Bounds({"$eq": near}, None)

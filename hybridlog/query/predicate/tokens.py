@@ -1,7 +1,7 @@
-"""The words of a predicate: field paths, numbers, strings, times, operators.
+"""The tokens of a predicate: field paths, numbers, strings, times, operators.
 
-Whatever cannot be a word raises `WhereError` with a caret under the place. Text is
-bounded before anything is done with it.
+Text that forms no token raises `WhereError` with a caret under the place. The length of
+the text is limited before it is processed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hybridlog.query.times import parse_duration, parse_time
 from hybridlog_storage.errors import TimeError, WhereError
 
 MAX_TEXT = 10_000
-"""Longest predicate, characters."""
+"""Maximum length of a predicate, characters."""
 MAX_TOKENS = 2_000
 _WINDOW = 100
 
@@ -49,16 +49,16 @@ Kind = Literal["path", "number", "time", "string", "operator", "end"]
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """One word.
+    """One token.
 
     Attributes:
-        kind: What it is; `time` is a number of nanoseconds, a time or a duration.
-        text: As written; of a string only what is between the quotes.
+        kind: Its kind; `time` is a number of nanoseconds, a time or a duration.
+        text: The text as written; for a string, without its quotes.
         position: Index of its first character.
         number: Value of a `number` or `time`.
-        path: Parts of a `path`: names, and ints for array elements (`[]` and `[*]`,
-            any element, leave no part).
-        keyword: A path of one plain name, in lower case; else empty.
+        path: Parts of a `path`: names, and ints for array elements. `[]` and `[*]`,
+            any element, add no part.
+        keyword: A path of one plain name, in lower case; empty for all others.
     """
 
     kind: Kind
@@ -78,16 +78,16 @@ def error_at(text: str, position: int, message: str) -> WhereError:
     if len(line) > _WINDOW:
         cut = max(0, column - _WINDOW // 2)
         line, column = line[cut : cut + _WINDOW], column - cut
-    # One column a character, and nothing that steers a terminal.
+    # One column per character, without control characters.
     line = "".join(char if char.isprintable() else "?" for char in line)
     return WhereError(f"{message}\n  {line}\n  {' ' * column}^")
 
 
 def tokenize(text: str) -> list[Token]:
-    """The words of a predicate, with an `end` behind the last.
+    """The tokens of a predicate, followed by an `end`.
 
     Raises:
-        WhereError: Too long, or a place where no word begins.
+        WhereError: too long, or a place where no token begins.
     """
     if len(text) > MAX_TEXT:
         raise WhereError(
@@ -111,7 +111,7 @@ def unescape(text: str, token: Token) -> str:
     """The value of a string token.
 
     Raises:
-        WhereError: An escape that does not exist, or half a surrogate pair.
+        WhereError: an unknown escape, or an unpaired surrogate.
     """
 
     def replace(match: re.Match[str]) -> str:
@@ -124,14 +124,14 @@ def unescape(text: str, token: Token) -> str:
 
     value = _ESCAPE.sub(replace, token.text)
     try:
-        # Pairs of surrogates become the one character they stand for.
+        # Pairs of surrogates become one character.
         return value.encode("utf-16", "surrogatepass").decode("utf-16")
     except UnicodeDecodeError:
         raise error_at(text, token.position, "the string has half a surrogate pair") from None
 
 
 def regex_text(token: Token) -> str:
-    r"""The pattern of a string token: backslashes stay, so that `"\d+"` means digits."""
+    r"""The pattern of a string token, with its backslashes: `"\d+"` means digits."""
     return token.text.replace('\\"', '"').replace("\\'", "'")
 
 
@@ -233,7 +233,7 @@ def _name(text: str, at: int, name: str) -> str:
 
 
 def _part(text: str, at: int, name: str) -> str | int:
-    """A name behind another; MongoDB takes a number for a place in an array."""
+    """A name after another; MongoDB treats a number as an index in an array."""
     plain = _name(text, at, name)
     is_place = plain.isascii() and plain.isdecimal() and str(int(plain[:10])) == plain
     return int(plain) if is_place else plain

@@ -1,7 +1,7 @@
-"""The tree of a predicate, whether it was written as text or as a MongoDB filter.
+"""The tree of a predicate, written as text or as a MongoDB filter.
 
-Nodes are immutable and can be hashed and pickled. Two nodes are equal when they ask for the
-same: where they stand in the text does not count, and NaN equals NaN.
+Nodes are immutable, hashable and picklable. Two nodes are equal if they have the same
+meaning: their places in the text are ignored, and NaN equals NaN.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 Value: TypeAlias = bool | int | float | str | None
-"""What a field is compared with; times and durations are integer nanoseconds."""
+"""The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
 
 
@@ -48,7 +48,7 @@ class Field(_Node):
 
     Attributes:
         parts: Names, and ints for elements of arrays.
-        position: Where it stands in the text.
+        position: Its place in the text.
     """
 
     parts: tuple[str | int, ...]
@@ -61,7 +61,7 @@ class Field(_Node):
 
     @property
     def names(self) -> str:
-        """The path without places in arrays, as the types of fields are listed."""
+        """The path without array indexes, as in the types of fields."""
         return ".".join(part for part in self.parts if isinstance(part, str))
 
 
@@ -129,7 +129,7 @@ class Opaque(_Node):
     """A piece of a MongoDB filter that only MongoDB can answer.
 
     Attributes:
-        filter: The piece, as `frozen` gives it.
+        filter: The piece, as returned by `frozen`.
     """
 
     filter: object
@@ -147,18 +147,18 @@ Node: TypeAlias = Condition | And | Or | Not | Opaque
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Predicate:
-    """A predicate that was read and checked.
+    """A predicate that was parsed and checked.
 
     Attributes:
         root: The tree.
-        text: As it was written; messages show it.
+        text: The text as written, for messages.
     """
 
     root: Node
     text: str = dataclasses.field(default="", compare=False)
 
     def __bool__(self) -> bool:
-        """Whether it asks for anything."""
+        """True if it has any condition."""
         return self.root != And(())
 
     def __and__(self, other: Predicate) -> Predicate:
@@ -181,17 +181,17 @@ class Predicate:
         return (node for node in nodes(self.root) if isinstance(node, Condition))
 
     def fields(self) -> list[str]:
-        """The paths asked for, as MongoDB writes them, each once."""
+        """The paths in the predicate, as MongoDB writes them, without duplicates."""
         return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
 
     @property
     def is_opaque(self) -> bool:
-        """Whether a part of it can be answered by MongoDB only."""
+        """True if only MongoDB can answer a part of it."""
         return any(isinstance(node, Opaque) for node in nodes(self.root))
 
 
 def root_of(node: Predicate | Node) -> Node:
-    """The tree of a predicate; a node is a tree already."""
+    """The tree of a predicate; a node is returned as it is."""
     return node.root if isinstance(node, Predicate) else node
 
 

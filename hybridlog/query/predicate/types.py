@@ -1,4 +1,4 @@
-"""Types of the fields that a predicate asks for, and whether it fits them."""
+"""Types of the fields in a predicate, and the check of the predicate against them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Stat = Literal["n", "min", "max", "mean"]
 Kind = Literal["number", "string", "bool", "time", "date", "other"]
 
 STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
-"""Names of what the summary of an array says."""
+"""Names of the statistics in the summary of an array."""
 _SHOWN = 10
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
 _FLOATS = {"float", "double", "float32", "float64"}
@@ -60,8 +60,8 @@ class FieldTypes:
     """The types of the fields of a topic.
 
     Attributes:
-        known: False when only `_meta.*` is known, as of JSON messages.
-        types: Type of each path, without marks of arrays in the path.
+        known: False if only `_meta.*` is known, as for JSON messages.
+        types: Type of each path, without brackets for arrays in the path.
         arrays: Paths that are arrays.
         inner: Paths that have fields below them.
     """
@@ -73,7 +73,7 @@ class FieldTypes:
 
     @staticmethod
     def of(types: FieldTypes | Mapping[str, str] | None) -> FieldTypes:
-        """The types as listed by a codec: path to type; None when they are not known.
+        """The types as listed by a codec: path to type; None if they are unknown.
 
         Args:
             types: Path (dotted, with or without `[]` after arrays) to type as definitions
@@ -84,7 +84,7 @@ class FieldTypes:
         return _listed(None if types is None else tuple(types.items()))
 
     def is_open(self, asked: Field) -> bool:
-        """Whether each message decides what stands at a path."""
+        """True if each message decides the type at a path."""
         name = asked.names
         if str(asked.parts[0]) == "_meta":
             return False
@@ -96,9 +96,9 @@ class FieldTypes:
         )
 
     def statistic(self, parts: tuple[str | int, ...]) -> Stat | None:
-        """The statistic of an array that a path asks for; None when it asks for a field.
+        """The statistic of an array that a path names; None if it names a field.
 
-        Where the types are not known it may be either, and each message decides.
+        If the types are unknown, the path may name either, and each message decides.
         """
         stat = STATS.get(str(parts[-1]))
         if stat is None or len(parts) < 2 or parts[0] == "_meta" or not self.known:
@@ -119,11 +119,11 @@ class FieldTypes:
         return _KINDS.get(self.base(path), "other")
 
     def are_floats(self, path: str) -> bool:
-        """Whether a field, or the elements of an array, are floating-point numbers."""
+        """True if a field, or the elements of an array, are floating-point numbers."""
         return self.base(path) in _FLOATS
 
     def are_int64(self, path: str) -> bool:
-        """Whether a field, or the elements of an array, are integers that fit into int64."""
+        """True if a field, or the elements of an array, are integers that fit into int64."""
         return self.base(path) in _SMALL
 
 
@@ -146,10 +146,10 @@ def _listed(types: tuple[tuple[str, str], ...] | None) -> FieldTypes:
 
 
 def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse a predicate that asks for unknown fields, or compares things of two kinds.
+    """Refuse a predicate with unknown fields, or with comparisons of different kinds.
 
     Raises:
-        WhereError: With the place in the predicate's text.
+        WhereError: the predicate is refused; the message has the place in its text.
     """
     checker = _Checker(predicate.text, FieldTypes.of(types))
     for condition in predicate.conditions():

@@ -154,7 +154,7 @@ def test_nan() -> None:
         ("x == 1e999", "too large", 5),
         ("x == " + "9" * 500, "400 characters", None),
         ("x == t'noon'", "not a time", 5),
-        ("x == t'+5s'", "counts from a recording", 5),
+        ("x == t'+5s'", "relative to a recording", 5),
         ("5 < 6", "name of a field", 4),
         ("x", "expected an operator", 1),
         ("$where == 1", "no meaning", 0),
