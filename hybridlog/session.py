@@ -74,6 +74,7 @@ class Session:
         self._channels: dict[str, list[RecordedChannel]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._chunk_lists = ChunkLists()
+        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
         self._lock = threading.Lock()
         self.catalog = open_catalog(directory)
         self._remember_meanings()
@@ -421,6 +422,10 @@ class Session:
         """The table of a topic, created again if it is missing; None if there can be none."""
         from hybridlog.maintenance.tables import made_for
 
+        key = recording.id, topic
+        if key in self._tables_tried:
+            return self.tables.of(recording, topic)
+        self._tables_tried.add(key)
         return made_for(self.directory, recording, topic, self.tables)
 
     # Closing.
@@ -437,6 +442,7 @@ class Session:
             self._segments.clear()  # each is closed by the last thread that reads from it
         self._chunk_lists.clear()
         self.recent_chunks.clear()
+        self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()
         self._remember_meanings()
@@ -448,6 +454,7 @@ class Session:
                 reader.close()
             self._segments.clear()
         self.recent_chunks.clear()
+        self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()
         self.disconnect()

@@ -100,7 +100,7 @@ def make(
                 writer.discard()
     except StoreError:
         return False
-    return True
+    return not writer.has_failed
 
 
 def made_for(

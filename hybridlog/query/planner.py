@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
 from functools import cached_property
 from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar
@@ -94,6 +93,12 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
+        gone = set(self.question.recordings) - {e.id for e in self.session.recordings()}
+        if gone:
+            raise TopicError(
+                f"{len(gone)} of the recordings asked about were removed from the store. Make the "
+                "query again."
+            )
         wanted = set(self.question.topics)
         found: list[Part] = []
         for recording, bounds, windows in self._ranges.resolve():
@@ -147,7 +152,8 @@ class Planner:
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
         """Whether the fields of the messages of a part come from its table."""
-        if next(self._choose(part, Need.VALUES, fields)) is not self._tables:
+        costs = self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields)
+        if not costs or costs[0][1] is not self._tables:
             return False
         try:
             self._tables.check(part)
@@ -157,6 +163,9 @@ class Planner:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
+        if not self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields):
+            # Only MongoDB finds the messages; the fields are those of the messages.
+            return self._scan.values_of(self._plan_of([part]), fields)
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
     def runs(self, plan: ScanPlan | None = None) -> Iterator[MessageRun]:
@@ -307,8 +316,10 @@ class Planner:
         """The count of an engine that failed, by the next ones."""
         for engine in self._choose(part, Need.COUNT):
             if engine is not failed:
-                with suppress(*_RETRIED):
+                try:
                     return engine.count([part])
+                except _RETRIED as error:
+                    failure = error if isinstance(failure, UndecidedError) else failure
         raise failure
 
     def _first(

@@ -23,6 +23,7 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import parse_time
 from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -99,7 +100,12 @@ class Query:
                 or relative to each recording (`+5s`, `-10s`); None for its start.
             end: The same; None for its end.
         """
-        return self._with(bounds=(begin, end))
+        # As ints, so that equal questions are equal values: 5 is nanoseconds, 5.0 seconds.
+        bounds = (
+            parse_time(time, start=None, end=None) if isinstance(time, float) else time
+            for time in (begin, end)
+        )
+        return self._with(bounds=tuple(bounds))
 
     def clock(self, clock: str) -> Query:
         """The time that `between` refers to: `log` (default), `publish` or `header`.

@@ -31,6 +31,7 @@ from hybridlog.tables.layout import (
     recording_folder,
     small_file,
     table_schema,
+    topic_file,
     topic_folder,
 )
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
@@ -446,6 +447,9 @@ class Tables:
             if not name.endswith(SUFFIX):
                 continue
             file = ParquetFileReader(folder / name)
+            segment = max(map(int, file.about.segments), default=0)
+            if not name.startswith(topic_file(file.about.schema, segment).removesuffix(SUFFIX)):
+                raise StoreError(f"The table {folder / name} has the name of another one.")
             for group, (rows, *keys) in enumerate(file.about.bounds):
                 first, last = (keys[0], keys[1]), (keys[2], keys[3])
                 yield _Part(file, group, 0, rows, first, last)

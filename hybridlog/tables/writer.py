@@ -367,6 +367,7 @@ class TableWriter:
         self._has_parts = False
         self._numbers = 0
         self._has_ended = False
+        self.has_failed = False
         self._arena: NDArray[np.uint8] | None = None
         self._filled = 0
         self._held: list[_Messages] = []
@@ -455,6 +456,7 @@ class TableWriter:
         try:
             yield
         except Exception as error:
+            self.has_failed = True
             _log.warning("no tables of %s: %s", self._recording, error or repr(error))
             self.discard()
 

@@ -234,7 +234,6 @@ def test_damaged_tables_are_none_and_are_made_again(
     if harm is not garble:  # of that, only who reads the part is told
         assert count(recorded, tables, topic) is None
         assert tables.of(entry, topic) is None
-    assert recorded.topic(topic).where("i8 > 0").count() == want
     places = {f.place for f in recorded.verify().findings}
     if harm is not delete:
         assert f"table of {topic}" in places
@@ -245,6 +244,7 @@ def test_damaged_tables_are_none_and_are_made_again(
         assert making.make(recorded.directory, entry)
     tables.invalidate()
     assert count(recorded, tables, topic) == want
+    assert recorded.topic(topic).where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert path.read_bytes() == whole
     assert compare(recorded) == 1800
@@ -275,7 +275,7 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables) -> No
     recorded.refresh()
     assert recorded.topic("/large").where("i8 > 0").count() == want
     assert recorded.verify().findings == []
-    assert count(recorded, tables, "/large") is None
+    assert count(recorded, tables, "/large") == want
     recorded.reindex()
     assert compare(recorded) == 1800
 

@@ -75,7 +75,7 @@ class Mongo:
         is_open = part.recording.status == "open"
         if not is_open and not any(stats.unreadable for stats in part.stats):
             return found
-        if all(path.startswith("_meta") for path in part.predicate.fields()):
+        if not part.predicate.asks_fields:
             return found
         # An unreadable message has no fields.
         possible, certain = (joined(_READABLE, f) for f in (found.filter, found.certain))

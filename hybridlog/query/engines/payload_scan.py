@@ -73,7 +73,10 @@ class PayloadScan:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Read the messages that match in order and decode the fields."""
-        plan = self.plan([part])
+        return self.values_of(self.plan([part]), fields)
+
+    def values_of(self, plan: ScanPlan, fields: Collection[str] | None) -> Iterator[Values]:
+        """Fields of the messages of a plan, in order."""
         for run in ChunkScan(plan, self._session.segment).runs():
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):

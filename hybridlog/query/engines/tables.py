@@ -13,6 +13,7 @@ from hybridlog.losses import lost_spans
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, UndecidedError, Values
 from hybridlog.query.message_filter import can_decide, meta_array
+from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
@@ -62,6 +63,9 @@ class TablesEngine:
             return None  # the chunk index knows the times
         if part.predicate is not None and not can_decide(part.predicate):
             return None
+        asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
+        if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
+            return None  # the table does not say which messages have one
         is_lossy = any(True for _ in lost_spans(part.recording))  # lost rows must not answer
         if is_lossy or (need is Need.VALUES and not _are_whole(part, fields)):
             return None
@@ -165,7 +169,7 @@ class TablesEngine:
 
         records: Any = rows.records
         asked = predicate.fields()
-        if any(path.startswith("_meta") for path in asked):
+        if any(map(is_meta, asked)):
             pub = rows.own.get("pub")
             records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
         found = to_mask(predicate, part.field_types, records)
@@ -182,7 +186,7 @@ def _paths(table: TopicTable, part: Part) -> set[str]:
     found: set[str] = set()
     for condition in part.predicate.conditions() if part.predicate is not None else ():
         path = condition.field.names
-        if path.startswith("_meta"):
+        if is_meta(condition.field.path):
             continue
         # `ranges.min` is a column of its own, or the least element of an array.
         while "." in path and not table.has(path):

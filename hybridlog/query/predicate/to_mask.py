@@ -249,8 +249,8 @@ class _Columns:
                 raise _UnfitError  # it may be the summary of an array of any type
             yield from self._reach(leaves, (stat,), ())
             return
-        if not _is_list(kind) or pa.types.is_struct(kind.value_type):
-            raise _UnfitError
+        if not _is_list(kind) or not (_is_scalar(kind.value_type) or _is_list(kind.value_type)):
+            raise _UnfitError  # elements may have a field of that name
         if stat == "n" or (_is_numeric(kind.value_type) and not leaves.values.flatten().null_count):
             yield _computed(leaves, stat)
             return

@@ -185,9 +185,19 @@ class Predicate:
         return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
 
     @property
+    def asks_fields(self) -> bool:
+        """Whether it is about fields of the message, and not only about `_meta`."""
+        return self.is_opaque or not all(map(is_meta, self.fields()))
+
+    @property
     def is_opaque(self) -> bool:
         """True if only MongoDB can answer a part of it."""
         return any(isinstance(node, Opaque) for node in nodes(self.root))
+
+
+def is_meta(path: str) -> bool:
+    """Whether a path leads into `_meta`, which hybridlog adds to a message."""
+    return path == "_meta" or path.startswith("_meta.")
 
 
 def root_of(node: Predicate | Node) -> Node:
