@@ -428,6 +428,11 @@ class Session:
         self._tables_tried.add(key)
         return made_for(self.directory, recording, topic, self.tables)
 
+    def reject_table(self, recording: RecordingEntry, topic: str) -> None:
+        """Drop a table that turned out to be damaged; the next question makes it again."""
+        self.tables.reject(recording, topic)
+        self._tables_tried.discard((recording.id, topic))
+
     # Closing.
 
     def invalidate(self) -> None:

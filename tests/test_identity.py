@@ -239,6 +239,7 @@ def test_a_moved_store_takes_its_index_along(place: Path, uri: str, tmp_path: Pa
     moved = place.rename(tmp_path / "moved")
     with hl.open(moved, mongo=uri) as store:
         assert answers(store) == right()
+        store.connect()
         assert not store.repairs.indexed
         with Database.connect(uri) as database:
             mark = IndexState(database).mark()
@@ -314,6 +315,7 @@ def test_marks_need_no_mongodb(place: Path, uri: str) -> None:
         assert [m.fields["text"] for m in store.topic("marks")] == ["seen"]
     with hl.open(place, mongo=uri) as store:
         assert store.topic("marks").where("text == 'seen'").count() == 1
+        store.connect()
         assert store.repairs.indexed == {"one": 1}
 
 

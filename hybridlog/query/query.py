@@ -144,7 +144,7 @@ class Query:
             UsageError: a negative number.
         """
         if not isinstance(count, int) or count < 0:
-            raise UsageError(f"A limit is a number from 0 on, not {count!r}.")
+            raise UsageError(f"A limit is a whole number and not negative; {count!r} is not.")
         return self._with(limit=count)
 
     def every(self, step: int) -> Query:

@@ -191,7 +191,7 @@ def test_ctrl_c(logs: Path, fresh: Path) -> None:
         "record", logs / "robot.bag", "--level", "19", "--store", fresh, meanwhile=press
     )
     assert code == 130
-    assert "robot.bag is kept" in plain(shown).replace("\n", " ")
+    assert "robot.bag is stored" in plain(shown).replace("\n", " ")
     # The cursor that the bar has hidden is back.
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
     assert recordings(fresh) == ["small"]

@@ -158,7 +158,7 @@ class TablesEngine:
             for rows in table.scan(paths, own=columns, spans=spans):
                 yield rows, self._holds(part, rows)
         except StoreError:
-            self._session.tables.reject(part.recording, part.topic)
+            self._session.reject_table(part.recording, part.topic)
             raise
 
     def _holds(self, part: Part, rows: TableRows) -> NDArray[np.bool_]:

@@ -1,0 +1,178 @@
+"""Questions on which engines once differed, or were silently wrong."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.messages import Channel, Schema
+from tests.query.test_engines import WAYS, only
+
+SECOND = 10**9
+NUMBER = Schema("pkg/N", "ros1msg", b"float64 x")
+ODD = Schema("pkg/O", "ros1msg", b"float64 _metadata")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        yield opened
+
+
+def record(store: hl.Store, rows: list[tuple[Channel, bytes]], name: str = "log") -> None:
+    with store.start(name) as recording:
+        for number, (channel, payload) in enumerate(rows):
+            recording.write(channel, payload, log_time=(number + 1) * SECOND, publish_time=number)
+
+
+def as_json(*values: Any) -> list[tuple[Channel, bytes]]:
+    channel = Channel("/j", "json", None)
+    return [(channel, json.dumps(value).encode()) for value in values]
+
+
+def number(value: float) -> bytes:
+    return np.array([value]).tobytes()
+
+
+def counts(store: hl.Store, topic: str, predicate: Any) -> set[int]:
+    """Counts and numbers of messages, in each way that can answer."""
+    found = set()
+    for way in WAYS:
+        if way != "mongo":
+            with only(way):
+                query = store.topic(topic).where(predicate)
+                found |= {query.count(), len(list(query))}
+    return found
+
+
+@pytest.mark.parametrize(
+    ("predicate", "want"), [("a.n == 7", 1), ("a.n == 2", 2), ("not (a.n == 2)", 1)]
+)
+def test_lists_of_several_types_may_have_a_field_n(
+    store: hl.Store, predicate: str, want: int
+) -> None:
+    record(store, as_json({"a": [1, {"n": 7}]}, {"a": [1, {"n": 2}]}, {"a": [1, 2]}))
+    assert counts(store, "/j", predicate) == {want}
+
+
+@pytest.mark.parametrize(
+    ("schema", "field", "predicate", "want"),
+    [
+        (NUMBER, "x", "x missing", 0),
+        (NUMBER, "x", "not (x > 1)", 2),
+        (NUMBER, "x", "_meta.seq >= 0", 8),
+        (ODD, "_metadata", "_metadata missing", 0),
+        (ODD, "_metadata", "not (_metadata > 1)", 2),
+    ],
+)
+def test_unreadable_messages_have_no_fields_to_be_asked_for(
+    store: hl.Store, schema: Schema, field: str, predicate: str, want: int
+) -> None:
+    channel = Channel("/n", "ros1", schema)
+    rows = [(channel, number(value)) for value in range(6)]
+    record(store, [*rows, (channel, b"short"), (channel, b"shorter")])
+    assert counts(store, "/n", predicate) == {want}
+    query = store.topic("/n")
+    assert len(query.to_pandas()[field].dropna()) == 6
+    assert query.counters.unreadable == 2
+
+
+@pytest.mark.parametrize(
+    "query", [{"x": {"$exists": 0}}, {"x": None}, {"x": {"$not": {"$mod": [2, 1]}}}]
+)
+def test_filters_of_mongodb_find_no_unreadable_message(
+    store: hl.Store, query: dict[str, Any]
+) -> None:
+    channel = Channel("/n", "ros1", NUMBER)
+    record(store, [(channel, number(0)), (channel, number(1)), (channel, b"short")])
+    asked = store.topic("/n").where(query)
+    want = 1 if query == {"x": {"$not": {"$mod": [2, 1]}}} else 0
+    assert asked.count() == len(list(asked)) == asked.to_arrow().num_rows == want
+
+
+def test_publish_times_of_two_channels(store: hl.Store) -> None:
+    silent = Channel("/n", "ros1", NUMBER, {"of": "one"}, has_publish_time=False)
+    telling = Channel("/n", "ros1", NUMBER, {"of": "other"})
+    record(store, [*[(silent, number(1))] * 3, *[(telling, number(2))] * 4])
+    assert counts(store, "/n", "_meta.pub exists") == {4}
+    assert counts(store, "/n", "_meta.pub missing") == {3}
+
+
+def test_one_table_in_place_of_another_is_not_believed(store: hl.Store) -> None:
+    channel = Channel("/n", "ros1", NUMBER)
+    with store.start("log") as recording:
+        for index in range(4000):
+            recording.write(channel, number(index), log_time=index)
+    (path,) = (store.directory.path / "tables").rglob("*.parquet")
+    shutil.copy(path, path.with_name(path.name.replace("-000000", "-000001")))
+    path.unlink()
+    store.refresh()
+    assert store.topic("/n").where("x < 1000").count() == 1000
+
+
+def test_equal_questions_ask_the_same(store: hl.Store) -> None:
+    record(store, as_json(*[{"n": n} for n in range(10)]))
+    asked = store.topic("/j")
+    nanoseconds, seconds = asked.between(0, 5), asked.between(0.0, 5.0)
+    assert nanoseconds != seconds
+    assert seconds == asked.between(0, 5 * SECOND)
+    assert len({nanoseconds, seconds, asked.between(0, 5)}) == 2
+    windows = asked.where("n == 1").windows("1s", "1s")
+    again = Intervals.of([(windows[0].recording, np.array([[SECOND, 3 * SECOND, 1]]))])
+    assert asked.during(again) == asked.during(windows)
+    question = asked.where("n ~ 'x' and n > 1").during(windows).every(2).question
+    assert pickle.loads(pickle.dumps(question)) == question
+    assert hash(pickle.loads(pickle.dumps(question))) == hash(question)
+
+
+def test_every_counts_each_topic(store: hl.Store) -> None:
+    one, other = Channel("/one", "json", None), Channel("/other", "json", None)
+    rows = [(one if n % 2 else other, b'{"n": %d}' % n) for n in range(20)]
+    record(store, rows)
+    thinned = list(store.topic("/one", "/other").every(5))
+    assert [m.topic for m in thinned].count("/one") == 2
+    assert [m.topic for m in thinned].count("/other") == 2
+    assert store.topic("/one", "/other").every(5).count() == 4
+
+
+@pytest.mark.parametrize("step", [1.5, "3", 0])
+def test_steps_take_whole_numbers(store: hl.Store, step: Any) -> None:
+    record(store, as_json({"n": 1}))
+    with pytest.raises(UsageError):
+        store.topic("/j").every(step)
+    with pytest.raises(UsageError):
+        store.topic("/j").limit(step or -1)
+    with pytest.raises(UsageError, match="names"):
+        store.topic("/j").fields(["n"])  # type: ignore[arg-type]
+
+
+def test_a_recording_that_is_gone_is_not_left_out(store: hl.Store) -> None:
+    record(store, as_json({"n": 1}), "a")
+    record(store, as_json({"n": 1}, {"n": 2}), "b")
+    query = store.topic("/j").where("n >= 1")
+    assert query.count() == 3
+    with hl.open(store.directory.path) as other:
+        other.remove("a")
+    store.refresh()
+    for ask in (query.count, lambda: list(query), query.to_pandas):
+        with pytest.raises(TopicError, match="removed"):
+            ask()
+    assert store.topic("/j").where("n >= 1").count() == 2
+
+
+def test_only_mongodb_finds_and_the_messages_tell(store: hl.Store) -> None:
+    record(store, as_json(*[{"n": n, "v": n // 3} for n in range(9)]))
+    query = store.topic("/j").where({"$expr": {"$gt": ["$n", 4]}})
+    assert query.count() == len(list(query)) == query.to_arrow().num_rows == 4
+    assert sum(table.num_rows for table in query.to_tables()) == 4
+    assert len(query.changes("v", pause="0s")) == 1
