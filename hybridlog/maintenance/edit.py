@@ -140,7 +140,9 @@ def _channel(inventory: Inventory) -> tuple[Channel, int, int]:
             same = channel.topic == wanted.topic and channel.schema == wanted.schema
             if same and channel.message_encoding == wanted.message_encoding:
                 return channel, channel_id, summary.schema_ids[channel_id]
-    return wanted, max(known, default=-1) + 1, schemas + 1
+    # Ids of a lost segment are not reused either.
+    lost = (int(c["id"]) for sealed in inventory.lost for c in sealed.channels)
+    return wanted, max([*known, *lost], default=-1) + 1, schemas + 1
 
 
 def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> int:
