@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 _OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
-_FIXED_ARRAY = re.compile(r"\[(\d+)\]$")
+_SINGLE = re.compile(r"(bool|byte|char|string|time|duration|float(32|64)|u?int(8|16|32|64))")
+_FIXED_ARRAY = re.compile(_SINGLE.pattern + r"\[(?P<length>\d+)\]")
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 
 
@@ -236,8 +237,11 @@ def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
         if not below:
             return False
         for name in below:
-            kind = types[name]
-            fixed = _FIXED_ARRAY.search(kind)
-            if kind.endswith("]") and (fixed is None or int(fixed[1]) > _WHOLE):
+            inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
+            fixed = _FIXED_ARRAY.fullmatch(types[name])
+            is_short = fixed is not None and int(fixed["length"]) <= _WHOLE
+            if not (_SINGLE.fullmatch(types[name]) or is_short) and not (
+                inner and not types[name].endswith("]")
+            ):
                 return False
     return True
