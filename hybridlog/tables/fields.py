@@ -60,7 +60,7 @@ class FieldShape:
         if pa.types.is_struct(kind):
             if kind.num_fields == 0:
                 present = np.ones(len(array), np.bool_)
-                return pa.array(present, mask=_missing(array))
+                return pa.array(present, mask=array.is_null().to_numpy(zero_copy_only=False))
             return self._struct(array, path, _inner_names)
         if _is_list(kind):
             if self._is_long(array, path):

@@ -52,6 +52,13 @@ def test_json(store: hl.Store, tmp_path: Path) -> None:
     assert duckdb.execute(query, [files]).fetchone() == (400,)
 
 
+def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Path) -> None:
+    record(store, tmp_path, [{"n": 1, "e": {}}, {"n": 2, "e": None}, {"n": 3, "e": {}}])
+    found = rows(store)
+    assert found is not None
+    assert [row["e"] is None for row in found] == [False, True, False]
+
+
 def test_json_of_mixed_types(store: hl.Store, tmp_path: Path) -> None:
     record(store, tmp_path, [{"a": 1}, {"a": "x"}, {"a": {"b": 2}}, {}])
     found = rows(store)
