@@ -224,7 +224,14 @@ class Store:
         return self.query(self.topics())
 
     def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
-        """A question about topics by their full names, in some recordings or all."""
+        """A question about topics by their full names, in some recordings or all.
+
+        Raises:
+            UsageError: a name instead of a list of names.
+            TopicError: no recording chosen has any of the topics.
+        """
+        if isinstance(topics, str):
+            raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self.session, Question(*self.session.having(topics, recordings)))
 
     # Changes.

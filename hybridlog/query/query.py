@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.messages import Batch
 
+_MAX_STEP = 2**62  # longer than any topic, and an int64
+
 
 class Query:
     """A question about some topics of an open store. Immutable: each step returns a new one.
@@ -155,7 +157,7 @@ class Query:
         """
         if not isinstance(step, int) or step < 1:
             raise UsageError(f"every(n) needs a number n of at least 1, not {step!r}.")
-        return self._with(every=step)
+        return self._with(every=min(step, _MAX_STEP))
 
     def reverse(self) -> Query:
         """Latest message first."""

@@ -142,6 +142,8 @@ def test_every_counts_each_topic(store: hl.Store) -> None:
     assert [m.topic for m in thinned].count("/one") == 2
     assert [m.topic for m in thinned].count("/other") == 2
     assert store.topic("/one", "/other").every(5).count() == 4
+    first = store.topic("/one", "/other").every(10**30)
+    assert len(list(first)) == first.count() == len(first.to_pandas()) == 2
 
 
 @pytest.mark.parametrize("step", [1.5, "3", 0])
@@ -153,6 +155,8 @@ def test_steps_take_whole_numbers(store: hl.Store, step: Any) -> None:
         store.topic("/j").limit(step or -1)
     with pytest.raises(UsageError, match="names"):
         store.topic("/j").fields(["n"])  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"topic\('/j'\)"):
+        store.query("/j")
 
 
 def test_a_recording_that_is_gone_is_not_left_out(store: hl.Store) -> None:
