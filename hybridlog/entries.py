@@ -323,12 +323,12 @@ def _losses_of_chunks(
         bounds = summary.table.part_bounds()
         for part in summary.table.parts[bounds[number] : bounds[number + 1]]:
             channel = summary.channels.get(int(part["channel"]))
-            told = {
+            lost = {
                 "topic": channel.topic if channel is not None else None,
                 **{name: int(part[name]) for name in ("messages", "first", "last")},
             }
             place = {"offset": int(chunk["offset"]), "length": int(chunk["length"])}
-            rows.append(_loss(inventory.listing.sealed[segment], reason, told, **place))
+            rows.append(_loss(inventory.listing.sealed[segment], reason, lost, **place))
     return rows
 
 
@@ -359,9 +359,9 @@ def _fill_stats(entry: RecordingEntry, inventory: Inventory, stamps: Stamps) -> 
     totals: dict[int, ChannelStats] = {}
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
-        told = stamps(entry, number, summary.table)
-        entry.is_decoded &= told is not None or not summary.chunks
-        for channel_id, stats in channel_totals(summary.table, told, silent).items():
+        found = stamps(entry, number, summary.table)
+        entry.is_decoded &= found is not None or not summary.chunks
+        for channel_id, stats in channel_totals(summary.table, found, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
     for channel in entry.channels:
         channel.stats = totals.get(channel.id, ChannelStats())

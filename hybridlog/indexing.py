@@ -76,18 +76,20 @@ class ChunkIndexer:
             channel = channels[channel_id]
             codec, assembler, stamped = self._part(channel_id, channel)
             batch = placed.batch.take(rows)
-            told = _Told(batch, placed.number[rows], has_publish_time=channel.has_publish_time)
+            found = _StatsByChunk(
+                batch, placed.number[rows], has_publish_time=channel.has_publish_time
+            )
             tables: list[NDArray[np.uint8]] = []
             for group in codec.bodies(batch.buffer, batch.offset, batch.length):
                 if group.stamps is not None:
-                    told.stamped(group.rows, group.stamps)
+                    found.stamped(group.rows, group.stamps)
                 if group.error is not None:
-                    told.unreadable(group.rows)
+                    found.unreadable(group.rows)
                 tables.append(assembler.assemble(placed, rows[group.rows], group.body, group.error))
             if stamped:
-                _read_stamps(codec, batch, told)
+                _read_stamps(codec, batch, found)
             documents.append(Documents(collection_of(channel.topic), tables))
-            for number, of_chunk in told.by_chunk():
+            for number, of_chunk in found.by_chunk():
                 stats[number][channel_id] = of_chunk
         entries = [
             ChunkEntry(
@@ -138,7 +140,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
         yield int(ids[start]), order[start:end]
 
 
-class _Told:
+class _StatsByChunk:
     """Statistics of a channel's messages, for each chunk.
 
     Args:
@@ -222,14 +224,14 @@ class _Told:
             stats.skew_min, stats.skew_max = least, most
 
 
-def _read_stamps(codec: Codec, batch: Batch, told: _Told) -> None:
+def _read_stamps(codec: Codec, batch: Batch, found: _StatsByChunk) -> None:
     """Read header stamps that the index bodies do not provide."""
-    rows = told.without_stamps()
+    rows = found.without_stamps()
     if len(rows):
         left = batch.take(rows)
         stamped, stamps = stamps_of(codec, left)
         if len(stamped):
-            told.stamped(rows[stamped], stamps)
+            found.stamped(rows[stamped], stamps)
 
 
 def _spans(values: NDArray[np.int64], begins: NDArray[np.intp]) -> Iterator[tuple[int, int]]:

@@ -235,7 +235,7 @@ class Decoder:
 
 
 def _are_single(planner: Planner) -> bool:
-    """Whether only single values are asked for, which reduced messages have, too."""
+    """True if only single values are asked for; reduced messages have those, too."""
     fields = planner.question.fields
     known = planner.session.field_types(planner.question.topics, planner.question.recordings)
     if not fields or known is None:

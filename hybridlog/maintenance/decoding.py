@@ -62,7 +62,7 @@ def _decoded(
     before = 0
     for number, summary in inventory.summaries.items():
         if catalog.stamps(entry, number, summary.table) is None:
-            told: dict[int, dict[int, ChannelStats]] = {}
+            stats: dict[int, dict[int, ChannelStats]] = {}
             path = directory.recording(entry.label) / inventory.listing.sealed[number]
             with SegmentReader(path, number) as reader:
                 for place in summary.chunks:
@@ -70,8 +70,8 @@ def _decoded(
                     with suppress(SegmentError):
                         chunk = reader.read_chunk(place)
                         _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
-                        told[place.number] = of_chunk.stats
+                        stats[place.number] = of_chunk.stats
                     if progress is not None:
                         progress(entry.label, before + place.offset + place.length, total)
-            yield number, summary.digest, stamps_of(summary.table, told)
+            yield number, summary.digest, stamps_of(summary.table, stats)
         before += summary.size

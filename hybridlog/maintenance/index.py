@@ -409,9 +409,9 @@ def _stamps(state: IndexState, inventory: Inventory) -> Iterator[tuple[int, str,
     indexed = state.chunks(inventory.id[:16])
     for segment, chunks in groupby(indexed, key=lambda chunk: chunk.segment):
         summary = inventory.summaries.get(segment)
-        told = {chunk.number: chunk.stats for chunk in chunks}
+        stats = {chunk.number: chunk.stats for chunk in chunks}
         if summary is not None:
-            yield segment, summary.digest, stamps_of(summary.table, told)
+            yield segment, summary.digest, stamps_of(summary.table, stats)
 
 
 def reindex(

@@ -48,8 +48,8 @@ class ChunkLists:
             fetch: Queries the database for the chunks of these channels in a time range,
                 or in all times.
         """
-        kept = self._kept(recording, frozenset(channels), fetch)
-        return fetch(bounds) if kept is None else kept.between(*bounds)
+        cached = self._cached(recording, frozenset(channels), fetch)
+        return fetch(bounds) if cached is None else cached.between(*bounds)
 
     def before(
         self,
@@ -68,16 +68,15 @@ class ChunkLists:
 
         Yields:
             A chunk, and the greatest log time, ns, that it or any later chunk may hold.
-            come may hold.
         """
         held = frozenset(channels)
-        kept = self._kept(recording, held, fetch)
-        if kept is None:
+        cached = self._cached(recording, held, fetch)
+        if cached is None:
             yield from latest_first(held, span, fetch)
         else:
-            yield from kept.before(span[1])
+            yield from cached.before(span[1])
 
-    def _kept(
+    def _cached(
         self,
         recording: str,
         channels: frozenset[int],
@@ -91,9 +90,9 @@ class ChunkLists:
             self._asked.add(key)
             return None
         everything = fetch(None)
-        kept = _ChunkList(everything, channels) if len(everything) <= _MOST else None
-        self._lists[key] = kept
-        return kept
+        cached = _ChunkList(everything, channels) if len(everything) <= _MOST else None
+        self._lists[key] = cached
+        return cached
 
     def clear(self) -> None:
         """Forget all entries."""

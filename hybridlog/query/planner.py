@@ -151,7 +151,7 @@ class Planner:
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
-        """Whether the fields of the messages of a part come from its table."""
+        """True if the fields of the messages of a part come from its table."""
         costs = self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields)
         if not costs or costs[0][1] is not self._tables:
             return False
@@ -301,7 +301,7 @@ class Planner:
         return total
 
     def _is_narrowed(self, part: Part) -> bool:
-        """Whether MongoDB finds candidates, and the messages decide."""
+        """True if MongoDB finds candidates and the messages decide."""
         if part.predicate is None:
             return False
         files = self._files(part, Need.COUNT)

@@ -174,7 +174,7 @@ class TopicTable:
 
     @property
     def has_fields(self) -> bool:
-        """Whether the messages have any field."""
+        """True if the messages have any field."""
         return any(not leaf.is_own for leaves in self._leaves.values() for leaf in leaves)
 
     def has(self, path: str) -> bool:

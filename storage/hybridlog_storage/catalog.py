@@ -338,9 +338,9 @@ def stamps_of(
     """
     rows = np.zeros(len(table.parts), _STAMPS)
     bounds = table.part_bounds().tolist()
-    for number, told in chunks.items():
+    for number, by_channel in chunks.items():
         for row in range(bounds[number], bounds[number + 1]):
-            stats = told.get(int(table.parts["channel"][row]))
+            stats = by_channel.get(int(table.parts["channel"][row]))
             if stats is None:
                 continue
             rows[row] = (
@@ -792,10 +792,10 @@ class Catalog:
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
         key = entry.id, number, entry.digests.get(str(number), "")
         with self._reading() as db:
-            kept = self._tables.get(key)
-            if kept is not None:
+            cached = self._tables.get(key)
+            if cached is not None:
                 self._tables.move_to_end(key)
-                return kept
+                return cached
             row = db.execute(
                 "select id, number, digest, chunks, crc from segments where id = ? and number = ?",
                 key[:2],
@@ -806,17 +806,17 @@ class Catalog:
                     f"{entry.label}. `hybridlog reindex` rebuilds it."
                 )
             table = ChunkTable.from_bytes(row[3])
-            kept = table, self.stamps(entry, number, table)
-            if kept[1] is None and entry.is_decoded and len(table.parts):
+            cached = table, self.stamps(entry, number, table)
+            if cached[1] is None and entry.is_decoded and len(table.parts):
                 # Without its row the next opening reads the recording's files again.
                 with suppress(sqlite3.Error):
                     db.execute("delete from recordings where id = ?", (entry.id,))
-            self._tables[key] = kept
+            self._tables[key] = cached
             self._cached += _size(table)
             while self._cached > _CACHED_BYTES and len(self._tables) > 1:
                 _, (oldest, _) = self._tables.popitem(last=False)
                 self._cached -= _size(oldest)
-            return kept
+            return cached
 
     def chunks(
         self,
@@ -915,8 +915,8 @@ def _in_bounds(
     suffix = "_publish" if clock == "publish" else ""
     inside = (parts[f"first{suffix}"] < end) & (parts[f"last{suffix}"] >= begin)
     if clock == "publish":
-        told = [c.id for c in entry.channels if c.has_publish_time]
-        inside &= np.isin(parts["channel"], np.array(told, np.int64))
+        timed = [c.id for c in entry.channels if c.has_publish_time]
+        inside &= np.isin(parts["channel"], np.array(timed, np.int64))
     return np.asarray(inside)
 
 

@@ -286,8 +286,8 @@ class SegmentReader:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         totals = table.by_channel()
         counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
-        told = records.statistics.channel_message_counts if records.statistics else {}
-        if counts != {c: n for c, n in told.items() if n} or not counts.keys() <= (
+        stated = records.statistics.channel_message_counts if records.statistics else {}
+        if counts != {c: n for c, n in stated.items() if n} or not counts.keys() <= (
             records.channels.keys()
         ):
             raise _NoSummaryError("its statistics and its chunk table differ")

@@ -87,9 +87,9 @@ def read_settings(path: Path) -> StoreSettings:
     requires = _names(file, values, "requires")
     unknown = [name for name in requires if name not in FEATURES]
     if unknown:
-        told = ", ".join(repr(name[:80]) for name in unknown[:5])
+        names = ", ".join(repr(name[:80]) for name in unknown[:5])
         raise StoreError(
-            f"The store {path} requires {told}, which this hybridlog does not know. Install a "
+            f"The store {path} requires {names}, which this hybridlog does not know. Install a "
             "newer hybridlog."
         )
     store_id, shared = values.get("store_id"), values.get("shared", False)

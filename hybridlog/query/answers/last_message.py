@@ -29,15 +29,15 @@ def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
     """The last message not after a time, in any recording; None if none exists."""
-    moments: list[tuple[int, int, RecordingEntry]] = []
+    candidates: list[tuple[int, int, RecordingEntry]] = []
     for recording in session.chosen(question.recordings):
         start, end = span_of(recording)
         now = parse_time(moment, start=start, end=end)
         if start < end and start <= now:
-            moments.append((min(now, end - 1), start, recording))
+            candidates.append((min(now, end - 1), start, recording))
     best: tuple[tuple[int, str, int], Message] | None = None
     # Ask the recording that could hold the latest message first: it usually does.
-    for latest, start, recording in sorted(moments, key=itemgetter(0), reverse=True):
+    for latest, start, recording in sorted(candidates, key=itemgetter(0), reverse=True):
         if best is not None and latest < best[0][0]:
             break
         found = _last_of(session, question, counters, recording, (start, latest))

@@ -198,7 +198,7 @@ class Mongo:
 
 
 def _is_older(part: Part) -> bool:
-    """Whether the index is older than the package that reads the fields of the messages."""
+    """True if the index is older than the package that reads the fields of the messages."""
     if part.predicate is None:
         return False
     unread = {c.id for c in part.recording.channels if c.reason is not None}

@@ -186,7 +186,7 @@ class Predicate:
 
     @property
     def asks_fields(self) -> bool:
-        """Whether it is about fields of the message, and not only about `_meta`."""
+        """True if it is about fields of the message, not only about `_meta`."""
         return self.is_opaque or not all(map(is_meta, self.fields()))
 
     @property
@@ -196,7 +196,7 @@ class Predicate:
 
 
 def is_meta(path: str) -> bool:
-    """Whether a path leads into `_meta`, which hybridlog adds to a message."""
+    """True if a path leads into `_meta`, which hybridlog adds to a message."""
     return path == "_meta" or path.startswith("_meta.")
 
 
