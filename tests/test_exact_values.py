@@ -421,9 +421,9 @@ def frame(request: pytest.FixtureRequest, store: hl.Store) -> pd.DataFrame:
 
 def test_duckdb_reads_a_frame(frame: pd.DataFrame) -> None:
     rows = frame.reset_index()
-    assert duckdb.sql("select count(*) from rows").fetchall() == [(len(rows),)]
+    assert duckdb.connect().sql("select count(*) from rows").fetchall() == [(len(rows),)]
     for name in rows.columns:
-        found = duckdb.sql(f'select count("{name}") from rows').fetchall()
+        found = duckdb.connect().sql(f'select count("{name}") from rows').fetchall()
         assert found == [(int(rows[name].notna().sum()),)]
 
 
@@ -432,9 +432,9 @@ def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None
         rows = store.topic(topic).to_arrow()
         path = tmp_path / f"{number}.parquet"
         path.write_bytes(written(store.topic(topic), "parquet"))
-        one = duckdb.sql("select * from rows").fetchall()
+        one = duckdb.connect().sql("select * from rows").fetchall()
         assert len(one) == rows.num_rows
-        assert len(duckdb.sql(f"select * from '{path}'").fetchall()) == rows.num_rows
+        assert len(duckdb.connect().sql(f"select * from '{path}'").fetchall()) == rows.num_rows
         assert pl.read_parquet(path).height == rows.num_rows
         assert pl.from_arrow(rows).shape[0] == rows.num_rows
 

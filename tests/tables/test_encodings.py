@@ -49,7 +49,7 @@ def test_json(store: hl.Store, tmp_path: Path) -> None:
     assert len(found) == 1200
     files = str(store.directory.path / "tables/*/topic=a/*.parquet")
     query = "select count(*) from read_parquet(?) where n = 9007199254740993"
-    assert duckdb.execute(query, [files]).fetchone() == (400,)
+    assert duckdb.connect().execute(query, [files]).fetchone() == (400,)
 
 
 def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Path) -> None:

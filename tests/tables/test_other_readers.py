@@ -29,7 +29,7 @@ def glob_of(store: hl.Store) -> str:
 
 def with_duckdb(store: hl.Store) -> list[Row]:
     query = f"select {', '.join(COLUMNS)} from read_parquet(?) order by t, seq"
-    return duckdb.execute(query, [glob_of(store)]).fetchall()
+    return duckdb.connect().execute(query, [glob_of(store)]).fetchall()
 
 
 def with_polars(store: hl.Store) -> list[Row]:
@@ -105,7 +105,7 @@ def test_duckdb_finds_what_there_is(
     # NaN is greater than all numbers in DuckDB.
     where = where.replace("f64 > 1.0", "f64 > 1.0 and not isnan(f64)")
     query = f"select count(*) from read_parquet(?) where {where}"
-    (count,) = duckdb.execute(query, [glob_of(recorded)]).fetchone() or (None,)
+    (count,) = duckdb.connect().execute(query, [glob_of(recorded)]).fetchone() or (None,)
     assert count == sum(holds(m.value) for m in decoded(recorded, "log", "/large"))
 
 
@@ -120,7 +120,7 @@ def test_partitions(recorded: hl.Store) -> None:
     (entry,) = recorded.recordings()
     everything = str(recorded.directory.path / "tables/*/topic=*/*.parquet")
     query = "select distinct recording, topic from read_parquet(?, hive_partitioning = true)"
-    assert duckdb.execute(query, [everything]).fetchall() == [(f"r{entry.id}", "large")]
+    assert duckdb.connect().execute(query, [everything]).fetchall() == [(f"r{entry.id}", "large")]
     frame = pl.scan_parquet(everything, hive_partitioning=True)
     assert frame.select("recording").unique().collect().rows() == [(f"r{entry.id}",)]
 
@@ -136,14 +136,14 @@ def test_ids_that_look_like_numbers_are_told_apart(recorded: hl.Store, tmp_path:
     frame = pl.scan_parquet(files, hive_partitioning=True)
     assert frame.select("recording").unique().collect().height == 3
     query = "select count(distinct recording) from read_parquet(?, hive_partitioning = true)"
-    assert duckdb.execute(query, [files]).fetchone() == (3,)
+    assert duckdb.connect().execute(query, [files]).fetchone() == (3,)
 
 
 def test_small_topics(recorded: hl.Store) -> None:
     path = str(recorded.directory.path / "tables/*/small/*.parquet")
     query = "select t, seq, u64 from read_parquet(?) where topic = '/small/two' order by t, seq"
     want = [(m.t, m.seq, m.value.u64) for m in decoded(recorded, "log", "/small/two")]
-    assert duckdb.execute(query, [path]).fetchall() == want
+    assert duckdb.connect().execute(query, [path]).fetchall() == want
     frame = pl.scan_parquet(path).filter(pl.col("topic") == "/small/two")
     assert frame.select("t", "seq", "u64").collect().rows() == want
 
@@ -154,7 +154,7 @@ def test_several_recordings_are_one_table(recorded: hl.Store, tmp_path: Path) ->
     query = "select count(*) from read_parquet(?) where i8 = 1"
     messages = [m for name in ("log", "more") for m in decoded(recorded, name, "/large")]
     want = sum(m.value.i8 == 1 for m in messages)
-    assert duckdb.execute(query, [glob_of(recorded)]).fetchone() == (want,)
+    assert duckdb.connect().execute(query, [glob_of(recorded)]).fetchone() == (want,)
     assert ds.dataset(recorded.directory.path / "tables").count_rows() == 2800
 
 
@@ -177,7 +177,7 @@ def test_real_logs(store: hl.Store, log: str, topic: str, path: str) -> None:
         want.append((message.t, value))
     files = str(store.directory.path / f"tables/*/topic={topic[1:].replace('/', '__')}/*.parquet")
     query = f"select t, {path} from read_parquet(?) order by t, seq"
-    assert duckdb.execute(query, [files]).fetchall() == want
+    assert duckdb.connect().execute(query, [files]).fetchall() == want
     column = pl.col(path.split(".", maxsplit=1)[0])
     for name in path.split(".")[1:]:
         column = column.struct.field(name)
