@@ -409,14 +409,7 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
 
 def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
     origin = state.begun.get("origin", {}) if state is not None else {}
-    return {
-        "id": entry.id,
-        "name": entry.name,
-        "tags": entry.tags,
-        "source": entry.source,
-        "created": entry.created,
-        "origin": origin,
-    }
+    return {**recording_metadata(entry), "origin": origin}
 
 
 def sealed_line(inventory: Inventory, number: int) -> journal.Event:

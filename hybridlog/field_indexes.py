@@ -1,12 +1,12 @@
 """Indexes on fields, with which MongoDB finds documents without a scan.
 
 They change the duration of a query and never its answer, so the segments do not have
-them: MongoDB stores them, and `reindex` creates them again.
+them: MongoDB stores them, and `reindex` leaves them in place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.collection_names import collection_of
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 OWN_FIELDS = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
 """Fields that every index document has, in any topic."""
 
-_OURS = "hybridlog."
 _MOST_FIELDS = 8
 
 
@@ -60,22 +59,6 @@ def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
         for topic in topics
         for keys in database.indexes(collection_of(topic))
     ]
-
-
-def of_collections(database: Database) -> Mapping[str, list[list[tuple[str, int]]]]:
-    """The keys of all indexes on topics' collections, for `make_again`."""
-    names = [name for name in database.list_collections() if not name.startswith(_OURS)]
-    return {name: keys for name in names if (keys := database.indexes(name))}
-
-
-def make_again(
-    database: Database, indexes: Mapping[str, Sequence[Sequence[tuple[str, int]]]]
-) -> None:
-    """Create indexes again on collections that were dropped."""
-    for collection, all_keys in indexes.items():
-        database.ensure_collection(collection)
-        for keys in all_keys:
-            database.create_index(collection, keys)
 
 
 def _check(fields: Sequence[str]) -> None:

@@ -13,16 +13,13 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.schema.plain import without_nan
 from hybridlog_storage.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
 
 _MAX_DEPTH = 200
 _BLOCK = 1 << 20
