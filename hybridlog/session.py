@@ -222,13 +222,15 @@ class Session:
         wanted = set(ids)
         return [entry for entry in self.recordings() if entry.id in wanted]
 
-    def select(self, names: Sequence[str]) -> list[RecordingEntry]:
-        """Recordings by label, by name, by id, or by the beginning of one of these.
+    def select(self, names: Sequence[str] | None) -> list[RecordingEntry]:
+        """Recordings by label, name, id, or the beginning of one of these; None for all.
 
         Raises:
             TopicError: no recording matches, or several do.
         """
         everything = self.recordings()
+        if names is None:
+            return everything
         chosen: list[RecordingEntry] = []
         for given in names:
             name = self.repairs.copies.get(given, given)

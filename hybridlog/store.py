@@ -193,8 +193,8 @@ class Store:
         """
         return self.session.entry(recording)
 
-    def select(self, names: Sequence[str]) -> list[RecordingEntry]:
-        """Recordings by label, by name, by id, or by the beginning of one of these.
+    def select(self, names: Sequence[str] | None) -> list[RecordingEntry]:
+        """Recordings by label, name, id, or the beginning of one of these; None for all.
 
         Raises:
             TopicError: No recording matches, or several do.
@@ -335,7 +335,7 @@ class Store:
         if recordings is None:
             self.catalog.mend()
         self.refresh()
-        chosen = self.recordings() if recordings is None else self.select(recordings)
+        chosen = self.select(recordings)
         left = index.reindex(
             self.directory,
             self.catalog,

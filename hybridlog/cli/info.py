@@ -35,7 +35,7 @@ def command(*, what: str | None, store: Path | None, mongo: str | None, as_json:
         show_segment(Path(what), as_json=as_json)
         return
     with opened_store(store, mongo, quiet=as_json) as opened:
-        chosen = opened.select([what]) if what is not None else opened.recordings()
+        chosen = opened.select(None if what is None else [what])
         index = opened.index_place
     if as_json:
         full = [_as_dict(entry) for entry in chosen]

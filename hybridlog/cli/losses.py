@@ -35,7 +35,7 @@ def command(
 
     fits = matcher(topic) if topic else None
     with opened_store(store, mongo) as opened:
-        entries = opened.select(recording) if recording else opened.recordings()
+        entries = opened.select(recording or None)
         if topic:
             resolve(topic, opened.topics())  # refuses a name that fits no topic
     rows = [

@@ -34,7 +34,7 @@ def command(
     """
     started = time.monotonic()
     with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
-        chosen = opened.select(recording) if recording else opened.recordings()
+        chosen = opened.select(recording or None)
         total = sum(entry.stored_bytes for entry in chosen)
         with (
             if_stopped(

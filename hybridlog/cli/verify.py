@@ -38,7 +38,7 @@ def command(
     """
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        chosen = opened.select(recording) if recording else opened.recordings()
+        chosen = opened.select(recording or None)
         total = sum(entry.stored_bytes for entry in chosen)
         with progress_bar("verify", total, quiet=quiet) as bar:
             result = opened.verify(recording or None, Stages(bar))
