@@ -98,7 +98,7 @@ def _topics(directory: StoreDirectory, labels: Sequence[str]) -> set[str]:
 
 
 def _short_names(topics: set[str]) -> Iterator[str]:
-    """Ends of topics, in whole parts, that no two topics share."""
+    """Short names that stand for one topic only: `scan` for `/robot/scan`."""
     owners: dict[str, int] = {}
     for topic in topics:
         parts = topic.strip("/").split("/")

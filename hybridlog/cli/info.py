@@ -190,7 +190,7 @@ def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> li
 
 
 def _source(source: Mapping[str, Any]) -> str:
-    """The source of a recording; a robot has no size, and a program has no address."""
+    """Path or URL of the source, its kind, and the size of a log file."""
     size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
     kind = f"{source['kind']}{size}"
     return f"{source['path']} ({kind})" if source["path"] else kind

@@ -161,7 +161,7 @@ def payloads_of(
 
 
 def body_groups(bodies: Iterator[bytes | PayloadError]) -> Iterator[BodyGroup]:
-    """Group bodies, given in row order, by width."""
+    """Group the document bodies of messages by their length in bytes."""
     by_width: dict[int, tuple[list[int], list[bytes]]] = {}
     by_error: dict[str, list[int]] = {}
     for row, body in enumerate(bodies):

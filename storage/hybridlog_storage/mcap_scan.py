@@ -402,7 +402,7 @@ class _Places:
         return RECORD_HEAD.unpack(head) == (Opcode.CHUNK, self._lengths[offset] - _HEAD)
 
     def _single(self) -> bool:
-        """Check a single chunk by its own fields, since it has no majority."""
+        """Check the only chunk of a file by its own fields: it has no others to agree with."""
         if len(self._starts) != 1:
             return False
         (offset,) = self._starts

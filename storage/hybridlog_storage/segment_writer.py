@@ -452,7 +452,7 @@ class RecordingWriter:
     # The methods below run on the writing thread only.
 
     def _store(self, packed: Future[PackedChunk]) -> None:
-        """Write a closed chunk and packed chunks behind it; none after a failure."""
+        """Write a packed chunk and the packed ones that follow it; nothing after a failure."""
         if self._broken is not None:
             return  # the next append raises it
         if not self._packed or packed is not self._packed[0]:

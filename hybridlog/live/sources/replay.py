@@ -330,7 +330,7 @@ class _Player:
         return self._start + elapsed / (1e9 * self._speed)
 
     def _wait_for_the_end(self) -> None:
-        """Wait until the last message of the round is due, even an unwanted one."""
+        """Wait until the last message of the round is due, even if its topic is not recorded."""
         while not self._stop.is_set():
             pause = self._last_due - time.monotonic()
             if pause <= 0:
