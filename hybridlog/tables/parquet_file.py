@@ -121,6 +121,7 @@ class _Sink:
 
     def __init__(self, path: Path, depth: int) -> None:
         self.closed = False
+        self._is_abandoned = False
         self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, depth=depth)
         self._waiting = bytearray()
         self._position = 0
@@ -131,6 +132,8 @@ class _Sink:
     def write(self, data: Buffer) -> int:
         """Write bytes."""
         data = memoryview(data).cast("B")
+        if self._is_abandoned:
+            return len(data)  # pyarrow closes its writer when it is collected
         self._position += len(data)
         if self._footer is not None:
             self._footer += data
@@ -168,6 +171,8 @@ class _Sink:
         self._fd = -1
 
     def abandon(self) -> None:
+        self._is_abandoned = True
+        self._waiting.clear()
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1

@@ -55,6 +55,15 @@ def path(tmp_path: Path) -> Path:
     return place / "a.parquet"
 
 
+def test_a_discarded_file_is_let_go_in_silence(path: Path, table: pa.Table) -> None:
+    """When pyarrow's writer is collected, it writes a footer to the file that is gone."""
+    writer = ParquetFileWriter(path, table, depth=1)
+    writer.write(table)
+    writer.discard()
+    writer._writer.close()
+    assert not path.exists()
+
+
 def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
     said = write(path, table)
     reader = ParquetFileReader(path)
