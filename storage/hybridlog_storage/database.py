@@ -3,17 +3,25 @@
 The only module that uses pymongo. Documents made by hybridlog are transferred as bytes in
 both directions, thousands at a time, and never become Python objects. pymongo is imported
 on first use, since its import takes longer than most commands.
+
+Every command may be repeated: documents are inserted under their own `_id`, and other
+changes have the same result twice. So a command is sent again when its connection breaks,
+and a long answer goes on behind the last document received. In a replica set, writes are
+acknowledged by a majority of the members, whatever the URI says: an acknowledged write then
+outlives the loss of the primary. Reads go to the primary.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import operator
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -27,6 +35,7 @@ if TYPE_CHECKING:
     from pymongo import MongoClient
     from pymongo.collection import Collection
     from pymongo.database import Database as PymongoDatabase
+    from pymongo.write_concern import WriteConcern
 
     from hybridlog_storage.messages import Buffer
 
@@ -34,6 +43,10 @@ Document = dict[str, Any]
 """A decoded document with values of the `bson` package."""
 Sort = Sequence[tuple[str, int]]
 """Field paths with 1 (ascending) or -1 (descending)."""
+ReadConcern = Literal["local", "majority", "linearizable"]
+"""What a read of a replica set may see: everything that the primary has; only what cannot be
+rolled back; that, and certainly all of it. A single server knows no difference."""
+_T = TypeVar("_T")
 
 BATCH_BYTES = 16 << 20
 """Most bytes of documents in one insert command; a single document may have as many."""
@@ -47,6 +60,11 @@ _MOST_TOGETHER = 100
 _BYTES_TOGETHER = 4 << 20
 
 _GONE_S = 1.0  # seconds without an answer after which the server counts as ended
+_TRIES = 3  # for a command whose connection breaks
+_ELECTION_S = 20.0  # seconds for a replica set to elect a primary; it takes about 12
+_REPLICATION_S = 60.0  # seconds for a majority of its members to take over a write
+_NO_LONGER_PRIMARY = frozenset({91, 189, 10107, 11600, 11602, 13435, 13436})
+"""Server error codes of a member that stops being the primary."""
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = frozenset({14031})
@@ -103,7 +121,11 @@ class Database:
 
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
         self._client = client
-        self._database: PymongoDatabase[Document] = client[name]
+        self._is_replicated = _is_replicated(client)
+        self._write_concern = _write_concern(client, is_replicated=self._is_replicated)
+        self._database: PymongoDatabase[Document] = client.get_database(
+            name, write_concern=self._write_concern
+        )
         self._address = address
 
     @classmethod
@@ -114,7 +136,8 @@ class Database:
             uri: MongoDB connection string. A database named in it wins over `name`, a
                 `serverSelectionTimeoutMS` in it over `timeout_s`.
             name: Database to use; it need not exist.
-            timeout_s: Seconds to wait for the server, now and in every later operation.
+            timeout_s: Seconds to wait for the server, now and in every later operation. If
+                the URI is that of a replica set, 20 seconds more: it may elect a primary.
 
         Raises:
             UsageError: The URI or the database's name is malformed or not allowed.
@@ -144,9 +167,12 @@ class Database:
                 f"digits, - and _, and none of {', '.join(sorted(_RESERVED_NAMES))}."
             )
         given = {option.lower() for option in parsed["options"]}
-        options: dict[str, object] = {"appname": "hybridlog"}
+        # Members other than the primary may lack documents that the index is said to have.
+        options: dict[str, object] = {"appname": "hybridlog", "readPreference": "primary"}
         if "serverselectiontimeoutms" not in given:
-            options["serverSelectionTimeoutMS"] = int(timeout_s * 1000)
+            is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
+            wait_s = timeout_s + (_ELECTION_S if is_set else 0)
+            options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
         if "connecttimeoutms" not in given:
             options["connectTimeoutMS"] = int(timeout_s * 1000)
         with _mapped(address):
@@ -154,8 +180,7 @@ class Database:
         try:
             if not client.write_concern.acknowledged:
                 raise UsageError(f"{address}: w=0 would lose errors; leave it out.")
-            with _mapped(address):
-                version = client.server_info()
+            version = _retried(client, address, client.server_info)
             if tuple(version["versionArray"][:2]) < OLDEST_SERVER:
                 raise DatabaseError(
                     f"MongoDB at {address} has version {version['version']}; hybridlog needs "
@@ -206,11 +231,15 @@ class Database:
             return False
         return True
 
+    def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
+        """Run a command, again if its connection breaks."""
+        return _retried(self._client, self._address, command, question=question)
+
     def ensure_collection(self, name: str) -> None:
         """Create a clustered collection (`_id` is its only key) unless it exists."""
         from pymongo.errors import OperationFailure
 
-        with _mapped(self._address):
+        def create() -> None:
             try:
                 self._database.create_collection(
                     name,
@@ -220,6 +249,8 @@ class Database:
             except OperationFailure as error:
                 if error.code != _NAMESPACE_EXISTS:
                     raise
+
+        self._again(create)
 
     def insert_raw(
         self,
@@ -245,7 +276,7 @@ class Database:
                 replica set, with the majority).
 
         Returns:
-            Number of new documents.
+            Number of new documents; fewer after a repeated command.
 
         Raises:
             ValueError: `documents` does not hold `count` documents of the given lengths.
@@ -273,10 +304,19 @@ class Database:
         }
         if journal:
             command["writeConcern"] = {"w": "majority", "j": True}
-        elif not self._client.write_concern.is_server_default:
-            command["writeConcern"] = self._client.write_concern.document
-        with _mapped(self._address):
+        elif not self._write_concern.is_server_default:
+            command["writeConcern"] = self._write_concern.document
+
+        def insert() -> Document:
+            from pymongo.errors import NotPrimaryError
+
             reply = self._database.command(command)
+            failed = reply.get("writeConcernError") or {}
+            if failed.get("code") in _NO_LONGER_PRIMARY:
+                raise NotPrimaryError(str(failed.get("errmsg", "")), failed)
+            return reply
+
+        reply = self._again(insert)
         for error in reply.get("writeErrors", ()):
             if error["code"] != _DUPLICATE_KEY:
                 raise _refused(self._address, error["code"], str(error.get("errmsg", "")))
@@ -307,18 +347,22 @@ class Database:
             batch_size: Documents in one item; 0 for as many as fit 16 MiB.
             max_time_ms: Most milliseconds on the server.
         """
-        with _mapped(self._address, question=True):
-            cursor = self._collection(collection).find_raw_batches(
-                dict(filter or {}),
-                None if projection is None else dict(projection),
+        of, shape = self._collection(collection), None if projection is None else dict(projection)
+
+        def ask(query: Document) -> Any:
+            return of.find_raw_batches(
+                query,
+                shape,
                 sort=sort or None,
                 limit=limit,
                 # By default the server's first batch has 101 documents.
                 batch_size=batch_size or (1 << 30),
                 max_time_ms=max_time_ms,
             )
-            with cursor:
-                yield from cursor
+
+        is_keyed = not limit and (projection is None or projection.get("_id", 1))
+        order = _key_order(sort) if is_keyed else 0
+        return self._found(ask, dict(filter or {}), order, _last_key)
 
     def find(
         self,
@@ -330,19 +374,62 @@ class Database:
         limit: int = 0,
         batch_size: int = 0,
         max_time_ms: int | None = None,
+        read: ReadConcern = "local",
     ) -> Iterator[Document]:
-        """Find documents one by one; for small answers. Arguments as in `find_raw`."""
-        with _mapped(self._address, question=True):
-            cursor = self._collection(collection).find(
-                dict(filter or {}),
+        """Find documents one by one; for small answers.
+
+        The arguments are those of `find_raw`, and `read` for what the answer may hold.
+        """
+        of = self._collection(collection, read)
+
+        def ask(query: Document) -> Any:
+            return of.find(
+                query,
                 None if projection is None else dict(projection),
                 sort=sort or None,
                 limit=limit,
                 batch_size=batch_size,
                 max_time_ms=max_time_ms,
             )
-            with cursor:
-                yield from cursor
+
+        is_keyed = not limit and (projection is None or projection.get("_id", 1))
+        order = _key_order(sort) if is_keyed else 0
+        return self._found(ask, dict(filter or {}), order, operator.itemgetter("_id"))
+
+    def _found(
+        self,
+        ask: Callable[[Document], Any],
+        query: Document,
+        order: int,
+        key: Callable[[Any], object],
+    ) -> Iterator[Any]:
+        """What a cursor finds; goes on behind the last item if the connection breaks.
+
+        Args:
+            ask: Makes the cursor for a filter.
+            query: The filter.
+            order: 1 or -1 if the items are in the order of `_id`; 0 to go on only while there
+                is no item yet.
+            key: The last `_id` of an item.
+        """
+        last: Any = None
+        tries = _TRIES
+        with _mapped(self._address, question=True):
+            while True:
+                rest = query
+                if last is not None:
+                    rest = {"$and": [query, {"_id": {"$gt" if order > 0 else "$lt": key(last)}}]}
+                try:
+                    with ask(rest) as cursor:
+                        for item in cursor:
+                            yield item
+                            last, tries = item, _TRIES
+                    return
+                except _broken() as error:
+                    tries -= 1
+                    if not tries or (last is not None and not order):
+                        raise
+                    _wait(self._client, error)
 
     def find_one(
         self,
@@ -352,10 +439,11 @@ class Database:
         *,
         sort: Sort | None = None,
         max_time_ms: int | None = None,
+        read: ReadConcern = "local",
     ) -> Document | None:
-        """Find the first document, None if no document matches. Arguments as in `find_raw`."""
+        """Find the first document, None if no document matches. Arguments as in `find`."""
         found = self.find(
-            collection, filter, projection, sort=sort, limit=1, max_time_ms=max_time_ms
+            collection, filter, projection, sort=sort, limit=1, max_time_ms=max_time_ms, read=read
         )
         return next(found, None)
 
@@ -379,39 +467,24 @@ class Database:
             must exist.
             max_time_ms: Most milliseconds on the server.
         """
-        with _mapped(self._address, question=True):
-            where = self._collection(collection)
-            options: dict[str, Any] = {} if max_time_ms is None else {"maxTimeMS": max_time_ms}
+        of = self._collection(collection)
+        options: dict[str, Any] = {} if max_time_ms is None else {"maxTimeMS": max_time_ms}
+        if by_key and filter:
+            options["hint"] = {"_id": 1}
+
+        def ask() -> int:
             if not filter:
-                return where.estimated_document_count(**options)
-            if by_key:
-                options["hint"] = {"_id": 1}
-            return self._count(where, dict(filter), options)
+                return of.estimated_document_count(**options)
+            # A sharded cluster would count documents twice while it moves them.
+            if self._client.is_mongos:
+                return of.count_documents(dict(filter), **options)
+            # Costs less than a pipeline, as which the driver would send it.
+            reply = self._database.command("count", of.name, query=dict(filter), **options)
+            return int(reply["n"])
 
-    def _count(self, where: Collection[Document], query: Document, options: Document) -> int:
-        """Count with the command `count` where that is exact: it costs less than a pipeline."""
-        from pymongo.errors import AutoReconnect, ServerSelectionTimeoutError
+        return self._again(ask, question=True)
 
-        # A sharded cluster would count documents twice while it moves them.
-        if not self._client.is_mongos:
-            try:
-                reply = self._database.command(
-                    "count",
-                    where.name,
-                    query=query,
-                    read_preference=where.read_preference,
-                    **options,
-                )
-                return int(reply["n"])
-            except ServerSelectionTimeoutError:
-                raise
-            except AutoReconnect:
-                pass  # the driver retries pipelines, but not commands
-        return where.count_documents(query, **options)
-
-    def count_each(
-        self, questions: Sequence[tuple[str, Mapping[str, object]]], *, most: int = 0
-    ) -> list[int]:
+    def count_each(self, questions: Sequence[tuple[str, Mapping[str, object]]]) -> list[int]:
         """Count the documents that match each of many questions, in few round trips.
 
         Meant for questions with a range of `_id`: MongoDB tries for each whether that range
@@ -419,48 +492,64 @@ class Database:
 
         Args:
             questions: Collection and filter of each.
-            most: Count at most this many; 0 for no limit.
         """
         numbers = [0] * len(questions)
+        for place, number in self._grouped(questions, lambda place: {"$literal": place}):
+            numbers[place] = number
+        return numbers
+
+    def count_by(
+        self, questions: Sequence[tuple[str, Mapping[str, object]]], field: str
+    ) -> dict[object, int]:
+        """Count the documents that match any of many questions, by the value of a field."""
+        numbers: Counter[object] = Counter()
+        for value, number in self._grouped(questions, lambda _: f"${field}"):
+            numbers[value] += number
+        return numbers
+
+    def _grouped(
+        self,
+        questions: Sequence[tuple[str, Mapping[str, object]]],
+        key: Callable[[int], object],
+    ) -> Iterator[tuple[Any, int]]:
+        """Numbers of documents by a key, which may differ between questions."""
         for first, part in _together(questions):
             pipelines = []
             for place, (collection, query) in enumerate(part, first):
-                count: Document = {"$group": {"_id": {"$literal": place}, "n": {"$sum": 1}}}
-                limit: list[Document] = [{"$limit": most}] if most else []
-                pipelines.append((collection, [{"$match": dict(query)}, _IN_ORDER, *limit, count]))
+                count: Document = {"$group": {"_id": key(place), "n": {"$sum": 1}}}
+                pipelines.append((collection, [{"$match": dict(query)}, _IN_ORDER, count]))
             collection, pipeline = _union(pipelines)
             for found in self.aggregate(collection, pipeline):
-                numbers[found["_id"]] = int(found["n"])
-        return numbers
+                yield found["_id"], int(found["n"])
 
     def find_each(
         self,
         collection: str,
         filters: Sequence[Mapping[str, object]],
-        projection: Mapping[str, object] | None = None,
-        *,
-        order: int = 1,
-        batch_size: int = 0,
+        projection: Mapping[str, object],
     ) -> Iterator[bytes]:
         """Find the documents of many questions, one after the other, as in `find_raw`.
 
         Args:
             collection: The collection.
-            filters: The questions, each with a range of `_id`.
+            filters: The questions, each with a range of `_id`. The documents that about a
+                hundred of them find must fit into memory.
             projection: MongoDB's projection document; names the fields to return.
-            order: Order of `_id` within each answer: 1, or -1 for descending.
-            batch_size: Documents in one item; 0 for as many as fit 16 MiB.
         """
-        shape: list[Document] = [] if projection is None else [{"$project": dict(projection)}]
-        sort: Document = {"$sort": {"_id": order}}
+        of, shape = self._collection(collection), {"$project": dict(projection)}
         for _, part in _together([(collection, query) for query in filters]):
-            parts = [(where, [{"$match": dict(query)}, sort, *shape]) for where, query in part]
-            with _mapped(self._address, question=True):
-                cursor = self._collection(collection).aggregate_raw_batches(
-                    _union(parts)[1], batchSize=batch_size or (1 << 30), allowDiskUse=True
-                )
-                with cursor:
-                    yield from cursor
+            if len(part) == 1:  # one command; a pipeline takes two
+                yield from self.find_raw(collection, part[0][1], projection, sort=[("_id", 1)])
+                continue
+            parts = [(where, [{"$match": dict(query)}, _IN_ORDER, shape]) for where, query in part]
+            _, pipeline = _union(parts)
+
+            def ask(pipeline: list[Document] = pipeline) -> list[bytes]:
+                found = of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
+                with found as cursor:
+                    return [*cursor]
+
+            yield from self._again(ask, question=True)
 
     def aggregate(
         self,
@@ -473,13 +562,12 @@ class Database:
         for stage in pipeline:
             if not _WRITING_STAGES.isdisjoint(stage):
                 raise WhereError(f"A pipeline may only read: {', '.join(stage)} is not allowed.")
-        with _mapped(self._address, question=True):
-            options: dict[str, Any] = {"allowDiskUse": True}
-            if max_time_ms is not None:
-                options["maxTimeMS"] = max_time_ms
-            stages = [dict(stage) for stage in pipeline]
-            with self._collection(collection).aggregate(stages, **options) as cursor:
-                yield from cursor
+        of = self._collection(collection)
+        options: dict[str, Any] = {"allowDiskUse": True}
+        if max_time_ms is not None:
+            options["maxTimeMS"] = max_time_ms
+        stages = [dict(stage) for stage in pipeline]
+        yield from self._found(lambda _: of.aggregate(stages, **options), {}, 0, dict)
 
     def replace(
         self,
@@ -490,19 +578,17 @@ class Database:
         upsert: bool = True,
     ) -> None:
         """Replace the first matching document, or insert it if none matches."""
-        with _mapped(self._address):
-            self._collection(collection).replace_one(dict(filter), dict(document), upsert=upsert)
+        of = self._collection(collection)
+        self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=upsert))
 
     def replace_all(self, collection: str, documents: Sequence[Mapping[str, object]]) -> None:
         """Replace or insert each document by its `_id`."""
         from pymongo import ReplaceOne
 
         if documents:
-            with _mapped(self._address):
-                self._collection(collection).bulk_write(
-                    [ReplaceOne({"_id": d["_id"]}, dict(d), upsert=True) for d in documents],
-                    ordered=False,
-                )
+            changes = [ReplaceOne({"_id": d["_id"]}, dict(d), upsert=True) for d in documents]
+            of = self._collection(collection)
+            self._again(lambda: of.bulk_write(changes, ordered=False))
 
     def update(
         self,
@@ -512,32 +598,35 @@ class Database:
         *,
         upsert: bool = False,
     ) -> int:
-        """Apply update operators to every matching document; return their number."""
-        with _mapped(self._address):
-            result = self._collection(collection).update_many(
-                dict(filter), dict(change), upsert=upsert
-            )
-            return result.matched_count
+        """Apply update operators to every matching document; return their number.
+
+        Args:
+            collection: The collection.
+            filter: MongoDB's filter document.
+            change: The operators. They may be applied twice, so what they count is only a sign
+                that something has changed.
+            upsert: Whether to insert a document if none matches.
+        """
+        of = self._collection(collection)
+        result = self._again(lambda: of.update_many(dict(filter), dict(change), upsert=upsert))
+        return result.matched_count
 
     def delete(self, collection: str, filter: Mapping[str, object]) -> int:  # noqa: A002
         """Delete every matching document; return their number. `{}` deletes all."""
-        with _mapped(self._address):
-            return self._collection(collection).delete_many(dict(filter)).deleted_count
+        of = self._collection(collection)
+        return self._again(lambda: of.delete_many(dict(filter))).deleted_count
 
     def drop(self, collection: str) -> None:
         """Remove a collection if it exists."""
-        with _mapped(self._address):
-            self._collection(collection).drop()
+        self._again(self._collection(collection).drop)
 
     def drop_all(self) -> None:
         """Remove the whole database."""
-        with _mapped(self._address):
-            self._client.drop_database(self._database.name)
+        self._again(lambda: self._client.drop_database(self._database.name))
 
     def list_collections(self) -> list[str]:
         """Names of all collections, sorted, without MongoDB's own."""
-        with _mapped(self._address):
-            names = self._database.list_collection_names()
+        names = self._again(self._database.list_collection_names)
         return sorted(name for name in names if not name.startswith("system."))
 
     def create_index(
@@ -549,14 +638,14 @@ class Database:
         sparse: bool = False,
     ) -> str:
         """Create an index unless it exists; return its name."""
-        with _mapped(self._address):
-            options: dict[str, Any] = {"sparse": True} if sparse else {}
-            return self._collection(collection).create_index(list(keys), unique=unique, **options)
+        of = self._collection(collection)
+        options: dict[str, Any] = {"sparse": True} if sparse else {}
+        return self._again(lambda: of.create_index(list(keys), unique=unique, **options))
 
     def indexes(self, collection: str) -> list[list[tuple[str, int]]]:
         """The keys of all indexes but the one on `_id`, sorted."""
-        with _mapped(self._address):
-            found = [about["key"].items() for about in self._collection(collection).list_indexes()]
+        of = self._collection(collection)
+        found = self._again(lambda: [about["key"].items() for about in of.list_indexes()])
         keys = [[(str(field), int(order)) for field, order in key] for key in found]
         return sorted(key for key in keys if [field for field, _ in key] != ["_id"])
 
@@ -564,8 +653,8 @@ class Database:
         """Drop the index with these keys; return whether it existed."""
         if list(keys) not in self.indexes(collection):
             return False
-        with _mapped(self._address):
-            self._collection(collection).drop_index(list(keys))
+        of = self._collection(collection)
+        self._again(lambda: of.drop_index(list(keys)))
         return True
 
     def stats(self, collection: str) -> CollectionStats:
@@ -573,13 +662,17 @@ class Database:
         from pymongo.errors import OperationFailure
 
         pipeline: list[Document] = [{"$collStats": {"storageStats": {}}}]
-        with _mapped(self._address):
+        of = self._collection(collection)
+
+        def ask() -> Document:
             try:
-                found = next(iter(self._collection(collection).aggregate(pipeline)), {})
+                return next(iter(of.aggregate(pipeline)), {})
             except OperationFailure as error:
                 if error.code != 26:  # NamespaceNotFound
                     raise
-                found = {}
+                return {}
+
+        found = self._again(ask)
         about = found.get("storageStats", {})
         return CollectionStats(
             documents=int(about.get("count", 0)),
@@ -588,8 +681,12 @@ class Database:
             index_bytes=int(about.get("totalIndexSize", 0)),
         )
 
-    def _collection(self, name: str) -> Collection[Document]:
-        return self._database[name]
+    def _collection(self, name: str, read: ReadConcern = "local") -> Collection[Document]:
+        from pymongo.read_concern import ReadConcern as PymongoReadConcern
+
+        if read == "local" or not self._is_replicated:
+            return self._database[name]
+        return self._database.get_collection(name, read_concern=PymongoReadConcern(read))
 
 
 _IN_ORDER: Document = {"$sort": {"_id": 1}}
@@ -617,6 +714,87 @@ def _union(parts: Sequence[tuple[str, list[Document]]]) -> tuple[str, list[Docum
     collection, pipeline = parts[0]
     others = [{"$unionWith": {"coll": where, "pipeline": stages}} for where, stages in parts[1:]]
     return collection, [*pipeline, *others]
+
+
+def _is_replicated(client: MongoClient[Document]) -> bool:
+    """True for a replica set, a member of one, and a sharded cluster, once it has answered."""
+    about = client.topology_description
+    members = about.server_descriptions().values()
+    return about.topology_type_name == "Sharded" or any(m.replica_set_name for m in members)
+
+
+def _write_concern(client: MongoClient[Document], *, is_replicated: bool) -> WriteConcern:
+    """The URI's, but with a majority of a replica set's members, and not waiting for ever."""
+    from pymongo.write_concern import WriteConcern
+
+    given: Document = client.write_concern.document
+    if not is_replicated:
+        return WriteConcern(**given)
+    number = given.get("w", 1)
+    wanted = "majority" if isinstance(number, int) else number  # a name is one of the server's
+    return WriteConcern(**{"wtimeout": int(_REPLICATION_S * 1000), **given, "w": wanted})
+
+
+def _broken() -> tuple[type[Exception], ...]:
+    """Errors after which a command is sent again: the connection or the cursor is gone."""
+    from pymongo.errors import AutoReconnect, CursorNotFound
+
+    return AutoReconnect, CursorNotFound
+
+
+def _retried(
+    client: MongoClient[Document],
+    address: str,
+    command: Callable[[], _T],
+    *,
+    question: bool = False,
+) -> _T:
+    """Run a command that may be repeated, again if its connection breaks."""
+    with _mapped(address, question=question):
+        for _ in range(_TRIES - 1):
+            try:
+                return command()
+            except _broken() as error:
+                _wait(client, error)
+        return command()
+
+
+def _wait(client: MongoClient[Document], error: Exception) -> None:
+    """Wait until the server answers again after an error.
+
+    Raises:
+        PyMongoError: It does not: the error. A replica set is given the time of an election, by
+            the next command.
+    """
+    from pymongo import timeout
+    from pymongo.errors import PyMongoError, ServerSelectionTimeoutError
+
+    if isinstance(error, ServerSelectionTimeoutError):
+        raise error  # after all the time that there is
+    if client.topology_description.topology_type_name.startswith("ReplicaSet"):
+        return
+    try:
+        with timeout(_GONE_S):
+            client.admin.command("ping")
+    except PyMongoError:
+        raise error from None
+
+
+def _key_order(sort: Sort | None) -> int:
+    """1 or -1 if documents come in the order of `_id`, or the other way round; else 0."""
+    (first, order), *more = sort or [("_id", 1)]
+    return order if first == "_id" and not more else 0
+
+
+def _last_key(documents: bytes) -> object:
+    """The `_id` of the last of several documents."""
+    from bson import decode
+
+    position, length = 0, 0
+    while position < len(documents):
+        (length,) = struct.unpack_from("<i", documents, position)
+        position += length
+    return decode(documents[position - length :])["_id"]
 
 
 def without_secrets(uri: str) -> str:

@@ -2,9 +2,10 @@
 
 `hybridlog.recordings` mirrors the catalog for other programs. It also states for each
 recording whether its index is complete, and from which segments it was made. The index is
-used only if both match. `hybridlog.chunks` lists indexed chunks while a recording is being
-indexed. A row is written after the documents of its chunk, so a killed server has not lost
-documents that it lists.
+used only if both match, and in a replica set only if a majority of its members has them:
+then the documents, written before, cannot be lost. `hybridlog.chunks` lists indexed chunks
+while a recording is being indexed. A row is written after the documents of its chunk, so a
+killed server has not lost documents that it lists.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
-from hybridlog_storage.database import Database
+from hybridlog_storage.database import Database, ReadConcern
 from hybridlog_storage.index_documents import key_bound
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
@@ -34,6 +35,7 @@ indexed, complete, being removed for good."""
 _DESTROYS: Final = frozenset({"clearing", "removing"})
 _KEY: Final = re.compile("[0-9a-f]{16}")
 _TURN: Final = {"_id": "turn"}
+_TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
 """Values of an entry that may change while its segments stay."""
 
@@ -104,7 +106,9 @@ class IndexState:
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
         wanted = {"id": 1, "index": 1, "channels.topic": 1, **dict.fromkeys(_SHOWN, 1)}
-        for document in self._db.find(RECORDINGS, asked, wanted, batch_size=_AT_ONCE):
+        for document in self._db.find(
+            RECORDINGS, asked, wanted, batch_size=_AT_ONCE, read="majority"
+        ):
             index = document.get("index") or {}
             topics = {str(c.get("topic", "")) for c in document.get("channels") or ()}
             found[document["_id"]] = Indexed(
@@ -119,9 +123,9 @@ class IndexState:
             )
         return found
 
-    def turn(self) -> int:
+    def turn(self, read: ReadConcern = "local") -> int:
         """The number of removals of documents of any recording so far."""
-        found = self._db.find_one(STORE, _TURN)
+        found = self._db.find_one(STORE, _TURN, read=read, max_time_ms=_TURN_MS)
         return int(found["turn"]) if found is not None else 0
 
     def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
@@ -129,7 +133,7 @@ class IndexState:
         asked, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
         said = {
             found["_id"]: found.get("index") or {}
-            for found in self._db.find(RECORDINGS, asked, wanted)
+            for found in self._db.find(RECORDINGS, asked, wanted, read="majority")
         }
         return {
             key: Progressed(int(index.get("turn", 0)), dict(index.get("segments") or {}))
