@@ -43,7 +43,8 @@ class Belief:
         state = IndexState(database)
         if before is not None and before.recordings.keys() >= set(keys):
             return before
-        turn = state.turn()
+        # What is read after this is as new as this, whichever member is the primary by now.
+        turn = state.turn(read="linearizable")
         known = before.recordings if before is not None and before.turn == turn else {}
         missing = set(keys) - known.keys()
         return cls(turn, {**known, **dict.fromkeys(missing), **state.progress(missing)})
@@ -105,9 +106,15 @@ class GuardedIndex:
         """Number of documents that match."""
         return self._once(lambda: self.database.count(collection, asked, by_key=by_key))
 
-    def count_each(self, questions: Sequence[tuple[str, _Filter]], *, most: int = 0) -> list[int]:
+    def count_each(self, questions: Sequence[tuple[str, _Filter]]) -> list[int]:
         """Numbers of documents that match each of many questions."""
-        return self._once(lambda: self.database.count_each(questions, most=most))
+        return self._once(lambda: self.database.count_each(questions))
+
+    def count_by(
+        self, questions: Sequence[tuple[str, _Filter]], field: str
+    ) -> Mapping[object, int]:
+        """Numbers of documents that match any of many questions, by the value of a field."""
+        return self._once(lambda: self.database.count_by(questions, field))
 
     def find_one(self, collection: str, *args: Any, **options: Any) -> dict[str, Any] | None:
         """The first document; None if none matches."""
@@ -118,10 +125,10 @@ class GuardedIndex:
         return self._each(self.database.find_raw(collection, *args, **options))
 
     def find_each(
-        self, collection: str, filters: Sequence[_Filter], *args: Any, **options: Any
+        self, collection: str, filters: Sequence[_Filter], projection: _Filter
     ) -> Iterator[bytes]:
-        """Documents of many queries, one after the other, in the form of `find_raw`."""
-        return self._each(self.database.find_each(collection, filters, *args, **options))
+        """Documents of many questions, one after the other, in the form of `find_raw`."""
+        return self._each(self.database.find_each(collection, filters, projection))
 
     def _once(self, ask: Callable[[], _T]) -> _T:
         found = ask()

@@ -64,6 +64,7 @@ class Planner:
         self.session = session
         self.question = question
         self.counters = counters
+        self._asked: Sequence[Part] = ()  # parts that are answered at the same time
         self._ranges = RangeResolver(session, question)
         self._scan = PayloadScan(session, counters)
         self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
@@ -72,7 +73,7 @@ class Planner:
     def _mongo(self) -> Mongo:
         from hybridlog.query.engines.mongo import Mongo
 
-        return Mongo(self.session, self.counters)
+        return Mongo(self.session, self.counters, lambda: self._asked)
 
     @cached_property
     def _tables(self) -> TablesEngine:
@@ -146,6 +147,11 @@ class Planner:
         limit = self.question.limit
         return total if limit is None else min(total, limit)
 
+    def together(self, parts: Sequence[Part]) -> Sequence[Part]:
+        """Announce parts that will be asked about one by one; a server is asked at once."""
+        self._asked = parts
+        return parts
+
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """For each message of a part, whether it matches, in order."""
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
@@ -201,6 +207,7 @@ class Planner:
             return plan
         from hybridlog.query.message_filter import MessageFilter
 
+        self.together(parts)
         selecting: dict[Engine, list[Part]] = defaultdict(list)
         unindexed: set[int] = set()
         filters: dict[int, MessageFilter] = {}
@@ -281,6 +288,7 @@ class Planner:
         return sorted(able, key=itemgetter(0))
 
     def _count(self, parts: Sequence[Part]) -> int:
+        self.together(parts)
         groups: dict[Engine, list[Part]] = defaultdict(list)
         narrowed: list[Part] = []
         for part in parts:

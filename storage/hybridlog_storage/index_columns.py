@@ -7,8 +7,9 @@ layout in every document. So a batch of thousands of them is read as one numpy a
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 KEY: Final = {"_id": 1}
 """The projection that `key_columns` reads."""
-REFERENCE: Final = {"_id": 0, "_meta.ref": 1}
+REFERENCE: Final = {"_id": 1, "_meta.ref": 1}
 """The projection that `reference_columns` reads."""
 
 _KEY_VALUE = np.dtype([("time", ">u8"), ("recording", ">u8"), ("seq", ">u8")])
@@ -62,11 +63,13 @@ class ReferenceColumns:
     """Positions of the payloads of messages.
 
     Attributes:
+        recording: uint64[n], key of the recording.
         segment: int64[n], number of the segment.
         chunk: int64[n], number of the chunk in the segment.
         offset: int64[n], start of the payload in the uncompressed chunk.
     """
 
+    recording: NDArray[np.uint64]
     segment: NDArray[np.int64]
     chunk: NDArray[np.int64]
     offset: NDArray[np.int64]
@@ -74,6 +77,17 @@ class ReferenceColumns:
     def __len__(self) -> int:
         """Number of references."""
         return len(self.offset)
+
+    def by_chunk(self) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int64]]]:
+        """Recording, segment and chunk with the offsets there, in the order of the documents."""
+        order = np.lexsort((self.chunk, self.segment, self.recording))
+        places = (self.recording[order], self.segment[order], self.chunk[order])
+        is_new = np.any([column[1:] != column[:-1] for column in places], axis=0)
+        for rows in np.split(order, np.flatnonzero(is_new) + 1):
+            if len(rows):
+                first = rows[0]
+                place = int(self.recording[first]), int(self.segment[first]), int(self.chunk[first])
+                yield place, self.offset[rows]
 
 
 def key_columns(batch: bytes) -> KeyColumns:
@@ -110,6 +124,7 @@ def reference_columns(batch: bytes) -> ReferenceColumns:
         if len(documents) and (documents[name] != expected).any():
             raise _strange("_meta.ref")
     return ReferenceColumns(
+        documents["key"]["recording"].astype(np.uint64),
         documents["seg"].astype(np.int64),
         documents["chunk"].astype(np.int64),
         documents["off"].astype(np.int64),
@@ -135,11 +150,13 @@ def _reference_layout() -> tuple[np.dtype[np.void], dict[str, np.void]]:
     sizes = {"<i4": 4, "<i8": 8}
     inner = 4 + sum(2 + len(name) + sizes[kind] for name, _, kind in integers) + 1
     meta = 4 + len(b"\x03ref\0") + inner + 1
-    whole = 4 + len(b"\x03_meta\0") + meta + 1
-    text = struct.pack("<i", whole) + b"\x03_meta\0" + struct.pack("<i", meta)
+    key = b"\x05_id\0" + struct.pack("<i", _KEY_VALUE.itemsize) + b"\0"
+    whole = 4 + len(key) + _KEY_VALUE.itemsize + len(b"\x03_meta\0") + meta + 1
+    head = struct.pack("<i", whole) + key
+    fields: list[tuple[str, Any]] = [("before key", f"V{len(head)}"), ("key", _KEY_VALUE)]
+    expected = {"before key": np.void(head)}
+    text = b"\x03_meta\0" + struct.pack("<i", meta)
     text += b"\x03ref\0" + struct.pack("<i", inner)
-    fields: list[tuple[str, str]] = []
-    expected: dict[str, np.void] = {}
     for name, tag, kind in integers:
         text += bytes([tag]) + name.encode() + b"\0"
         fields += [(f"before {name}", f"V{len(text)}"), (name, kind)]

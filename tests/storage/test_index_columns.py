@@ -13,21 +13,32 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.index_columns import key_columns, reference_columns
 
 whole = st.integers(0, 2**63 - 1)
-references = st.tuples(st.integers(0, 2**31 - 1), whole, whole, whole)
+few = st.integers(0, 1)
+references = st.one_of(
+    st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**31 - 1), whole, whole, whole),
+    st.tuples(few, few, few, whole, whole),
+)
 
 
 @given(st.lists(references))
-def test_references_are_those_of_the_documents(rows: list[tuple[int, int, int, int]]) -> None:
+def test_references_are_those_of_the_documents(rows: list[tuple[int, int, int, int, int]]) -> None:
     batch = b"".join(
         bson.encode(
-            {"_meta": {"ref": {"seg": s, "chunk": Int64(c), "off": Int64(o), "len": Int64(n)}}}
+            {
+                "_id": b"\0" * 8 + r.to_bytes(8, "big") + b"\0" * 8,
+                "_meta": {"ref": {"seg": s, "chunk": Int64(c), "off": Int64(o), "len": Int64(n)}},
+            }
         )
-        for s, c, o, n in rows
+        for r, s, c, o, n in rows
     )
     found = reference_columns(batch)
     assert len(found) == len(rows)
-    columns = (found.segment, found.chunk, found.offset)
-    assert list(zip(*(c.tolist() for c in columns), strict=True)) == [r[:3] for r in rows]
+    columns = (found.recording, found.segment, found.chunk, found.offset)
+    assert list(zip(*(c.tolist() for c in columns), strict=True)) == [r[:4] for r in rows]
+    by_chunk: dict[tuple[int, ...], list[int]] = {}
+    for row in rows:
+        by_chunk.setdefault(row[:3], []).append(row[3])
+    assert {place: offsets.tolist() for place, offsets in found.by_chunk()} == by_chunk
 
 
 @given(st.lists(st.tuples(whole, st.integers(0, 2**64 - 1), whole), max_size=20))

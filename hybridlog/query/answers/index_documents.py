@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import bson
@@ -29,8 +29,16 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
     """
     session.database_for("Reading index documents")
     planner = Planner(session, question, counters)
-    mongo = Mongo(session, counters)
-    streams = [_of_part(planner, mongo, part, reverse=question.reverse) for part in planner.parts()]
+    parts = planner.parts()
+    mongo = Mongo(session, counters, lambda: parts)
+    by_topic: dict[str, list[Part]] = defaultdict(list)
+    for part in parts:
+        by_topic[part.topic].append(part)
+    streams = [
+        stream
+        for of_topic in by_topic.values()
+        for stream in _of_topic(planner, mongo, of_topic, reverse=question.reverse)
+    ]
     # Keys are ordered by log time, recording and arrival, over all topics.
     merged = heapq.merge(*streams, key=lambda pair: pair[1]["_id"], reverse=question.reverse)
     seen: Counter[str] = Counter()
@@ -44,21 +52,40 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
             yield document
 
 
-def _of_part(
-    planner: Planner, mongo: Mongo, part: Part, *, reverse: bool
-) -> Iterator[tuple[str, Document]]:
-    matching: set[tuple[int, int]] | None = None
-    if not mongo.filter_of(part).is_exact:
-        matching = set()
-        for found in planner.outcomes(part):
-            rows = found.holds
-            matching.update(
-                zip(found.log_time[rows].tolist(), found.seq[rows].tolist(), strict=True)
-            )
-    for raw in mongo.documents(part, reverse=reverse):
-        documents = bson.decode_all(raw)
-        planner.counters.documents_read += len(documents)
-        for document in documents:
-            meta = document["_meta"]
-            if matching is None or (meta["t"], meta["seq"]) in matching:
-                yield part.topic, document
+def _of_topic(
+    planner: Planner, mongo: Mongo, parts: Sequence[Part], *, reverse: bool
+) -> list[Iterator[tuple[str, Document]]]:
+    """Streams of the documents of one topic that match, each in order."""
+    matching = _Matching(planner, mongo, parts)
+
+    def read(stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
+        for raw in stream:
+            documents = bson.decode_all(raw)
+            planner.counters.documents_read += len(documents)
+            yield from ((parts[0].topic, d) for d in documents if matching.has(d["_meta"]))
+
+    return [read(stream) for stream in mongo.documents(parts, reverse=reverse)]
+
+
+class _Matching:
+    """Knows which of the documents that MongoDB finds match, where it cannot decide."""
+
+    def __init__(self, planner: Planner, mongo: Mongo, parts: Sequence[Part]) -> None:
+        self._planner = planner
+        self._unsure = {p.recording.key: p for p in parts if not mongo.filter_of(p).is_exact}
+        self._found: dict[str, set[tuple[int, int]]] = {}
+
+    def has(self, meta: Mapping[str, Any]) -> bool:
+        """True if a document matches, by its `_meta`."""
+        key = meta["rec"]
+        part = self._unsure.get(key)
+        if part is None:
+            return True
+        if key not in self._found:
+            found = self._found[key] = set()
+            for outcomes in self._planner.outcomes(part):
+                rows = outcomes.holds
+                found.update(
+                    zip(outcomes.log_time[rows].tolist(), outcomes.seq[rows].tolist(), strict=True)
+                )
+        return (meta["t"], meta["seq"]) in self._found[key]

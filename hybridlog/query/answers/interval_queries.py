@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,10 +45,15 @@ class IntervalQueries:
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
+        spans = [
+            (part, span, _bounded(part, span), _just_before(part, span))
+            for part, span in self._spans()
+        ]
+        self._planner.together([p for *_, inner, before in spans for p in (*before, inner)])
         return Intervals.of(
             (part.recording.id, rows)
-            for part, span in self._spans()
-            for rows in self._states_in(part, span, gap)
+            for part, span, inner, before in spans
+            for rows in self._states_in(part, span, gap, inner, before)
         )
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
@@ -121,7 +127,7 @@ class IntervalQueries:
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
-        for part in self._planner.parts():
+        for part in self._planner.together(self._planner.parts()):
             for found in self._planner.outcomes(part):
                 yield part.recording, found.log_time[found.holds]
 
@@ -135,22 +141,33 @@ class IntervalQueries:
             if recording.id in parts:
                 yield parts[recording.id], span
 
-    def _states_in(self, part: Part, span: Span, gap: int | None) -> Iterator[NDArray[np.int64]]:
+    def _states_in(
+        self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
+    ) -> Iterator[NDArray[np.int64]]:
         holding = Holding(gap)
-        before = self._last_before(part, span)
-        if before is not None:
+        last = self._last_before(part, span, before)
+        if last is not None:
             # The last message before the range determines the state at its beginning.
-            time, holds = before
+            time, holds = last
             yield clipped(holding.add(np.array([time]), np.array([holds]), counted=False), span)
-        for found in self._planner.outcomes(_bounded(part, span)):
+        for found in self._planner.outcomes(inner):
             yield clipped(holding.add(found.log_time, found.holds), span)
         yield clipped(holding.finish(span_of(part.recording)[1]), span)
 
-    def _last_before(self, part: Part, span: Span) -> tuple[int, bool] | None:
-        """Time and outcome of the last message before a span, whether it matches or not."""
-        for begin in _earlier(part, span):
+    def _last_before(
+        self, part: Part, span: Span, first: Sequence[Part]
+    ) -> tuple[int, bool] | None:
+        """Time and outcome of the last message before a span, whether it matches or not.
+
+        Args:
+            part: The part.
+            span: The span.
+            first: From `_just_before`.
+        """
+        further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
+        for earlier in (*first, *further):
             last = None
-            for found in self._planner.outcomes(_bounded(part, (begin, span[0]))):
+            for found in self._planner.outcomes(earlier):
                 if len(found.log_time):
                     last = int(found.log_time[-1]), bool(found.holds[-1])
             if last is not None:
@@ -206,6 +223,11 @@ def _earlier(part: Part, span: Span) -> Iterator[int]:
         yield span[0] - back
         back *= _FURTHER
     yield entry_span[0]
+
+
+def _just_before(part: Part, span: Span) -> list[Part]:
+    """The part in the first of the earlier spans, if there is one."""
+    return [_bounded(part, (begin, span[0])) for begin in islice(_earlier(part, span), 1)]
 
 
 def _bounded(part: Part, span: Span) -> Part:

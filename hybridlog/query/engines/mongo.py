@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.index_columns import KeyColumns
 
 _QUESTION_S = 0.4e-3  # seconds for a query to MongoDB
@@ -35,6 +36,8 @@ _DOCUMENT_S = 4e-6  # seconds to send a document
 _WINDOWS_A_QUESTION = 14
 _BATCH = 50_000
 _DOCUMENTS = 10_000
+_AHEAD = 200_000  # messages whose keys are read at once
+_MOST_APART = 100  # ranges of log time: as many as one command asks for
 _Filter = dict[str, object]
 _READABLE: _Filter = {"_meta.error": {"$exists": False}}
 
@@ -45,21 +48,33 @@ class Mongo:
     Args:
         session: The open store.
         counters: Count the documents that are read.
+        together: The parts of the question, about which the index is asked at once.
     """
 
-    def __init__(self, session: Session, counters: Counters) -> None:
+    def __init__(
+        self, session: Session, counters: Counters, together: Callable[[], Sequence[Part]] = tuple
+    ) -> None:
         self._session = session
         self._counters = counters
+        self._together = together
         self._undecided: dict[Part, int] = {}
+        self._ahead: dict[Part, list[Outcomes]] = {}
+        self._is_known = False
+        self._is_away = False
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
-        if need is Need.VALUES or _is_older(part) or self._session.database is None:
+        if need is Need.VALUES or self._is_away or _is_older(part):
+            return None
+        if self._session.database is None:
             return None
         try:
             if need is not Need.SELECTION and self.undecided(part):
                 return None
-        except (DatabaseError, IndexChangedError):
+        except IndexChangedError:
+            return None
+        except DatabaseError:
+            self._is_away = True  # not to wait for it once for each part
             return None
         windows = 1 if part.windows is None else len(part.windows)
         each = _LOOK_S if need is Need.COUNT else _LOOK_S + _DOCUMENT_S
@@ -91,14 +106,26 @@ class Mongo:
             DatabaseError: MongoDB is unavailable.
             IndexChangedError: another process changes the index.
         """
-        found = self.filter_of(part)
-        if found.is_exact:
+        if self.filter_of(part).is_exact:
             return 0
         if part not in self._undecided:
-            unsure = {"$and": [found.filter, {"$nor": [found.certain]}]}
-            asked = [(collection_of(part.topic), joined(c, unsure)) for c in conditions(part)]
-            self._undecided[part] = sum(self._index([part]).count_each(asked))
+            others = [p for p in self._together() if p.topic == part.topic and p is not part]
+            try:
+                self._ask_undecided([part, *others])
+            except IndexChangedError:
+                self._ask_undecided([part])
         return self._undecided[part]
+
+    def _ask_undecided(self, parts: Sequence[Part]) -> None:
+        """Ask about parts of one topic, with one question."""
+
+        def unsure(found: MongoFilter) -> _Filter:
+            return {"$and": [found.filter, {"$nor": [found.certain]}]}
+
+        open_parts = [p for p in parts if not self.filter_of(p).is_exact]
+        asked = [question for question, _ in self._questions(open_parts, unsure)]
+        found = self._index(open_parts).count_by(asked, "_meta.rec")
+        self._undecided.update((p, found.get(p.recording.key, 0)) for p in open_parts)
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of documents that match.
@@ -107,31 +134,58 @@ class Mongo:
             DatabaseError: MongoDB is unavailable.
             IndexChangedError: another process changes the index.
         """
-        index = self._index(parts)
-        unbounded: dict[tuple[str, str], list[Part]] = defaultdict(list)
-        asked: list[tuple[str, Mapping[str, object]]] = []
-        for part in parts:
-            collection, own = collection_of(part.topic), self.filter_of(part).filter
-            if part.is_unbounded:
-                unbounded[collection, repr(own)].append(part)
-            else:
-                asked.extend((collection, joined(c, own)) for c in conditions(part))
-        for (collection, _), group in unbounded.items():
-            keys = sorted(part.recording.key for part in group)
-            chosen: _Filter = {"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0]}
-            asked.append((collection, joined(chosen, self.filter_of(group[0]).filter)))
-        return sum(index.count_each(asked))
+        asked = [question for question, _ in self._questions(parts, lambda f: f.filter)]
+        return sum(self._index(parts).count_each(asked))
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """Keys of the matching documents merged with keys of the others."""
+        if part in self._ahead or self._look_ahead(part):
+            yield from self._ahead.pop(part)
+            return
         own = self.filter_of(part).filter
         collection = collection_of(part.topic)
-        for condition in conditions(part):
+        for condition, _ in conditions(part):
             yes = self._keys(part, collection, joined(condition, own))
             no: Iterator[KeyColumns] = iter(())
             if own:
                 no = self._keys(part, collection, joined(condition, {"$nor": [own]}))
             yield from _merged(yes, no)
+
+    def _look_ahead(self, part: Part) -> bool:
+        """Ask about this part and the following ones at once, if that is more than one."""
+        together = self._together()
+        place = next((i for i, other in enumerate(together) if other is part), len(together))
+        group: list[Part] = []
+        messages = 0.0
+        for other in together[place:]:
+            if other.topic == part.topic:
+                messages += other.messages * other.share
+                if messages > _AHEAD:
+                    break
+                group.append(other)
+        if len(group) < 2:
+            return False
+        yes = self._all_keys(group, lambda found: found.filter)
+        no = yes.take(slice(0))
+        if self.filter_of(part).filter:
+            no = self._all_keys(group, lambda found: {"$nor": [found.filter]})
+        for one in group:
+            both = (iter([k] if len(k) else []) for k in (_keys_in(yes, one), _keys_in(no, one)))
+            self._ahead[one] = [*_merged(*both)]
+        return True
+
+    def _all_keys(self, parts: Sequence[Part], of: Callable[[MongoFilter], _Filter]) -> KeyColumns:
+        """Keys of the documents of parts of one topic, by recording and in order."""
+        asked = [query for (_, query), _ in self._questions(parts, of)]
+        found = self._index(parts).find_each(collection_of(parts[0].topic), asked, KEY)
+        keys = key_columns(b"".join(found))
+        self._counters.documents_read += len(keys)
+        order = np.lexsort((keys.seq, keys.time, keys.recording))
+        keys = keys.take(order)
+        # Parts may overlap.
+        columns = (keys.recording, keys.time, keys.seq)
+        is_new = np.any([column[1:] != column[:-1] for column in columns], axis=0)
+        return keys.take(np.flatnonzero(np.append(np.True_, is_new)) if len(keys) else slice(0))
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Not supported: `cost` returns None."""
@@ -139,52 +193,134 @@ class Mongo:
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """References of the documents that match, or may match."""
-        index = self._index(parts)
-        low, high = min(t.first for t in tasks), max(t.last for t in tasks)
-        wanted = {t.key for t in tasks}
-        there = {t.key[0] for t in tasks}
-        found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
+        times: dict[str, list[int]] = defaultdict(list)
+        for task in tasks:
+            times[task.key[0]] += [task.first, task.last + 1]
+        alike: dict[tuple[str, str], list[Part]] = defaultdict(list)
         for part in parts:
-            if part.recording.id not in there:
-                continue
-            condition: _Filter = {
-                "_id": {"$gte": key_bound(low), "$lt": key_bound(high + 1)},
-                "_meta.rec": part.recording.key,
-            }
-            # With the order, MongoDB compares the range with an index of the user's.
-            for raw in index.find_raw(
-                collection_of(part.topic),
-                joined(condition, self.filter_of(part).filter),
-                REFERENCE,
-                sort=[("_id", 1)],
-            ):
+            if part.recording.id in times:
+                own = self.filter_of(part).filter
+                alike[collection_of(part.topic), repr(own)].append(part)
+        index = self._index([part for group in alike.values() for part in group])
+        wanted = {task.key for task in tasks}
+        found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
+        for (collection, _), group in alike.items():
+            spans = [(min(t), max(t)) for t in (times[part.recording.id] for part in group)]
+            # More documents than those of the chunks may be found, but no others are used.
+            asked = [
+                joined(_chosen(span, own), self.filter_of(own[0]).filter)
+                for span, own in self._ranges(group, spans)
+            ]
+            id_of = {int(part.recording.key, 16): part.recording.id for part in group}
+            for raw in index.find_each(collection, asked, REFERENCE):
                 reference = reference_columns(raw)
                 self._counters.documents_read += len(reference)
-                places = np.stack([reference.segment, reference.chunk], axis=1)
-                groups, inverse = np.unique(places, axis=0, return_inverse=True)
-                for number, (segment, chunk) in enumerate(groups.tolist()):
-                    key = (part.recording.id, segment, chunk)
+                for (recording, *place), offsets in reference.by_chunk():
+                    key = (id_of[recording], place[0], place[1])
                     if key in wanted:
-                        found[key].append(reference.offset[inverse.reshape(-1) == number])
+                        found[key].append(offsets)
         return RowSelection({key: np.sort(np.concatenate(p)) for key, p in found.items()})
 
-    def documents(self, part: Part, *, reverse: bool) -> Iterator[bytes]:
-        """Index documents of the candidates of a part, in order, many at a time.
+    def documents(self, parts: Sequence[Part], *, reverse: bool) -> list[Iterator[bytes]]:
+        """Index documents of the candidates of some parts of one topic.
+
+        Returns:
+            Streams of many documents at a time, each in order.
 
         Raises:
             DatabaseError: MongoDB is unavailable.
         """
-        own, order = self.filter_of(part).filter, -1 if reverse else 1
-        for condition in [*conditions(part)][::order]:
-            yield from self._index([part]).find_raw(
-                collection_of(part.topic),
-                joined(condition, own),
-                sort=[("_id", order)],
-                batch_size=_DOCUMENTS,
+        order = -1 if reverse else 1
+        questions = self._questions(parts, lambda f: f.filter, most=1)
+        streams: list[list[tuple[str, _Filter]]] = []
+        ends: list[int] = []
+        for question, (begin, end) in sorted(questions, key=lambda asked: asked[1]):
+            place = next((i for i, last in enumerate(ends) if last <= begin), len(ends))
+            if place == len(ends):
+                streams.append([])
+                ends.append(end)
+            streams[place].append(question)
+            ends[place] = end
+
+        def read(asked: Sequence[tuple[str, _Filter]]) -> Iterator[bytes]:
+            for collection, query in asked[::order]:
+                yield from self._index(parts).find_raw(
+                    collection, query, sort=[("_id", order)], batch_size=_DOCUMENTS
+                )
+
+        return [read(asked) for asked in streams]
+
+    def _questions(
+        self,
+        parts: Sequence[Part],
+        of: Callable[[MongoFilter], _Filter],
+        most: int | None = None,
+    ) -> list[tuple[tuple[str, _Filter], Span]]:
+        """Collections and filters that ask about each part once, with the log time of each.
+
+        Parts that differ only in their recordings are asked about together, where nothing
+        else lies between them.
+        """
+        alike: dict[tuple[str, str, str, Span | None], list[tuple[Part, Span]]]
+        alike = defaultdict(list)
+        found: list[tuple[tuple[str, _Filter], Span]] = []
+        for part in parts:
+            collection, own = collection_of(part.topic), of(self.filter_of(part))
+            if part.windows is not None:
+                for condition, span in conditions(part):
+                    found.append(((collection, joined(condition, own)), span))
+                continue
+            span, bounds = _time_of(part)
+            if span[0] < span[1]:
+                alike[collection, repr(own), part.clock, bounds].append((part, span))
+        for (collection, _, clock, bounds), group in alike.items():
+            own = of(self.filter_of(group[0][0]))
+            for span, there in self._ranges([p for p, _ in group], [s for _, s in group], most):
+                condition = _chosen(span, there)
+                if clock != "log" and bounds is not None:
+                    condition.update(_on_clock(clock, bounds))
+                found.append(((collection, joined(condition, own)), span))
+        return found
+
+    def _ranges(
+        self, parts: Sequence[Part], spans: Sequence[Span], most: int | None = None
+    ) -> list[tuple[Span, list[Part]]]:
+        """Ranges of log time that hold the spans of some parts, with the parts of each.
+
+        Spans are joined if they overlap, and if they are more than `most`, also across gaps in
+        which no other recording lies: finding many documents in one range costs less than
+        asking for many ranges.
+        """
+        if not parts:
+            return []
+        order = sorted(range(len(parts)), key=spans.__getitem__)
+        times = np.array([spans[i] for i in order], np.int64)
+        low, high = np.maximum.accumulate(times[:-1, 1]), times[1:, 0]
+        is_apart = low < high
+        if int(is_apart.sum()) >= (_MOST_APART if most is None else most):
+            own = {part.recording.id for part in parts}
+            others = np.array(
+                [_extent(r) for r in self._session.recordings() if r.id not in own], np.int64
+            ).reshape(-1, 2)
+            before = np.searchsorted(np.sort(others[:, 0]), high, "left")
+            is_apart &= before > np.searchsorted(np.sort(others[:, 1]), low, "right")
+        groups = np.split(np.arange(len(order)), np.flatnonzero(is_apart) + 1)
+        return [
+            (
+                (int(times[group[0], 0]), int(times[group, 1].max())),
+                [parts[order[i]] for i in group.tolist()],
             )
+            for group in groups
+        ]
 
     def _index(self, parts: Iterable[Part]) -> GuardedIndex:
         entries = list({part.recording.id: part.recording for part in parts}.values())
+        if not self._is_known:
+            # The state of all recordings of the question is read at once.
+            everything = [*entries, *(part.recording for part in self._together())]
+            database = self._session.database_for("A predicate")
+            self._session.belief(database, {entry.key for entry in everything})
+            self._is_known = True
         return self._session.index_for("A predicate", entries)
 
     def _keys(self, part: Part, collection: str, asked: _Filter) -> Iterator[KeyColumns]:
@@ -210,14 +346,49 @@ def joined(condition: _Filter, predicate: Mapping[str, object]) -> _Filter:
     return {"$and": [condition, dict(predicate)]} if predicate else condition
 
 
-def conditions(part: Part) -> Iterator[_Filter]:
+def conditions(part: Part) -> Iterator[tuple[_Filter, Span]]:
     """The recording and time of a part as filters, one for each window, in order."""
     recording: _Filter = {"_meta.rec": part.recording.key}
     if part.bounds is not None and part.clock != "log":
-        name = STAMP if part.clock == "header" else "_meta.pub"
-        recording[name] = {"$gte": part.bounds[0], "$lt": part.bounds[1]}
+        recording.update(_on_clock(part.clock, part.bounds))
     for begin, end in part.log_windows.tolist():
-        yield {**recording, **_between((begin, end))}
+        yield {**recording, **_between((begin, end))}, (begin, end)
+
+
+def _on_clock(clock: str, bounds: Span) -> _Filter:
+    name = STAMP if clock == "header" else "_meta.pub"
+    return {name: {"$gte": bounds[0], "$lt": bounds[1]}}
+
+
+def _chosen(span: Span, parts: Sequence[Part]) -> _Filter:
+    """The recordings of some parts, in a range of log time."""
+    keys = sorted(part.recording.key for part in parts)
+    return {"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0], **_between(span)}
+
+
+def _time_of(part: Part) -> tuple[Span, Span | None]:
+    """The log time of a part without windows, and its bounds if they exclude messages.
+
+    The log time is cut to that of its messages, where it is known.
+    """
+    low, high = (0, TIME_LIMIT - 1) if part.bounds is None else part.bounds
+    first, end = 0, TIME_LIMIT - 1
+    if part.recording.status != "open":
+        first = min((s.first for s in part.stats if s.first is not None), default=0)
+        end = max((s.last + 1 for s in part.stats if s.last is not None), default=0)
+    if part.bounds is None:
+        return (first, end), None
+    if part.clock != "log":
+        return (first, end), part.bounds
+    is_whole = low <= first and end <= high
+    return (max(first, low), min(end, high)), None if is_whole else part.bounds
+
+
+def _extent(entry: RecordingEntry) -> Span:
+    """The log time in which a recording may have messages."""
+    if entry.status == "open" or entry.span is None:
+        return 0, TIME_LIMIT - 1
+    return entry.span[0], entry.span[1] + 1
 
 
 def _between(span: Span) -> _Filter:
@@ -225,6 +396,20 @@ def _between(span: Span) -> _Filter:
     if begin <= 0 and end >= TIME_LIMIT - 1:
         return {}
     return {"_id": {"$gte": key_bound(begin), "$lt": key_bound(end)}}
+
+
+def _keys_in(keys: KeyColumns, part: Part) -> KeyColumns:
+    """The keys of one part, of those of several recordings in order."""
+    windows = part.log_windows
+    if not len(windows):
+        return keys.take(slice(0))
+    recording = np.uint64(int(part.recording.key, 16))
+    low, high = (
+        int(np.searchsorted(keys.recording, recording, side)) for side in ("left", "right")
+    )
+    own = keys.time[low:high]
+    begin, end = np.searchsorted(own, [windows[0, 0], windows[-1, 1]])
+    return keys.take(slice(low + int(begin), low + int(end)))
 
 
 def _merged(yes: Iterator[KeyColumns], no: Iterator[KeyColumns]) -> Iterator[Outcomes]:

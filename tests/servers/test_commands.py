@@ -1,0 +1,116 @@
+"""No question asks MongoDB once a recording, and neither does opening: commands are counted.
+
+With a latency of 50 ms, each command costs more than most answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.engines import mongo
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.tables import TablesEngine
+from tests.faults import logs
+from tests.servers.commands import commands
+
+MESSAGES = 12
+GAP = 1000  # messages that would lie between two recordings
+ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"
+RELATIVE = "+0s", "+0.055s"
+QUESTIONS: dict[str, Callable[[hl.Store], object]] = {
+    "count": lambda s: s.topic("/number").where("x > 1").count(),
+    "count of times": lambda s: s.topic("/number").where("x > 1").between(*ABSOLUTE).count(),
+    "count of relative times": lambda s: (
+        s.topic("/number").where("n > 1").between(*RELATIVE).count()
+    ),
+    "count by stamps": lambda s: (
+        s.topic("/stamped").where("n > 1").clock("header").between(*ABSOLUTE).count()
+    ),
+    "count of several topics": lambda s: s.topic("/number", "/stamped").where("n > 1").count(),
+    "count that messages decide": lambda s: s.topic("/text").where("s ~ '^xx$'").count(),
+    "fetch": lambda s: [m.raw for m in s.topic("/number").where("x > 1")],
+    "fetch of relative times": lambda s: [
+        m.raw for m in s.topic("/number").where("x > 1").between(*RELATIVE)
+    ],
+    "fetch that messages decide": lambda s: [m.raw for m in s.topic("/text").where("s ~ '^xx$'")],
+    "table": lambda s: s.topic("/number").where("x > 1").to_pandas()["n"].tolist(),
+    "documents": lambda s: [d["n"] for d in s.topic("/number").where("n > 1").documents()],
+    "last documents": lambda s: [
+        d["n"] for d in s.topic("/number").where("n > 1").reverse().limit(3).documents()
+    ],
+    "intervals": lambda s: [*s.topic("/number").where("n > 3").intervals()],
+    "intervals of relative times": lambda s: [
+        *s.topic("/number").where("n > 3").between("+0.025s", "+0.045s").intervals()
+    ],
+    "windows": lambda s: [*s.topic("/number").where("n > 3").windows(0, "1ms")],
+    "single message": lambda s: s.topic("/number").where("n > 1").at(ABSOLUTE[1]).raw,
+}
+
+
+def add(path: Path, numbers: range) -> None:
+    with hl.open(path, create=True) as store:
+        for n in numbers:
+            log = path.parent / f"{n}.mcap"
+            store.record(logs.write(log, logs.content(n * GAP, MESSAGES)), name=f"log {n}")
+
+
+def asked(path: Path) -> tuple[dict[str, list[str]], dict[str, object]]:
+    """What MongoDB gets for each question and for opening, and the answers."""
+    heard, answers = {}, {}
+    with commands() as opening, hl.open(path, require_database=True):
+        heard["open"] = [*opening]
+    for name, ask in QUESTIONS.items():
+        with hl.open(path, require_database=True) as store, commands() as names:
+            answers[name] = ask(store)
+            heard[name] = [*names]
+    return heard, answers
+
+
+def test_no_question_asks_once_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "store"
+    add(path, range(10))
+    with hl.open(path, require_database=True) as store:  # one mongod for all
+        truth = {name: ask(store) for name, ask in QUESTIONS.items()}
+        # Only MongoDB answers what it can.
+        monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+        monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
+        few, answers = asked(path)
+        assert answers == truth
+        add(path, range(10, 40))
+        many, _ = asked(path)
+    for k in few:
+        print(k, len(few[k]), len(many[k]), few[k][:9])
+    assert {name: len(names) for name, names in many.items()} == {
+        name: len(names) for name, names in few.items()
+    }
+    assert all(few.values())
+
+
+@pytest.mark.parametrize("most", [1, 100])
+def test_some_of_many_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Ranges of time are joined, where no recording that is not asked about lies between."""
+    path = tmp_path / "store"
+    add(path, range(7))
+    with hl.open(path, require_database=True) as store:
+        monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+        monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
+        monkeypatch.setattr(mongo, "_MOST_APART", most)
+        for chosen in ([0, 1, 2, 4, 6], [6], [0, 3], range(7)):
+            query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
+            there = [n * GAP + k for n in chosen for k in range(MESSAGES)]
+            assert query.where("n >= 5").count() == len([n for n in there if n >= 5])
+            assert [d["n"] for d in query.where("n >= 5").documents()] == [
+                n for n in there if n >= 5
+            ]
+            asked = query.where("n > 1").between("+0.025s", "+0.075s")
+            wanted = [n for n in there if 3 <= n % GAP < 8]
+            assert asked.count() == len(wanted)
+            assert [m.fields["n"] for m in asked] == wanted
+            assert [d["n"] for d in asked.reverse().documents()] == wanted[::-1]
+            assert len(asked.windows(0, "1ms")) == len(wanted)
