@@ -69,12 +69,12 @@ ALLOWED = {
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
-    "ruamel": ("hybridlog.live.sources.ros2.overrides", "hybridlog.sources.rosbag2_metadata"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
     "websockets": (
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
     ),
+    "yaml": ("hybridlog.yaml_values",),
     "zstandard": (
         "hybridlog.sources",
         "hybridlog_storage.compression",
@@ -89,7 +89,7 @@ DISTRIBUTIONS = {
     "google": "mcap-protobuf-support",
     "mcap_protobuf": "mcap-protobuf-support",
     "re2": "google-re2",
-    "ruamel": "ruamel.yaml",
+    "yaml": "pyyaml",
 }
 
 # Modules of ours that only some may import when the program runs.

@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 from hybridlog.sources.base import Damage, cannot_open
 from hybridlog.sources.rosbag2_metadata import MAX_BYTES, NAME, BagMetadata, parse_metadata
+from hybridlog.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+_MOST_MISSING = 100  # files that are reported one by one
 
 
 def read_metadata(folder: Path) -> BagMetadata | Damage | None:
@@ -26,11 +29,11 @@ def read_metadata(folder: Path) -> BagMetadata | Damage | None:
         return None
     except OSError as error:
         return Damage(path, 0, None, f"the metadata cannot be read ({error.strerror})", 0)
-    found = parse_metadata(data.decode(errors="replace"))
-    if found is None:
-        reason = "the metadata is damaged; the files beside it are read without it"
+    try:
+        return parse_metadata(data.decode(errors="replace"))
+    except YamlError as error:
+        reason = f"the metadata cannot be used ({error}); the files beside it are read without it"
         return Damage(path, 0, len(data), reason, 0)
-    return found
 
 
 def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage]]:
@@ -43,7 +46,7 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage
         SourceError: None of them exists.
     """
     files: list[Path] = []
-    missing: list[Damage] = []
+    absent: list[str] = []
     for name in metadata.files:
         path = folder / name
         # Some recorders list compressed files under their name before compression.
@@ -55,12 +58,32 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage
         if found is not None:
             files.append(found)
             continue
-        reason = f"the file is missing; {NAME} lists it"
-        missing.append(Damage(path, None, None, reason, metadata.counts.get(name)))
+        absent.append(name)
     if not files:
         listed = ", ".join(metadata.files[:5]) or "no file"
         raise SourceError(
             f"{folder}: none of the files that its {NAME} lists is there ({listed}); put them "
             "beside it, or give the path of the file itself"
         )
-    return files, missing
+    return files, _missing(folder, metadata, absent)
+
+
+def _missing(folder: Path, metadata: BagMetadata, names: list[str]) -> list[Damage]:
+    """The damage for missing files; many are counted together."""
+    damage = [
+        Damage(
+            folder / name,
+            None,
+            None,
+            f"the file is missing; {NAME} lists it",
+            metadata.counts.get(name),
+        )
+        for name in names[:_MOST_MISSING]
+    ]
+    if more := names[_MOST_MISSING:]:
+        counts = [metadata.counts.get(name) for name in more]
+        known = [count for count in counts if count is not None]
+        lost = sum(known) if len(known) == len(counts) else None
+        reason = f"{len(more)} more files that it lists are missing"
+        damage.append(Damage(folder / NAME, None, None, reason, lost))
+    return damage

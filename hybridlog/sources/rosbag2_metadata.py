@@ -10,11 +10,33 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PureWindowsPath
 
+from hybridlog.yaml_values import YamlError, parse_yaml
+
 NAME = "metadata.yaml"
 
-MAX_BYTES = 16 << 20
+MAX_BYTES = 64 << 20
+"""Largest metadata; that of 65,535 topics has about 40 MB."""
+
+MAX_FILES = 100_000
 
 _NO_FILES = {"", ".", ".."}
+# Keys at any depth; the rest, such as the list of topics, is skipped.
+_WANTED = frozenset(
+    {
+        "compression_mode",
+        "duration",
+        "files",
+        "message_count",
+        "nanoseconds",
+        "nanoseconds_since_epoch",
+        "path",
+        "relative_file_paths",
+        "ros_distro",
+        "rosbag2_bagfile_information",
+        "starting_time",
+        "storage_identifier",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,27 +60,19 @@ class BagMetadata:
     ros_distro: str = ""
 
 
-def parse_metadata(text: str) -> BagMetadata | None:
+def parse_metadata(text: str) -> BagMetadata:
     """Parse the metadata of a bag.
 
-    Returns:
-        The metadata, or None if it is not YAML or not that of a bag.
+    Raises:
+        YamlError: It is not YAML or not that of a bag, or too large.
     """
-    # Hostile YAML may nest deeply; the safe loader makes plain values only.
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     if len(text) > MAX_BYTES:
-        return None
-    try:
-        root: object = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, TypeError, RecursionError, OverflowError):
-        return None
-    bag = _mapping(root)
+        raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
+    bag = _mapping(parse_yaml(text, _WANTED))
     # The copy in a database has no outer key.
     bag = bag if "storage_identifier" in bag else _mapping(bag.get("rosbag2_bagfile_information"))
     if not bag:
-        return None
+        raise YamlError("it does not describe a bag")
     listed = _list(bag.get("files"))
     counts: dict[str, int] = {}
     for entry in map(_mapping, listed):
@@ -67,6 +81,8 @@ def parse_metadata(text: str) -> BagMetadata | None:
             counts[_name(str(entry["path"]))] = count
     paths = [item for item in _list(bag.get("relative_file_paths")) if isinstance(item, str)]
     files = [_name(item) for item in paths] or list(counts)
+    if len(files) > MAX_FILES:
+        raise YamlError(f"it lists more than {MAX_FILES} files")
     total = _count(bag.get("message_count"))
     if len(files) == 1 and total is not None:
         counts.setdefault(files[0], total)

@@ -23,8 +23,9 @@ from hybridlog.sources.base import (
     Source,
     cannot_open,
 )
-from hybridlog.sources.rosbag2_metadata import MAX_BYTES, parse_metadata
+from hybridlog.sources.rosbag2_metadata import parse_metadata
 from hybridlog.sources.spool import copy_start
+from hybridlog.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Batch, Channel, Schema
 
@@ -142,10 +143,12 @@ class SqliteSource(Source):
         if "metadata" in tables:
             query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
             for (text,) in self._optional(query):
-                found = parse_metadata(text) if isinstance(text, str) else None
-                if found is not None and len(text) <= MAX_BYTES:
-                    self.packed_messages = found.packed_messages
-                    distro = found.ros_distro
+                try:
+                    found = parse_metadata(text if isinstance(text, str) else "")
+                except YamlError:
+                    continue  # the recorder's copy of what the tables say
+                self.packed_messages = found.packed_messages
+                distro = found.ros_distro
         if "schema" in tables:
             for (name,) in self._optional("SELECT ros_distro FROM schema LIMIT 1"):
                 distro = str(name or distro)

@@ -157,7 +157,7 @@ def test_zstd_that_holds_no_log(tmp_path: Path, data: bytes) -> None:
 def test_loads_no_reader_before_it_is_needed() -> None:
     code = (
         "import sys, hybridlog.sources.detect\n"
-        "heavy = {'rosbags', 'ruamel', 'sqlite3', 'lz4', 'pandas', 'pyarrow', 'pymongo'}\n"
+        "heavy = {'rosbags', 'yaml', 'sqlite3', 'lz4', 'pandas', 'pyarrow', 'pymongo'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

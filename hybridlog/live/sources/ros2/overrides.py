@@ -10,9 +10,11 @@
 
 from __future__ import annotations
 
+import reprlib
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
+from hybridlog.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -38,9 +40,6 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     Raises:
         UsageError: The file is unreadable or not YAML, or a policy is unknown.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -49,11 +48,9 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     if len(data) > MAX_BYTES:
         raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are too large for QoS overrides")
     try:
-        # Hostile YAML may nest deeply; the safe loader only makes plain values.
-        root: object = YAML(typ="safe", pure=True).load(data)
-    except (YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UsageError(f"{path}: invalid YAML: {reason}") from error
+        root = parse_yaml(data)
+    except YamlError as error:
+        raise UsageError(f"{path}: invalid YAML: {error}") from error
     if root is None:
         return {}
     if not isinstance(root, dict):
@@ -61,7 +58,9 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     found = {}
     for topic, policies in root.items():
         if not isinstance(topic, str) or not isinstance(policies, dict):
-            raise UsageError(f"{path}: {topic!r}: a topic with policies below it is expected")
+            raise UsageError(
+                f"{path}: {reprlib.repr(topic)}: a topic with policies below it is expected"
+            )
         name = topic if topic.startswith("/") else f"/{topic}"
         found[name] = {
             str(key): _policy(key, value, f"{path}: {topic}") for key, value in policies.items()
@@ -79,11 +78,13 @@ def _policy(name: object, value: object, where: str) -> int:
         return _duration(value, f"{where}: {name}")
     if name == "depth":
         if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
-            raise UsageError(f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {value!r}")
+            raise UsageError(
+                f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {reprlib.repr(value)}"
+            )
         return value
     if name == "avoid_ros_namespace_conventions":
         if not isinstance(value, bool):
-            raise UsageError(f"{where}: {name} is true or false, not {value!r}")
+            raise UsageError(f"{where}: {name} is true or false, not {reprlib.repr(value)}")
         return value
     words = _POLICIES.get(name) if isinstance(name, str) else None
     if words is None:
@@ -91,7 +92,7 @@ def _policy(name: object, value: object, where: str) -> int:
         raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
     number = words.get(value.lower()) if isinstance(value, str) else None
     if number is None:
-        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {value!r}")
+        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {reprlib.repr(value)}")
     return number
 
 
@@ -105,4 +106,4 @@ def _duration(value: object, where: str) -> int:
         sec, nsec = value["sec"], value["nsec"]
         if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
             return int(min(sec * 1_000_000_000 + nsec, FOREVER))
-    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {value!r}")
+    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {reprlib.repr(value)}")

@@ -1,0 +1,129 @@
+"""Parses YAML of unknown origin in bounded time and memory.
+
+libyaml limits nesting and splits the text into events; these become plain values. Aliases
+share one value, and merge keys are ordinary keys, so nothing grows beyond the text.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+MAX_EVENTS = 2_000_000
+"""Most keys, values, and starts and ends of lists and mappings; parsed in about 2 s."""
+
+_INTEGER = re.compile(r"[-+]?[0-9]{1,20}")
+_WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}
+_NO_KEY = object()
+
+
+class YamlError(ValueError):
+    """The text is not YAML, or too much of it; the message is the reason."""
+
+
+def parse_yaml(text: str | bytes, wanted: Collection[str] | None = None) -> object:
+    """Parse the first document of a text.
+
+    Args:
+        text: The text.
+        wanted: Keys to keep in mappings, at any depth; None for all. Values of other keys
+            are skipped.
+
+    Returns:
+        Dictionaries, lists, strings, integers, booleans and None; fractions are strings.
+
+    Raises:
+        YamlError: It is not YAML, a key is not a single word or is repeated, or there is
+            too much of it.
+    """
+    import yaml
+
+    values = _Values(wanted)
+    starts = {yaml.MappingStartEvent: dict, yaml.SequenceStartEvent: list}
+    ends = {yaml.MappingEndEvent, yaml.SequenceEndEvent}
+    skipped = 0  # depth within an unwanted value
+    try:
+        for number, event in enumerate(yaml.parse(text, Loader=yaml.CSafeLoader)):
+            kind = type(event)
+            if number > MAX_EVENTS:
+                raise YamlError(f"it has more than {MAX_EVENTS} keys and values")
+            if skipped:
+                skipped += (kind in starts) - (kind in ends)
+            elif kind in starts:
+                skipped += not values.start(starts[kind](), event.anchor)
+            elif kind in ends:
+                values.end()
+            elif kind is yaml.ScalarEvent:
+                values.add(_scalar(event), event.anchor)
+            elif kind is yaml.AliasEvent:
+                values.alias(event.anchor)
+            elif kind is yaml.DocumentEndEvent:
+                break
+    except (yaml.YAMLError, UnicodeEncodeError) as error:
+        raise YamlError(" ".join(str(error).split())[:200]) from error
+    return values.root[0] if values.root else None
+
+
+class _Values:
+    """Makes values of events."""
+
+    def __init__(self, wanted: Collection[str] | None) -> None:
+        self.root: list[object] = []
+        self._wanted = wanted
+        self._open: list[Any] = [self.root]
+        self._keys: list[object] = [_NO_KEY]  # of the open mappings, each waiting for a value
+        self._anchors: dict[str, object] = {}
+
+    def start(self, value: Any, anchor: str | None) -> bool:
+        """Start a list or mapping; False if it is unwanted."""
+        if not self.add(value, anchor):
+            return False
+        self._open.append(value)
+        self._keys.append(_NO_KEY)
+        return True
+
+    def end(self) -> None:
+        self._open.pop()
+        self._keys.pop()
+
+    def alias(self, anchor: str) -> None:
+        self._place(self._anchors.get(anchor))
+
+    def add(self, value: object, anchor: str | None) -> bool:
+        """Add a value; False if it is unwanted."""
+        if not self._place(value):
+            return False
+        if anchor is not None:
+            self._anchors[anchor] = value
+        return True
+
+    def _place(self, value: object) -> bool:
+        """Add a value to the innermost list or mapping; False if it is unwanted."""
+        holder, key = self._open[-1], self._keys[-1]
+        if isinstance(holder, list):
+            holder.append(value)
+            return True
+        if key is _NO_KEY:
+            if isinstance(value, dict | list):
+                raise YamlError("a key is a list or a mapping")
+            self._keys[-1] = value
+            return True
+        self._keys[-1] = _NO_KEY
+        if self._wanted is not None and key not in self._wanted:
+            return False
+        if key in holder:
+            raise YamlError(f"the key {key!r} is repeated")
+        holder[key] = value
+        return True
+
+
+def _scalar(event: Any) -> object:
+    text: str = event.value
+    if not event.implicit[0]:  # quoted, or with a tag
+        return text
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    return int(text) if _INTEGER.fullmatch(text) else text
