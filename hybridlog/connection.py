@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import DatabaseError, StoreError
+from hybridlog_storage.errors import ConnectionLostError, DatabaseError, StoreError
 from hybridlog_storage.settings import EMBEDDED, with_password
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.mongod import EmbeddedMongod
+
+_TIMEOUT_S = 5.0
+_EMBEDDED_TIMEOUT_S = 2.0
+"""Seconds to wait for a server that was reached before; the embedded one has no network."""
 
 
 class Connection:
@@ -21,15 +25,23 @@ class Connection:
         mongo: URI of the MongoDB, or `embedded`; None for the one in the store's settings.
 
     Attributes:
-        database: The index; None without a connection.
+        may_write: False if the user of MongoDB may only read.
+        damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
     """
 
     def __init__(self, directory: StoreDirectory, mongo: str | None) -> None:
-        self.database: Database | None = None
+        self.may_write = True
+        self.damage: list[str] = []
+        self._database: Database | None = None
         self._directory = directory
         self._wanted = mongo
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
+
+    @property
+    def database(self) -> Database | None:
+        """The index; None without a connection."""
+        return None if self._database is None or self._database.is_lost else self._database
 
     def open(self) -> Database:
         """Connect, and check that the database belongs to this store.
@@ -41,13 +53,18 @@ class Connection:
         from hybridlog.maintenance import lease
         from hybridlog_storage.index_state import IndexState
 
-        if self.database is None:
-            self.database = self.another()
-            state = IndexState(self.database)
+        database = self.database
+        if database is None:
+            if self._database is not None:
+                self._database.close()
+            database = self._database = self.another()
+            state = IndexState(database)
             place = lease.place_of(self._directory)
-            if lease.check(state.mark(), place, self.database, embedded=self._uri == EMBEDDED):
+            self.may_write = database.may_write()
+            is_new = lease.check(state.mark(), place, database, embedded=self._uri == EMBEDDED)
+            if is_new and self.may_write:
                 state.claim(place)
-        return self.database
+        return database
 
     def another(self) -> Database:
         """An additional connection; starts the embedded MongoDB if it is not running.
@@ -63,6 +80,7 @@ class Connection:
                 self._directory.settings, self._directory.path
             )
         uri = self._uri
+        timeout_s = _TIMEOUT_S
         if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
 
@@ -72,9 +90,16 @@ class Connection:
             except StoreError as error:
                 # A read-only store has no embedded MongoDB, but its segments can be read.
                 raise DatabaseError(str(error)) from error
+            timeout_s = _EMBEDDED_TIMEOUT_S
+            if self._mongod.damage is not None:
+                self.damage.append(self._mongod.damage)
         else:
             uri = with_password(uri)
-        return Database.connect(uri)
+        try:
+            return Database.connect(uri, timeout_s=timeout_s)
+        except ConnectionLostError as error:
+            shortage = None if self._mongod is None else self._mongod.shortage()
+            raise (shortage or error) from error
 
     @property
     def place(self) -> str:
@@ -90,9 +115,9 @@ class Connection:
 
     def close(self) -> None:
         """Disconnect; the embedded MongoDB ends when no process uses it."""
-        if self.database is not None:
-            self.database.close()
-        self.database = None
+        if self._database is not None:
+            self._database.close()
+        self._database = None
         if self._mongod is not None:
             self._mongod.stop()
         self._mongod = None

@@ -59,8 +59,8 @@ class Belief:
             return None
         return (
             f"The index of recording {entry.label!r} is not complete: another process changes it "
-            "at this moment. Ask again when that is done; questions by topic and time are "
-            "answered all the same."
+            "at this moment, or the store is read-only. Questions by topic and time are answered "
+            "all the same."
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache, partial
@@ -19,9 +20,11 @@ from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
 from hybridlog_storage.errors import (
     CatalogError,
+    ConnectionBrokenError,
     DatabaseError,
     DiskFullError,
     HybridlogError,
+    IndexChangedError,
     TopicError,
 )
 from hybridlog_storage.messages import Channel, Schema
@@ -37,6 +40,10 @@ if TYPE_CHECKING:
 
 _MAX_OPEN_SEGMENTS = 256
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
+_TRIES = 5  # to connect, while the connection breaks
+_PAUSE_S = 0.1  # before the second try; doubles each time
+_REST_S = 10.0
+"""Seconds after a failure in which questions do not try to connect again."""
 
 
 class Session:
@@ -64,6 +71,7 @@ class Session:
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
         self._unavailable: HybridlogError | None = None
+        self._rests_until = 0.0
         self._progress = progress
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
@@ -98,27 +106,49 @@ class Session:
 
     @property
     def database(self) -> Database | None:
-        """The index, connected on first access; None if MongoDB is unavailable."""
-        if self._unavailable is None and not (self.connected is not None and self._is_indexed):
+        """The index, connected when it is needed; None if MongoDB is unavailable.
+
+        A failure is remembered for some seconds.
+        """
+        is_ready = self.connected is not None and self._is_indexed
+        if not is_ready and time.monotonic() >= self._rests_until:
             with suppress(HybridlogError):
                 self.connect()
         return self.connected
 
     def connect(self) -> Database:
-        """Connect to the index and bring it up to date.
+        """Connect to the index and bring it up to date; try again if the connection breaks.
 
         Raises:
             DatabaseError: MongoDB does not answer.
             StoreError: it holds the index of another store, or this store is a copy.
         """
-        from hybridlog.maintenance import index
-
         with self._connecting:
             if self.connected is not None and self._is_indexed:
                 return self.connected
             try:
-                database = self.connection.open()
-                repairs = RepairReport()
+                for tried in range(1, _TRIES):
+                    with suppress(ConnectionBrokenError):
+                        return self._connect()
+                    time.sleep(_PAUSE_S * 2 ** (tried - 1))
+                return self._connect()
+            except BaseException as error:
+                self.disconnect()
+                if isinstance(error, HybridlogError):
+                    self._unavailable = error
+                    self._rests_until = time.monotonic() + _REST_S
+                raise
+
+    def _connect(self) -> Database:
+        from hybridlog.maintenance import index
+
+        if self.connected is None:
+            self._belief = None
+        repairs = RepairReport()
+        has_changed = False
+        try:
+            database = self.connection.open()
+            if self.connection.may_write:
                 has_changed = index.bring_up_to_date(
                     self.directory,
                     self.catalog,
@@ -127,19 +157,18 @@ class Session:
                     report=repairs,
                     progress=self._progress,
                 )
-            except BaseException as error:
-                self.disconnect()
-                if isinstance(error, HybridlogError):
-                    self._unavailable = error
-                raise
-            self._unavailable = None
+        finally:
+            self.repairs.damage += self.connection.damage
+            self.connection.damage.clear()
             self.repairs.indexed.update(repairs.indexed)
             self.repairs.unreadable.update(repairs.unreadable)
             self.repairs.removed += repairs.removed
-            if has_changed:
-                self.invalidate()
-            self._is_indexed = True
-            return database
+        self._unavailable = None
+        self._rests_until = 0.0
+        if has_changed:
+            self.invalidate()
+        self._is_indexed = True
+        return database
 
     def disconnect(self) -> None:
         """Disconnect from MongoDB; questions are then answered from the files."""
@@ -151,27 +180,53 @@ class Session:
         self._belief = None
         self.connection.take_over()
         self._unavailable = None
+        self._rests_until = 0.0
 
-    def database_for(self, purpose: str) -> Database:
+    def database_for(self, purpose: str, *, writes: bool = False) -> Database:
         """The index.
 
+        Args:
+            purpose: The activity, for messages.
+            writes: True if it changes the index.
+
         Raises:
-            DatabaseError: it is unavailable; has the purpose and the reason.
+            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
+                reason.
         """
-        if self.database is None:
+        database = self.database
+        if database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
-        return self.database
+        if writes and not self.connection.may_write:
+            raise DatabaseError(
+                f"{purpose} needs a MongoDB user who may write. This one may only read: grant "
+                f"the role readWrite on the database {database.name!r}."
+            )
+        return database
+
+    @property
+    def writable_database(self) -> Database | None:
+        """The index; None if it is unavailable, or if its user may only read."""
+        database = self.database
+        return database if self.connection.may_write else None
 
     def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
         """The index, for queries about some recordings.
 
         Raises:
             DatabaseError: it is unavailable; has the purpose and the reason.
-            IndexChangedError: another process removes documents of these recordings.
+            IndexChangedError: documents of these recordings are missing, or being removed.
         """
         from hybridlog.guarded import GuardedIndex
 
-        return GuardedIndex(self.database_for(purpose), recordings, self.belief, self.invalidate)
+        database = self.database_for(purpose)
+        try:
+            return GuardedIndex(database, recordings, self.belief, self.invalidate)
+        except IndexChangedError as error:
+            if self.connection.may_write:
+                raise
+            raise IndexChangedError(
+                f"{error} This MongoDB user may only read: ask once as a user who may write."
+            ) from error
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
         """The state of the index of some recordings, as of the catalog's snapshot.
@@ -428,7 +483,7 @@ class Session:
         if key in self._tables_tried:
             return self.tables.of(recording, topic)
         self._tables_tried.add(key)
-        return made_for(self.directory, recording, topic, self.tables)
+        return made_for(self.directory, recording, topic, self.tables, self.repairs)
 
     def reject_table(self, recording: RecordingEntry, topic: str) -> None:
         """Drop a table that turned out to be damaged; the next question makes it again."""

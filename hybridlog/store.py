@@ -20,7 +20,13 @@ from hybridlog.session import Session
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.directory import StoreDirectory
-from hybridlog_storage.errors import DatabaseError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    DatabaseError,
+    HybridlogError,
+    StoreError,
+    UsageError,
+)
 from hybridlog_storage.settings import EMBEDDED, NAME
 
 if TYPE_CHECKING:
@@ -163,13 +169,18 @@ class Store:
         """
         return self.session.connect()
 
-    def database_for(self, purpose: str) -> Database:
+    def database_for(self, purpose: str, *, writes: bool = False) -> Database:
         """The index.
 
+        Args:
+            purpose: The activity, for messages.
+            writes: True if it changes the index.
+
         Raises:
-            DatabaseError: it is unavailable; has the purpose and the reason.
+            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
+                reason.
         """
-        return self.session.database_for(purpose)
+        return self.session.database_for(purpose, writes=writes)
 
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
@@ -264,7 +275,7 @@ class Store:
                 source,
                 self.directory,
                 self.catalog,
-                self.database_for("Recording a log"),
+                self.database_for("Recording a log", writes=True),
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
                 progress=progress,
@@ -287,7 +298,7 @@ class Store:
         return LiveRecording(
             self.directory,
             self.catalog,
-            self.database_for("Starting a recording"),
+            self.database_for("Starting a recording", writes=True),
             name,
             options or LiveOptions(**choices),
             renew=self.session.connection.another,
@@ -331,7 +342,7 @@ class Store:
         """
         from hybridlog.maintenance import index
 
-        database = self.database_for("reindex")
+        database = self.database_for("reindex", writes=True)
         if recordings is None:
             self.catalog.mend()
         self.refresh()
@@ -368,7 +379,7 @@ class Store:
             DatabaseError: MongoDB refuses, for example because two fields are arrays.
         """
         query = self.topic(topic)
-        database = self.database_for("An index")
+        database = self.database_for("An index", writes=True)
         query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
         field_indexes.add(database, query.topics, fields)
         return field_indexes.of_topics(database, query.topics)
@@ -380,7 +391,7 @@ class Store:
             TopicError: A topic does not exist.
         """
         query = self.topic(topic)
-        database = self.database_for("An index")
+        database = self.database_for("An index", writes=True)
         return field_indexes.remove(database, query.topics, fields)
 
     def indexes(self, *topics: str) -> list[FieldIndex]:
@@ -402,14 +413,21 @@ class Store:
 
         self.refresh()
         labels = None if recordings is None else [r.label for r in self.select(recordings)]
-        return verify(
-            self.directory,
-            self.catalog,
-            self.database,
-            self.repairs,
-            labels=labels,
-            progress=progress,
-        )
+
+        def check() -> Verification:
+            return verify(
+                self.directory,
+                self.catalog,
+                self.database,
+                self.repairs,
+                labels=labels,
+                progress=progress,
+            )
+
+        try:
+            return check()
+        except ConnectionLostError:  # damaged data files of MongoDB were replaced meanwhile
+            return check()
 
     def remove(self, recording: str) -> None:
         """Delete a recording.
@@ -429,7 +447,7 @@ class Store:
                 removal.remove_copy(self.directory, recording)
             else:
                 (entry,) = self.select([recording])
-                removal.remove(self.directory, self.catalog, self.database, entry)
+                removal.remove(self.directory, self.catalog, self.session.writable_database, entry)
         finally:
             self.refresh()
 
@@ -466,7 +484,7 @@ class Store:
         (entry,) = self.select([recording])
         edit.append(self.directory, self.catalog, entry, lines)
         connected = self.session.connected
-        if connected is not None:
+        if connected is not None and self.session.connection.may_write:
             index.mirror(self.catalog, connected, entry.id)
         self.refresh()
         return self.entry(entry.id)
@@ -535,7 +553,7 @@ class Store:
         labels = None if recordings is None else [r.label for r in self.select(recordings)]
         done = repair(self.directory, self.catalog, self.repairs, labels)
         self.refresh()
-        database = self.database
+        database = self.session.writable_database
         if database is not None:
             done += repair_index(
                 self.directory,

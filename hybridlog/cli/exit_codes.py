@@ -16,7 +16,7 @@ EXIT_CODES: Final = {
     4: "a damaged log, or lost messages: the rest is stored",
     5: "the store is missing, read-only, damaged, or of a newer format",
     6: "MongoDB does not answer, or died",
-    7: "no space left on the disk",
+    7: "no space left on the disk, or too few file handles or too little memory",
     8: "this content is in the store already",
     9: "an optional package is missing",
     10: "no fields: the message definition does not give them",

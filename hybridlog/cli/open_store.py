@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.recovery import Recovered
 
+_MAX_LISTED = 3  # recordings that are reported one by one
+
 
 @contextmanager
 def opened_store(
@@ -51,7 +53,10 @@ def opened_store(
         bar.close()
     with store:
         _print_repairs(store)
-        yield store
+        try:
+            yield store
+        finally:
+            _print_rebuilt(store)
 
 
 def _print_repairs(store: Store) -> None:
@@ -79,22 +84,32 @@ def _print_repairs(store: Store) -> None:
         )
     elif not store.directory.is_writable:
         note(f"The store {store.directory.path} is read-only; its segments answer.")
-    print_index_repairs(store)
+    _print_rebuilt(store)
 
 
-def print_index_repairs(store: Store) -> None:
-    """Report the repairs of the index, or why there is no connection to it."""
+def _print_rebuilt(store: Store) -> None:
+    """Report what was made again since the last report, and why MongoDB is unavailable."""
     repairs = store.repairs
-    for recording, chunks in repairs.indexed.items():
-        if chunks and recording not in repairs.recovered:
+    if store.catalog.was_damaged:
+        note("The catalog was damaged, and was made again.")
+        store.catalog.was_damaged = False
+    if repairs.tables:
+        note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
+    indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}
+    added = f"{counted(sum(indexed.values()), 'chunk')} added to the index"
+    if repairs.damage:
+        note(f"The data files of the embedded MongoDB were damaged, and were replaced: {added}.")
+    elif len(indexed) > _MAX_LISTED:
+        note(f"{counted(len(indexed), 'recording')}: {added}.")
+    else:
+        for recording, chunks in indexed.items():
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
     for recording in repairs.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
-    if store.without_database is not None:
-        note(
-            "MongoDB is unavailable, so only topics and times can be asked for: "
-            f"{store.without_database}"
-        )
+    if store.without_database is not None and store.directory.is_writable:
+        note(f"MongoDB is unavailable, so the files answer: {store.without_database}")
+    for done in (repairs.damage, repairs.tables, repairs.indexed, repairs.removed):
+        done.clear()
 
 
 def _print_recovered(recording: str, segments: list[Recovered]) -> None:

@@ -72,13 +72,8 @@ def bring_up_to_date(
         if indexed is not None and is_whole and _recall(catalog, entry, indexed):
             has_changed = True
             entry = put_entry(directory, catalog, entry.label)  # noqa: PLW2901
-        if is_whole and (not directory.is_writable or _is_settled(indexed, entry)):
-            continue
-        if not directory.is_writable:
-            raise StoreError(
-                f"The index of recording {entry.label!r} is not complete, and the store "
-                f"{directory.path} is read-only. Open it once with write permission."
-            )
+        if not directory.is_writable or (is_whole and _is_settled(indexed, entry)):
+            continue  # without an index, the segments of a read-only store answer
         with directory.writing(entry.label) as mine:
             if not mine:
                 continue  # the process that holds the lock indexes it

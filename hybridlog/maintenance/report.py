@@ -27,6 +27,8 @@ class RepairReport:
         adopted: Recordings that came from another store.
         copies: Copies of a recording, and the label of the one in use.
         unreadable: Recordings that could not be repaired, and the reason.
+        damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
+        tables: Recording and topic of tables that were missing or damaged, and made again.
         disk_full: The error if the disk had no room for repairs, else None.
     """
 
@@ -37,6 +39,8 @@ class RepairReport:
     adopted: list[str] = field(default_factory=list)
     copies: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    tables: list[tuple[str, str]] = field(default_factory=list)
     disk_full: DiskFullError | None = None
 
 

@@ -28,6 +28,7 @@ from hybridlog_storage.segment_reader import SegmentReader
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from hybridlog.maintenance.report import RepairReport
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -104,7 +105,11 @@ def make(
 
 
 def made_for(
-    directory: StoreDirectory, entry: RecordingEntry, topic: str, tables: Tables
+    directory: StoreDirectory,
+    entry: RecordingEntry,
+    topic: str,
+    tables: Tables,
+    report: RepairReport,
 ) -> TopicTable | None:
     """The table of a topic for a question, created again if it is missing or damaged.
 
@@ -115,6 +120,7 @@ def made_for(
         entry: The recording's entry in the catalog.
         topic: Full name.
         tables: Finds the tables.
+        report: Collects the tables that were created.
     """
     found = tables.of(entry, topic)
     if found is not None or entry.status == "open" or not directory.is_writable:
@@ -132,6 +138,8 @@ def made_for(
         with suppress(OSError, StoreError):
             files.make_folders(note.parent, depth=IN_TOPIC - 1)
             files.write_file(note, state.encode(), depth=IN_TOPIC)
+    else:
+        report.tables.append((entry.label, topic))
     return found
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -24,8 +24,11 @@ from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import (
+    ConnectionLostError,
     DatabaseError,
+    HybridlogError,
     IndexChangedError,
+    ResourceError,
     SegmentError,
     StoreError,
     TopicError,
@@ -47,7 +50,16 @@ if TYPE_CHECKING:
 _CONNECT_S = 0.3  # seconds to start and reach the embedded MongoDB
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
-_RETRIED = (DatabaseError, IndexChangedError, SegmentError, StoreError, UndecidedError)
+_Rows = TypeVar("_Rows", "Outcomes", "Values")
+_Key = tuple[int, int]
+_RETRIED = (
+    DatabaseError,
+    IndexChangedError,
+    ResourceError,
+    SegmentError,
+    StoreError,
+    UndecidedError,
+)
 """Failures of one engine that another engine may not have."""
 
 
@@ -225,10 +237,26 @@ class Planner:
                 filters.update(dict.fromkeys(indexes, MessageFilter(decide, part.field_types)))
         plan.filters = filters
 
+        def read_instead(part: Part, failure: HybridlogError) -> None:
+            if not self._costs([self._scan], part, Need.SELECTION, ()):
+                raise failure
+            assert part.predicate is not None
+            indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
+            decide = MessageFilter(part.predicate, part.field_types)
+            filters.update(dict.fromkeys(indexes, decide))  # before chunks are read for it
+            unindexed.update(indexes)
+
         def select(tasks: Sequence[ChunkTask]) -> RowSelection:
             offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-            for engine, chosen in selecting.items():
-                for key, rows in engine.select(chosen, tasks).offsets.items():
+            for engine, chosen in [*selecting.items()]:
+                try:
+                    found = self._again(partial(engine.select, chosen, tasks), chosen)
+                except _RETRIED as error:
+                    for part in chosen:
+                        read_instead(part, error)
+                    del selecting[engine]
+                    continue
+                for key, rows in found.offsets.items():
                     offsets[key].append(rows)
             merged = {key: np.sort(np.concatenate(rows)) for key, rows in offsets.items()}
             return RowSelection(merged, unindexed)
@@ -312,8 +340,7 @@ class Planner:
         """True if MongoDB finds candidates and the messages decide."""
         if part.predicate is None:
             return False
-        files = self._files(part, Need.COUNT)
-        costs = self._costs(files, part, Need.COUNT, ())
+        costs = self._costs(self._files(part, Need.COUNT), part, Need.COUNT, ())
         if costs and (costs[0][1] is not self._scan or costs[0][0] < _CONNECT_S):
             return False
         if self.session.database is None or self._costs([self._mongo], part, Need.COUNT, ()):
@@ -322,35 +349,71 @@ class Planner:
 
     def _count_otherwise(self, part: Part, failed: Engine, failure: Exception) -> int:
         """The count of an engine that failed, by the next ones."""
-        for engine in self._choose(part, Need.COUNT):
-            if engine is not failed:
-                try:
-                    return engine.count([part])
-                except _RETRIED as error:
-                    failure = error if isinstance(failure, UndecidedError) else failure
+        for engine in self._others(part, Need.COUNT, failed, failure):
+            try:
+                return engine.count([part])
+            except _RETRIED as error:
+                failure = error if isinstance(failure, UndecidedError) else failure
         raise failure
+
+    def _others(
+        self,
+        part: Part,
+        need: Need,
+        failed: Engine,
+        failure: Exception,
+        fields: Collection[str] | None = (),
+    ) -> Iterator[Engine]:
+        """The engines to ask after one has failed.
+
+        If the connection was lost, MongoDB is connected to again only if no other can answer:
+        the index may have to be built again first.
+        """
+        if not isinstance(failure, ConnectionLostError):
+            yield from (e for e in self._choose(part, need, fields) if e is not failed)
+            return
+        files = self._costs(self._files(part, need), part, need, fields)
+        yield from (engine for _, engine in files)
+        if self._costs([self._mongo], part, need, fields):
+            yield self._mongo
+
+    def _again(self, ask: Callable[[], _T], parts: Sequence[Part]) -> _T:
+        """An answer; asked for once more if the connection was lost and MongoDB must answer."""
+        try:
+            return ask()
+        except ConnectionLostError:
+            if all(self._costs([self._scan], part, Need.SELECTION, ()) for part in parts):
+                raise
+            return ask()
 
     def _first(
         self,
         part: Part,
         need: Need,
-        ask: Callable[[Engine], Iterator[_T]],
+        ask: Callable[[Engine], Iterator[_Rows]],
         fields: Collection[str] | None = (),
-    ) -> Iterator[_T]:
-        """Items of the cheapest engine; of the next one if it fails before its first item."""
-        failure: Exception | None = None
-        for engine in self._choose(part, need, fields):
-            found = ask(engine)
-            try:
-                first = next(found, None)
-            except _RETRIED as error:
-                failure = failure or error
-                continue
-            if first is not None:
-                yield first
-                yield from found
+    ) -> Iterator[_Rows]:
+        """Items of the cheapest engine; the next one goes on where it fails."""
+        failed = next(self._choose(part, need, fields))
+        failure: Exception
+        last: _Key | None = None
+        try:
+            for item in ask(failed):
+                yield item
+                last = _last_key(item) or last
             return
-        assert failure is not None
+        except _RETRIED as error:
+            failure = error
+        for engine in self._others(part, need, failed, failure, fields):
+            try:
+                for item in ask(engine):
+                    rest = item if last is None else _after(item, last)
+                    if rest is not None:
+                        yield rest
+                        last = _last_key(rest) or last
+                return
+            except _RETRIED as error:
+                failure = error if isinstance(failure, UndecidedError) else failure
         raise failure
 
     def _check_clock(self, channel: RecordedChannel) -> None:
@@ -363,6 +426,22 @@ class Planner:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
+
+
+def _last_key(item: Outcomes | Values) -> _Key | None:
+    """Log time and arrival number of the last row; None without rows."""
+    return (int(item.log_time[-1]), int(item.seq[-1])) if len(item.log_time) else None
+
+
+def _after(item: _Rows, key: _Key) -> _Rows | None:
+    """The rows behind a log time and arrival number; None without any."""
+    time, seq = key
+    is_before = (item.log_time < time) | ((item.log_time == time) & (item.seq <= seq))
+    begin = int(np.count_nonzero(is_before))
+    if begin == len(item.log_time):
+        return None
+    columns: dict[str, Any] = {n: column[begin:] for n, column in item._asdict().items()}
+    return item._replace(**columns)
 
 
 def _thinned(

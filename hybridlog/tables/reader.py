@@ -36,7 +36,7 @@ from hybridlog.tables.layout import (
 )
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import files
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import StoreError, exhausted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -442,7 +442,8 @@ class Tables:
         except FileNotFoundError:
             return
         except OSError as error:
-            raise StoreError(f"The tables in {folder} cannot be read: {error}.") from error
+            problem = f"The tables in {folder} cannot be read: {error}."
+            raise (exhausted(error.errno, f"reading {folder}") or StoreError(problem)) from error
         for name in sorted(found):
             if not name.endswith(SUFFIX):
                 continue

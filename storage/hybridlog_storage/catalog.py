@@ -8,11 +8,13 @@ state of its files (sizes, times). A row is used only while both are unchanged.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
 import os
 import sqlite3
+import stat
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -29,7 +31,13 @@ from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import ChunkTable
 from hybridlog_storage.distinct import distinct
-from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
+from hybridlog_storage.errors import (
+    CatalogError,
+    DiskFullError,
+    HybridlogError,
+    StoreError,
+    exhausted,
+)
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import ChunkPlace
 
@@ -38,6 +46,7 @@ if TYPE_CHECKING:
 
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
+_JOURNAL: Final = f"{CATALOG}-journal"
 _VERSION: Final = 2
 _BUSY_S: Final = 20.0
 _NO_DAMAGE: Final = frozenset(
@@ -379,9 +388,13 @@ class Catalog:
         store: The store's directory; None for a catalog in memory, if this user cannot write
         the store.
         store_id: The store's id; the catalog of another store is rebuilt.
+
+    Attributes:
+        was_damaged: True if a damaged file was replaced by an empty one.
     """
 
     def __init__(self, store: Path | None, store_id: str) -> None:
+        self.was_damaged = False
         self._path = store / CATALOG if store is not None else None
         self._store_id = store_id
         self._lock = RLock()
@@ -408,8 +421,9 @@ class Catalog:
         try:
             return self._connect()
         except sqlite3.Error as error:
-            if not _is_damage(error):
+            if not _is_damage(error) and not self._has_odd_journal():
                 raise self._told(error, "opened") from error
+            self.was_damaged = True
             self._delete()
         try:
             return self._connect()
@@ -430,6 +444,8 @@ class Catalog:
                     head = os.pread(fd, len(_HEAD), 0)
                 finally:
                     os.close(fd)
+            except IsADirectoryError as error:
+                raise sqlite3.DatabaseError("it is a directory") from error
             except OSError as error:
                 raise durability.explain(error, self._path, "opening") from error
             if head and (head[:16] != _HEAD[:16] or head[18:] != _HEAD[18:]):
@@ -483,9 +499,18 @@ class Catalog:
 
     def _delete(self) -> None:
         if self._path is not None:
-            for name in (CATALOG, f"{CATALOG}-journal"):
-                with suppress(FileNotFoundError):
-                    files.unlink(self._path.with_name(name), depth=files.IN_STORE)
+            for name in (CATALOG, _JOURNAL):
+                files.remove_tree(self._path.with_name(name), depth=files.IN_STORE)
+
+    def _has_odd_journal(self) -> bool:
+        """True if a directory is in the place of SQLite's journal."""
+        if self._path is None:
+            return False
+        try:
+            about = files.status(self._path.with_name(_JOURNAL), depth=files.IN_STORE)
+        except OSError:
+            return False
+        return stat.S_ISDIR(about.st_mode)
 
     def rebuild(self) -> None:
         """Replace the catalog with an empty one.
@@ -495,6 +520,7 @@ class Catalog:
         """
         with self._lock:
             self._forget()
+            self.was_damaged = True
             try:
                 if self._is_sound():
                     # Other processes may still use the open file.
@@ -554,8 +580,11 @@ class Catalog:
             self._forget()
             self._db = self._open()
 
-    def _told(self, error: sqlite3.Error, what: str) -> StoreError | DiskFullError:
+    def _told(self, error: sqlite3.Error, what: str) -> HybridlogError:
         """Map an SQLite error to a hybridlog error."""
+        short = exhausted(_system_error(error), f"using {self._path}")
+        if short is not None:
+            return short
         name = getattr(error, "sqlite_errorname", "")
         if name == "SQLITE_FULL" or "is full" in str(error):
             return DiskFullError(
@@ -987,6 +1016,19 @@ def _is_damage(error: sqlite3.Error) -> bool:
     if code is None:
         return "is full" not in str(error) and "I/O error" not in str(error)
     return code & 0xFF not in _NO_DAMAGE
+
+
+def _system_error(error: sqlite3.Error) -> int | None:
+    """The system's error number behind an SQLite error, which does not tell it."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    if code == sqlite3.SQLITE_NOMEM:
+        return errno.ENOMEM
+    if code == sqlite3.SQLITE_CANTOPEN:
+        try:
+            os.close(os.open(os.devnull, os.O_RDONLY))
+        except OSError as refused:
+            return refused.errno
+    return None
 
 
 def _identity(about: os.stat_result) -> tuple[int, int]:

@@ -25,7 +25,14 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 
-from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
+from hybridlog_storage.errors import (
+    ConnectionBrokenError,
+    ConnectionLostError,
+    DatabaseError,
+    DiskFullError,
+    UsageError,
+    WhereError,
+)
 from hybridlog_storage.settings import LOGIN_CURE
 
 if TYPE_CHECKING:
@@ -90,6 +97,7 @@ _UNNAMED_CODE = "Location"
 """Prefix of the server's unnamed error codes: thousands of checks on the arguments of
 operators and expressions. Failures of the server itself have names."""
 _WRITING_STAGES = frozenset({"$out", "$merge"})
+_WRITES = frozenset({"insert", "remove", "update"})
 _LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
@@ -117,9 +125,13 @@ class Database:
     Every method raises `DatabaseError` if the server does not answer or refuses. Methods
     with a `filter` or a pipeline raise `WhereError` if that is invalid. `max_time_ms`
     limits the time of a read on the server.
+
+    Attributes:
+        is_lost: True after a method found no connection; make a new `Database` then.
     """
 
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
+        self.is_lost = False
         self._client = client
         self._is_replicated = _is_replicated(client)
         self._write_concern = _write_concern(client, is_replicated=self._is_replicated)
@@ -233,7 +245,38 @@ class Database:
 
     def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
         """Run a command, again if its connection breaks."""
-        return _retried(self._client, self._address, command, question=question)
+        with self._noting():
+            return _retried(self._client, self._address, command, question=question)
+
+    @contextlib.contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Note a lost connection."""
+        try:
+            yield
+        except ConnectionLostError:
+            self.is_lost = True
+            raise
+
+    def may_write(self) -> bool:
+        """False if the user of this connection may not change the database."""
+        from pymongo.errors import OperationFailure
+
+        def ask() -> Document:
+            try:
+                return self._client.admin.command("connectionStatus", showPrivileges=True)
+            except OperationFailure:  # not MongoDB's own server
+                return {}
+
+        user = self._again(ask).get("authInfo", {})
+        if not user.get("authenticatedUsers"):
+            return True
+        allowed: set[str] = set()
+        for privilege in user.get("authenticatedUserPrivileges", ()):
+            resource = privilege["resource"]
+            names = resource.get("db"), resource.get("collection")
+            if resource.get("anyResource") or names in {("", ""), (self.name, "")}:
+                allowed.update(privilege["actions"])
+        return allowed >= _WRITES
 
     def ensure_collection(self, name: str) -> None:
         """Create a clustered collection (`_id` is its only key) unless it exists."""
@@ -414,7 +457,7 @@ class Database:
         """
         last: Any = None
         tries = _TRIES
-        with _mapped(self._address, question=True):
+        with self._noting(), _mapped(self._address, question=True):
             while True:
                 rest = query
                 if last is not None:
@@ -933,8 +976,10 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         ConnectionFailure,
         DocumentTooLarge,
         ExecutionTimeout,
+        InvalidOperation,
         OperationFailure,
         PyMongoError,
+        ServerSelectionTimeoutError,
     )
 
     try:
@@ -950,8 +995,12 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         if question and _is_wrong_question(code, error.details):
             raise WhereError(f"MongoDB does not understand the predicate: {text}") from error
         raise _refused(address, code, text) from error
+    except InvalidOperation as error:  # another thread has closed the client
+        raise ConnectionLostError(f"MongoDB at {address}: {_first_words(error)}") from error
     except ConnectionFailure as error:
-        raise DatabaseError(
+        is_down = isinstance(error, ServerSelectionTimeoutError)
+        kind = ConnectionLostError if is_down else ConnectionBrokenError
+        raise kind(
             f"MongoDB at {address} does not answer: {_first_words(error)}. Check that it runs and "
             f"can be reached."
         ) from error

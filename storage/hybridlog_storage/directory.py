@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final
 
 from hybridlog_storage import durability, files
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import StoreError, exhausted
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -171,7 +171,8 @@ class StoreDirectory:
         except FileNotFoundError:
             return []
         except OSError as error:
-            raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+            problem = f"The store {self.path} cannot be read: {error.strerror}."
+            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
         return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
 
     def listing(self, label: str) -> Listing:
@@ -186,7 +187,8 @@ class StoreDirectory:
         except FileNotFoundError:
             found = {}
         except OSError as error:
-            raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+            problem = f"{path} cannot be read: {error.strerror}."
+            raise (exhausted(error.errno, f"reading {path}") or StoreError(problem)) from error
         sealed: dict[int, str] = {}
         opened: dict[int, str] = {}
         others = []

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hybridlog_storage import files
-from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
 from hybridlog_storage.messages import Buffer
 
 
@@ -27,6 +27,9 @@ def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
         return DiskFullError(
             f"No space left while {doing} {path}. Free some space and run the command again."
         )
+    short = exhausted(error.errno, f"{doing} {path}")
+    if short is not None:
+        return short
     if error.errno in {errno.EROFS, errno.EACCES, errno.EPERM}:
         return StoreError(
             f"Not allowed to write while {doing} {path}: {error.strerror}. "

@@ -13,6 +13,25 @@ from typing import ClassVar, Final
 
 NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """System errors that mean a full disk."""
+NO_HANDLES: Final = frozenset({errno.EMFILE, errno.ENFILE})
+"""System errors that mean too few file handles."""
+
+
+def exhausted(number: int | None, doing: str) -> ResourceError | None:
+    """The error for a system error that means too few handles or too little memory.
+
+    Args:
+        number: The system's number of the error.
+        doing: The activity, for the message.
+    """
+    if number in NO_HANDLES:
+        return ResourceError(
+            f"Out of file handles while {doing}: raise the limit with `ulimit -n 8192`, or close "
+            "some stores and files."
+        )
+    if number == errno.ENOMEM:
+        return ResourceError(f"Out of memory while {doing}: end other programs, or add memory.")
+    return None
 
 
 class HybridlogError(Exception):
@@ -75,10 +94,22 @@ class DatabaseError(HybridlogError):
     exit_code = 6
 
 
-class DiskFullError(HybridlogError):
-    """No space left on the store's disk."""
+class ConnectionLostError(DatabaseError):
+    """The connection to MongoDB has ended, or there is none. A new one may work."""
+
+
+class ConnectionBrokenError(ConnectionLostError):
+    """The connection to MongoDB broke during a command; the server may still run."""
+
+
+class ResourceError(HybridlogError):
+    """Too few file handles, too little memory, or no space on a disk."""
 
     exit_code = 7
+
+
+class DiskFullError(ResourceError):
+    """No space left on the store's disk."""
 
 
 class AlreadyRecordedError(HybridlogError):

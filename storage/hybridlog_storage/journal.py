@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import StoreError, exhausted
 
 JOURNAL: Final = "journal"
 """Name of the file in a recording's directory."""
@@ -261,7 +261,8 @@ def read(recording: Path) -> JournalState | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+        problem = f"{path} cannot be read: {error.strerror}."
+        raise (exhausted(error.errno, f"reading {path}") or StoreError(problem)) from error
     if len(data) > MAX_JOURNAL:
         raise StoreError(f"{path} is too large to be a journal.")
     return parse(data)

@@ -14,6 +14,10 @@ state, and the kernel releases the locks of killed processes:
 A process locks `users.lock` before it looks for a mongod, so the mongod that it finds
 cannot be ended under it.
 
+The data files are derived from the segments. If mongod cannot use them, although it can use
+new ones, they are damaged: a new mongod gets an empty directory, and the index is built
+again. The damaged files are first renamed, and removed once the new mongod answers.
+
 The directory belongs to one user of the system. If it belongs to another user, a directory
 beside it with the uid in its name is used. No symlink in it is followed. mongod itself
 would follow them, so it is not started on a directory with symlinks.
@@ -28,6 +32,8 @@ import importlib.util
 import json
 import math
 import os
+import resource
+import secrets
 import shutil
 import socket
 import stat
@@ -47,8 +53,10 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HybridlogError,
     MissingDependencyError,
+    ResourceError,
     StoreError,
     UsageError,
+    exhausted,
 )
 from hybridlog_storage.socket_directory import is_our_socket, is_socket_of, new_socket
 
@@ -66,9 +74,12 @@ _HELLO_LIMIT_S = 1.0
 _SLOW_OPERATION_MS = 5000
 _JOURNAL_MS = 500  # longest time between two checks
 _RECORD_LIMIT = 64 << 10
-_LOG_TAIL = 64 << 10
+_LOG_TAIL = 256 << 10
 _MAX_DEPTH = 8  # most folders in the directory
 _MAX_FILES = 1 << 20
+_ROOM = 1 << 30  # free bytes below which damaged files are removed at once
+_ASIDE = ".damaged-"
+_FILES = ("mongod.log", "mongod.log.1", "mongod.json", "mongod.json.new")
 _IN_STORE, _IN_HERE = files.IN_STORE, files.IN_FOLDER
 
 _OTHER_WAYS = (
@@ -130,6 +141,9 @@ class EmbeddedMongod:
         linger_s: Seconds for which mongod runs after its last use; None takes
             HYBRIDLOG_MONGOD_LINGER_S, or 5. The process that starts mongod decides.
 
+    Attributes:
+        damage: The reason why the last start replaced the data files; None if it did not.
+
     Raises:
         UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is not a number of seconds.
     """
@@ -145,6 +159,8 @@ class EmbeddedMongod:
             raise UsageError(f"linger_s is {self._linger_s}; give seconds, 0 or more.")
         self._mutex = threading.Lock()
         self._users: int | None = None
+        self._aside: Path | None = None  # damaged data files, while the new ones are tried
+        self.damage: str | None = None
 
     @property
     def log(self) -> Path:
@@ -160,11 +176,12 @@ class EmbeddedMongod:
         """Return the URI of a running mongod; start one if necessary.
 
         May be called again at any time, for example after a `DatabaseError`: it checks again,
-        and restarts a mongod that has ended.
+        and restarts a mongod that has ended. Damaged data files are replaced by empty ones.
 
         Raises:
             MissingDependencyError: No mongod is installed.
             StoreError: The directory cannot be written.
+            ResourceError: mongod lacks file handles or memory.
             DiskFullError: There is no space for mongod's files.
             DatabaseError: mongod does not start; the message quotes its log.
         """
@@ -208,8 +225,7 @@ class EmbeddedMongod:
         """Lock `users.lock`; wait for a mongod that is being ended."""
         try:
             self._directory = _own_directory(self._given)
-            with contextlib.suppress(FileExistsError):
-                files.make_folder(self.data, 0o700, depth=_IN_HERE)
+            _make_folder(self.data, depth=_IN_HERE)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         descriptor = self._open("users.lock")
@@ -226,8 +242,13 @@ class EmbeddedMongod:
 
     def _open(self, name: str) -> int:
         flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
+        path = self._directory / name
         try:
-            return files.open_file(self._directory / name, flags, 0o600, depth=_IN_HERE)
+            try:
+                return files.open_file(path, flags, 0o600, depth=_IN_HERE)
+            except IsADirectoryError:
+                _remove_folder(path)
+                return files.open_file(path, flags, 0o600, depth=_IN_HERE)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
 
@@ -235,17 +256,25 @@ class EmbeddedMongod:
         """Path of the socket of a running mongod. Needs `users.lock`."""
         patience = _Patience(self.log)
         log_start: int | None = None
+        damage: str | None = None
+        self._aside = self.damage = None
         while True:
             keeper = self._open("keeper.lock")
             try:
                 if not _try_lock(keeper, fcntl.LOCK_EX):
                     record = self._read_record()
                     if record and _answers(record.socket) and record == self._read_record():
+                        self._remove_set_aside()
                         return record.socket
-                elif log_start is not None:
-                    raise self._failure(log_start)
                 else:
-                    log_start = self._launch(keeper)
+                    if log_start is not None:
+                        failure, is_damage = self._failure(log_start)
+                        if self._aside is not None:
+                            self._put_back()
+                        if damage is not None or not is_damage:
+                            raise failure
+                        damage, patience = str(failure), _Patience(self.log)
+                    log_start = self._launch(keeper, damage)
             finally:
                 os.close(keeper)
             if patience.is_over():
@@ -258,11 +287,12 @@ class EmbeddedMongod:
         except StoreError as error:
             raise DatabaseError(f"mongod cannot be reached: {error}") from error
 
-    def _launch(self, keeper: int) -> int | None:
+    def _launch(self, keeper: int, damage: str | None) -> int | None:
         """Start a keeper, which starts mongod.
 
         Args:
             keeper: The open and locked `keeper.lock`; the new keeper inherits the lock.
+            damage: The reason to replace the data files first, if it is known already.
 
         Returns:
             Size of the log before the start; None if an earlier mongod still has to end.
@@ -276,7 +306,15 @@ class EmbeddedMongod:
                 return None
             program = find_mongod()
             _refuse_odd_files(self._directory)
+            for name in _FILES:
+                with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                    _remove_folder(self._directory / name)
             self._remove_stale()
+            if self._aside is None:
+                self._remove_set_aside()
+                damage = damage or self._damage_of_last_run()
+                if damage is not None:
+                    self._set_aside(damage)
             path = self._new_socket()
             before = _size_of(self.log)
             try:
@@ -303,6 +341,42 @@ class EmbeddedMongod:
                 Path(record.socket).parent.rmdir()
         with contextlib.suppress(FileNotFoundError):
             files.unlink(self._record_path, depth=_IN_HERE)
+
+    def _damage_of_last_run(self) -> str | None:
+        """What the last mongod said about damaged data files before it ended by itself."""
+        text = _read_from(self.log, 0).rpartition(START_LINE)[2]
+        lines = [line for line in text.splitlines() if '"s":"F"' in line]
+        if not any(sign in line for line in lines for sign in _DAMAGE) or _other_cause(text):
+            return None
+        return "; ".join(_telling_lines(text))
+
+    def _set_aside(self, damage: str) -> None:
+        """Replace the data files by an empty directory. Needs all locks but `users.lock`."""
+        if not files.names(self.data, depth=_IN_HERE):
+            return
+        self.damage = damage
+        aside = self.data.with_name(f"{self.data.name}{_ASIDE}{secrets.token_hex(4)}")
+        files.rename(self.data, aside, depth=_IN_HERE)
+        files.make_folder(self.data, 0o700, depth=_IN_HERE)
+        files.sync_folder(self._directory, depth=_IN_STORE)
+        if shutil.disk_usage(self._directory).free < _ROOM:
+            self._remove_set_aside()
+        else:
+            self._aside = aside
+
+    def _put_back(self) -> None:
+        """Restore the data files that were set aside: new ones are of no use either."""
+        assert self._aside is not None
+        files.remove_tree(self.data, depth=_IN_HERE)
+        files.rename(self._aside, self.data, depth=_IN_HERE)
+        self._aside = self.damage = None
+
+    def _remove_set_aside(self) -> None:
+        """Remove damaged data files, also those of an interrupted start."""
+        with contextlib.suppress(OSError):
+            for name in files.names(self._directory, depth=_IN_STORE):
+                if name.startswith(f"{self.data.name}{_ASIDE}"):
+                    files.remove_tree(self._directory / name, depth=_IN_HERE)
 
     def _spawn(self, program: Path, path: Path, keeper: int, alive: int) -> None:
         if not sys.executable:
@@ -395,57 +469,109 @@ class EmbeddedMongod:
             f"{patience.waited():.0f} s. See {self.log}; end that process if it hangs."
         )
 
-    def _failure(self, log_start: int) -> HybridlogError:
-        """The error to raise after mongod started and ended.
+    def _failure(self, log_start: int) -> tuple[HybridlogError, bool]:
+        """The error after mongod started and ended, and whether the data files may be at fault.
 
         Args:
             log_start: Size of the log before the start, in bytes.
         """
-        text = _read_from(self.log, log_start)
+        text = _read_from(self.log, log_start).rpartition(START_LINE)[2]
         said = "; ".join(_telling_lines(text)) or "it logged nothing"
         message = f"mongod for {self._directory} did not come up: {said}."
         if _is_full(self._directory, text):
-            return DiskFullError(
+            full = DiskFullError(
                 f"{message} There is no space left on the file system of {self._directory}; free "
                 f"some and try again."
             )
-        for signs, cure in _CURES:
-            if any(sign in text for sign in signs):
-                message = f"{message} {cure.format(data=self.data)}"
-                break
-        return DatabaseError(f"{message} The whole log is {self.log}.")
+            return full, False
+        found = _other_cause(text)
+        if found is None:
+            is_damage = "ended by itself" in text and not _was_ended(text)
+            return DatabaseError(f"{message} The whole log is {self.log}."), is_damage
+        kind, cure = found
+        if kind is ResourceError:
+            return self._shortage(cure), False
+        message = f"{message} {cure.format(data=self.data)} The whole log is {self.log}."
+        return kind(message), False
+
+    def shortage(self) -> ResourceError | None:
+        """The error if the running mongod lacks file handles or memory, or did when it ended."""
+        found = _other_cause(_read_from(self.log, 0).rpartition(START_LINE)[2])
+        return self._shortage(found[1]) if found and found[0] is ResourceError else None
+
+    def _shortage(self, cure: str) -> ResourceError:
+        handles = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        limit = "unlimited" if handles == resource.RLIM_INFINITY else str(handles)
+        return ResourceError(
+            f"The mongod of {self._directory} {cure.format(limit=limit)} Its log is {self.log}."
+        )
 
 
-_CURES: tuple[tuple[tuple[str, ...], str], ...] = (
+START_LINE = "hybridlog: starts mongod\n"
+"""What the keeper logs before it starts mongod."""
+_DAMAGE = ("wiredtiger", "WT_PANIC", "data corruption")
+"""Words in the last lines of a mongod that ended because of its data files."""
+
+
+def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
+    """The error and the cure if a log names a cause other than damaged data files."""
+    for kind, signs, cure in _CAUSES:
+        if any(sign in text for sign in signs):
+            return kind, cure
+    return None
+
+
+def _was_ended(text: str) -> bool:
+    """True if somebody else ended mongod, for example for lack of memory."""
+    return any(f"killed by signal {number}\n" in text for number in (1, 2, 9, 15))
+
+
+_CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     (
-        ("DBPathInUse", "Another mongod instance is already running"),
+        ResourceError,
+        ("Too many open files",),
+        "ran out of file handles; the hard limit is {limit}. Raise it (`ulimit -n` as root, "
+        "`LimitNOFILE=` of a service), or keep fewer topics: each takes a handle or two.",
+    ),
+    (
+        ResourceError,
+        ("Cannot allocate memory", "bad_alloc", "ut of memory"),
+        "ran out of memory. End other programs, or raise its limit (`ulimit -v`).",
+    ),
+    (
+        DiskFullError,
+        ("No space left on device", "Disk quota exceeded"),
+        "There is no space left on its file system; free some and try again.",
+    ),
+    (
+        DatabaseError,
+        (
+            "DBPathInUse",
+            "Another mongod instance is already running",
+            "already being managed by another process",
+        ),
         "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
         "use it with --mongo URI.",
     ),
     (
+        DatabaseError,
         ("error while loading shared libraries", "GLIBC", "Exec format error"),
         f"This mongod does not run on this machine. {_OTHER_WAYS}",
     ),
     (
-        (
-            "UPGRADE PROBLEM",
-            "featureCompatibilityVersion",
-            "unsupported WiredTiger file version",
-            "InvalidFeatureCompatibilityVersion",
-            "requires an upgrade",
-            "WT_ERROR: non-specific WiredTiger error",
-        ),
-        "The data files may be of another version of MongoDB: name that mongod in "
-        "HYBRIDLOG_MONGOD, or remove {data} and rebuild the index with 'hybridlog reindex'.",
+        DatabaseError,
+        ("cannot run", "the keeper of mongod failed"),
+        "This is no fault of the data files.",
     ),
     (
-        ("WT_PANIC", "data corruption", "WT_TRY_SALVAGE", "WiredTiger.turtle"),
-        "The data files are damaged: remove {data} and rebuild the index with 'hybridlog "
-        "reindex'; no message is lost.",
-    ),
-    (
+        DatabaseError,
         ("Permission denied", "IllegalOperation: Attempted to create a lock file"),
         "Files in {data} belong to somebody else: use the store as the user who made it.",
+    ),
+    (
+        DatabaseError,
+        ("Operation not permitted", "Read-only file system"),
+        "The embedded MongoDB needs a directory that it can write: use a server with --mongo URI.",
     ),
 )
 
@@ -509,8 +635,7 @@ def _own_directory(given: Path) -> Path:
     """
     user = os.geteuid()
     for directory in (given, given.with_name(f"{given.name}-{user}")):
-        with contextlib.suppress(FileExistsError):
-            files.make_folder(directory, 0o700, depth=_IN_STORE)
+        _make_folder(directory, depth=_IN_STORE)
         about = files.status(directory, depth=_IN_STORE)
         if not stat.S_ISDIR(about.st_mode):
             raise _odd_file(directory, directory, about.st_mode)
@@ -520,6 +645,35 @@ def _own_directory(given: Path) -> Path:
         f"{directory} belongs to another user, although its name has this user's number. Remove "
         f"it: the index is rebuilt from the segments."
     )
+
+
+def _make_folder(path: Path, *, depth: int) -> None:
+    """Create a private folder unless it exists; replace a plain file of its name.
+
+    Raises:
+        OSError: It cannot be created.
+    """
+    with contextlib.suppress(FileExistsError):
+        files.make_folder(path, 0o700, depth=depth)
+        return
+    if stat.S_ISREG(files.status(path, depth=depth).st_mode):
+        # If another process has replaced it meanwhile, this fails.
+        with contextlib.suppress(FileNotFoundError, IsADirectoryError, PermissionError):
+            files.unlink(path, depth=depth)
+        with contextlib.suppress(FileExistsError):
+            files.make_folder(path, 0o700, depth=depth)
+
+
+def _remove_folder(path: Path) -> None:
+    """Remove a folder in place of a file. A file, which another process may use, stays.
+
+    Raises:
+        OSError: It is a file, does not exist, or cannot be removed.
+    """
+    for name in files.names(path, depth=_IN_HERE):
+        files.remove_tree(path / name, depth=_IN_HERE + 1)
+    with files.folder(path.parent, _IN_STORE) as fd:
+        files.system.rmdir(path.name, folder=fd)
 
 
 def _refuse_odd_files(directory: Path) -> None:
@@ -575,6 +729,9 @@ def _size_of(path: Path) -> int:
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
+    short = exhausted(error.errno, f"starting the index in {directory}")
+    if short is not None:
+        return short
     if error.errno in {errno.ELOOP, errno.ENOTDIR, errno.EISDIR}:
         return StoreError(
             f"{directory} holds something that does not belong there ({error.filename}: "

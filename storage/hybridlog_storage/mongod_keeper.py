@@ -109,6 +109,7 @@ def _start(job: Job) -> subprocess.Popen[bytes]:
     # C, since mongod does not start under a locale that is not installed, and ssh passes
     # on the locale of the other side.
     environment = {**os.environ, "LC_ALL": "C"}
+    _say(job, "starts mongod")
     return subprocess.Popen(  # noqa: S603 - the starter's own command
         job["command"],
         stdin=subprocess.DEVNULL,

@@ -29,7 +29,7 @@ from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.chunk_table import ChunkTable
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.distinct import distinct
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content, read_record
 from hybridlog_storage.messages import Buffer, Channel
 from hybridlog_storage.segment_file import digest_of
@@ -154,7 +154,7 @@ class SegmentReader:
             self._fd = self._open(path)
         except OSError as error:
             problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
-            raise SegmentError(problem) from error
+            raise (exhausted(error.errno, f"opening {path}") or SegmentError(problem)) from error
         about = os.fstat(self._fd)
         if not stat.S_ISREG(about.st_mode):
             self.close()
@@ -197,7 +197,10 @@ class SegmentReader:
         try:
             return os.fdopen(os.dup(self._fd), "rb")
         except OSError as error:
-            raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
+            problem = f"{self.path} cannot be read: {error.strerror}."
+            raise (
+                exhausted(error.errno, f"reading {self.path}") or SegmentError(problem)
+            ) from error
 
     def grow(self) -> None:
         """Update the file's size after an append."""

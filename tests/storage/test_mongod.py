@@ -24,6 +24,7 @@ from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     MissingDependencyError,
+    ResourceError,
     StoreError,
     UsageError,
 )
@@ -423,7 +424,7 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
             """echo '{"s":"I","msg":"hello"}'; """
             """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$""",
             DatabaseError,
-            r"up: oh .*WT_PANIC.*killed by signal 6.*hybridlog reindex",
+            r"up: oh .*WT_PANIC.*killed by signal 6",
         ),
     ],
 )
@@ -475,14 +476,149 @@ def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> No
             other.kill()
 
 
-def test_damaged_data_files_say_how_to_rebuild(directory: Path) -> None:
-    with EmbeddedMongod(directory, linger_s=LINGER_S):
+def marked(directory: Path, **extra: bytes) -> Path:
+    """Data files that no mongod has written, and that a fake one does not look at."""
+    data = directory / "data"
+    data.mkdir(parents=True)
+    (data / "WiredTiger.turtle").write_bytes(b"old")
+    for name, content in extra.items():
+        (data / name).write_bytes(content)
+    return data
+
+
+def inside(directory: Path) -> list[str]:
+    return sorted(p.name for p in directory.iterdir() if not p.name.endswith(".lock"))
+
+
+def test_damaged_data_files_are_replaced(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        with MongoClient(user.start()) as client:
+            client.test.kept.insert_one({"_id": 1})
+        assert user.damage is None
         processes = pids(directory)
     gone(*processes)
     (directory / "data" / "WiredTiger.turtle").write_bytes(b"\0" * 100)
-    (directory / "data" / "WiredTiger.wt").write_bytes(b"no database")
-    with pytest.raises(DatabaseError, match="hybridlog reindex"):
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert "Fatal assertion" in str(user.damage)
+        with MongoClient(user.start()) as client:
+            assert client.test.kept.count_documents({}) == 0
+        assert user.damage is None, "told once"
+        assert inside(directory) == ["data", "mongod.json", "mongod.log"], "nothing is left"
+
+
+def test_data_files_that_new_ones_cannot_replace_are_put_back(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If mongod cannot use new files either, it is not the fault of the old ones."""
+    starts = tmp_path / "starts"
+    script = f"""ls {directory}/data | tr '\\n' ' ' >> {starts}; echo >> {starts}
+echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    data = marked(directory)
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    with pytest.raises(DatabaseError, match=r"oh .*WT_PANIC"):
+        user.start()
+    assert starts.read_text().split("\n") == ["WiredTiger.turtle ", "", ""], "old, new"
+    assert (data / "WiredTiger.turtle").read_bytes() == b"old"
+    assert user.damage is None
+    assert inside(directory) == ["data", "mongod.log"]
+
+
+def test_damaged_data_files_are_removed_at_once_if_room_is_short(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = tmp_path / "seen"
+    script = f"""ls {directory} > {seen}; echo '{{"s":"F","msg":"oh"}}'; kill -6 $$"""
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    monkeypatch.setattr(module, "_ROOM", 1 << 62)
+    data = marked(directory)
+    with pytest.raises(DatabaseError):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    assert "damaged" not in seen.read_text()
+    assert not list(data.iterdir())
+
+
+def test_what_an_interrupted_replacement_has_left_is_removed(directory: Path) -> None:
+    left = directory / "data.damaged-0123abcd"
+    left.mkdir(parents=True)
+    (left / "big").write_bytes(b"x")
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert user.damage is None
+        assert not left.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "end", "error", "told"),
+    [
+        ("24: Too many open files", "exit 14", ResourceError, r"file handles; .*ulimit -n"),
+        ("std::bad_alloc", "kill -6 $$", ResourceError, "out of memory"),
+        ("No space left on device", "exit 14", DiskFullError, "free some"),
+        ("16: already being managed by another process", "exit 14", DatabaseError, "has .* open"),
+        ("Permission denied", "exit 100", DatabaseError, "somebody else"),
+        ("up", "kill -9 $$", DatabaseError, "signal 9"),
+    ],
+)
+def test_other_causes_leave_the_data_files_alone(
+    directory: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    end: str,
+    error: type[Exception],
+    told: str,
+) -> None:
+    starts = tmp_path / "starts"
+    script = f"""echo x >> {starts}; echo '{{"s":"F","msg":"wiredtiger: {words}"}}'; {end}"""
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    data = marked(directory)
+    with pytest.raises(error, match=told):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    assert starts.read_text() == "x\n"
+    assert (data / "WiredTiger.turtle").read_bytes() == b"old"
+
+
+@pytest.mark.parametrize(
+    ("said", "replaced"),
+    [
+        ('{"s":"F","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}', True),
+        ('{"s":"I","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}', False),
+        ('{"s":"F","msg":"Fatal assertion","attr":{"file":"query.cpp"}}', False),
+        ('{"s":"F","msg":"wiredtiger: Too many open files"}', False),
+    ],
+)
+def test_damage_that_the_last_mongod_noticed_late(
+    directory: Path, said: str, *, replaced: bool
+) -> None:
+    """A file that is opened only for a question: mongod has started well, and ends then."""
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        with MongoClient(user.start()) as client:
+            client.test.kept.insert_one({"_id": 1})
+        processes = pids(directory)
+    gone(*processes)
+    with user.log.open("a") as log:
+        log.write(f"{said}\nhybridlog: mongod ended by itself, killed by signal 6\n")
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert (user.damage is not None) == replaced
+        with MongoClient(user.start()) as client:
+            assert client.test.kept.count_documents({}) == (not replaced)
+        processes = pids(directory)
+    gone(*processes)
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert user.damage is None, "that run is over"
+
+
+@pytest.mark.parametrize("name", ["users.lock", "keeper.lock", "alive.lock", "mongod.json",
+                                  "mongod.json.new", "mongod.log", "data", ""])  # fmt: skip
+def test_a_file_for_a_folder_or_a_folder_for_a_file(directory: Path, name: str) -> None:
+    place = directory / name if name else directory
+    if name in {"data", ""}:
+        place.parent.mkdir(exist_ok=True)
+        place.write_text("x")
+    else:
+        place.mkdir(parents=True)
+        (place / "inner").write_text("x")
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert ping(user.start())
 
 
 def test_a_symlink_in_place_of_the_socket_directory(

@@ -11,6 +11,7 @@ import bson
 
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.planner import Planner
+from hybridlog_storage.errors import ConnectionLostError
 
 if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
@@ -58,13 +59,31 @@ def _of_topic(
     """Streams of the documents of one topic that match, each in order."""
     matching = _Matching(planner, mongo, parts)
 
-    def read(stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
+    def decode(stream: Iterator[bytes]) -> Iterator[Document]:
         for raw in stream:
             documents = bson.decode_all(raw)
             planner.counters.documents_read += len(documents)
-            yield from ((parts[0].topic, d) for d in documents if matching.has(d["_meta"]))
+            yield from documents
 
-    return [read(stream) for stream in mongo.documents(parts, reverse=reverse)]
+    def read(number: int, stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
+        last: Any = None
+        documents = decode(stream)
+        try:
+            for document in documents:
+                key = document["_id"]
+                if matching.has(document["_meta"]):
+                    yield parts[0].topic, document
+                last = key
+        except ConnectionLostError:  # a new connection goes on behind the last document
+            documents = decode(mongo.documents(parts, reverse=reverse)[number])
+            for document in documents:
+                key = document["_id"]
+                is_new = last is None or (key < last if reverse else key > last)
+                if is_new and matching.has(document["_meta"]):
+                    yield parts[0].topic, document
+
+    streams = mongo.documents(parts, reverse=reverse)
+    return [read(number, stream) for number, stream in enumerate(streams)]
 
 
 class _Matching:
