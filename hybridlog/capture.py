@@ -24,12 +24,12 @@ from hybridlog.maintenance.opening import announce_removal, put_entry, remove_fi
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, HybridlogError, StoreError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
@@ -217,7 +217,8 @@ class Capture:
         # If MongoDB is unavailable, the next connection finds an entry without files.
         with suppress(HybridlogError):
             state = IndexState(self.index.database)
-            state.clear(entry.key, {collection_of(c.topic) for c in self.writer.channels.values()})
+            topics = {channel.topic for channel in self.writer.channels.values()}
+            state.clear(entry.key, TopicPlaces(self.index.database).of(topics).values())
             state.remove(entry.key)
         self._held.close()
 

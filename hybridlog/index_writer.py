@@ -21,13 +21,14 @@ import numpy as np
 
 from hybridlog_storage.catalog import ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, SegmentError
+from hybridlog_storage.index_documents import with_prefix
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
+from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,7 +55,11 @@ _MOST_LATEST = 4096  # chunks: far more than a killed server has not in its jour
 
 @dataclass(slots=True)
 class _Parcel:
-    """Documents of some chunks that are sent to the database together, and those chunks."""
+    """Documents of some chunks that are sent to the database together, and those chunks.
+
+    Attributes:
+        documents: Those of each topic.
+    """
 
     documents: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
     entries: list[ChunkEntry] = field(default_factory=list)
@@ -63,7 +68,7 @@ class _Parcel:
 
     def add(self, documents: list[Documents], entries: list[ChunkEntry]) -> None:
         for part in documents:
-            self.documents.setdefault(part.collection, []).extend(part.tables)
+            self.documents.setdefault(part.topic, []).extend(part.tables)
             self.size += part.size
         self.entries += entries
         self.messages += sum(entry.messages for entry in entries)
@@ -281,7 +286,7 @@ class IndexWriter:
         self._forgotten: deque[_Forgotten] = deque()
         self._database = database
         self._state = IndexState(database)
-        self._collections: set[str] = set()
+        self._places = TopicPlaces(database)
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
         self._in_memory = 0  # chunks waiting or in work
@@ -342,7 +347,7 @@ class IndexWriter:
         if self._is_away:
             return
         try:
-            self._ensure(collection_of(channel.topic))
+            self._places.assigned([channel.topic])
         except DatabaseError:
             # It fails again with the first documents, and is reported then. A timeout takes
             # seconds, and other channels wait.
@@ -448,7 +453,7 @@ class IndexWriter:
             return
         with self._lock:
             self._database, self._state = database, state
-            self._collections.clear()
+            self._places = TopicPlaces(database)
             # A killed server has lost documents that were not in its journal yet.
             latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
             for entry in latest:
@@ -537,8 +542,7 @@ class IndexWriter:
         failure = self.failure
         try:
             if failure is None:
-                for collection, tables in parcel.documents.items():
-                    self._ensure(collection)
+                for collection, tables in self._placed(parcel.documents).items():
                     lengths = np.concatenate(
                         [np.full(len(table), table.shape[1], np.int64) for table in tables]
                     )
@@ -566,13 +570,21 @@ class IndexWriter:
         self._forgotten.append(_Forgotten(entry.segment, entry.place, entry.messages, True))
         return entry.messages
 
-    def _ensure(self, collection: str) -> None:
-        with self._lock:
-            if collection in self._collections:
-                return
-        self._database.ensure_collection(collection)
-        with self._lock:
-            self._collections.add(collection)
+    def _placed(
+        self, documents: Mapping[str, list[NDArray[np.uint8]]]
+    ) -> dict[str, list[NDArray[np.uint8]]]:
+        """The documents of topics by collection, with their keys there.
+
+        Raises:
+            DatabaseError: MongoDB fails.
+        """
+        places = self._places.assigned(documents.keys())
+        found: dict[str, list[NDArray[np.uint8]]] = {}
+        for topic, tables in documents.items():
+            place = places[topic]
+            own = [with_prefix(table, place.prefix) for table in tables]
+            found.setdefault(place.collection, []).extend(own)
+        return found
 
     def _made(self, size: int, future: Future[None]) -> None:
         self._room.release()

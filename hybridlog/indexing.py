@@ -18,7 +18,6 @@ from hybridlog.schema.column import STAMP
 from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.runs import run_lengths, run_starts
@@ -33,11 +32,11 @@ class Documents(NamedTuple):
     """Index documents of one topic.
 
     Attributes:
-        collection: Their collection.
+        topic: Their topic.
         tables: uint8[k, width] each, with a whole BSON document in each row.
     """
 
-    collection: str
+    topic: str
     tables: list[NDArray[np.uint8]]
 
     @property
@@ -88,7 +87,7 @@ class ChunkIndexer:
                 tables.append(assembler.assemble(placed, rows[group.rows], group.body, group.error))
             if stamped:
                 _read_stamps(codec, batch, found)
-            documents.append(Documents(collection_of(channel.topic), tables))
+            documents.append(Documents(channel.topic, tables))
             for number, of_chunk in found.by_chunk():
                 stats[number][channel_id] = of_chunk
         entries = [

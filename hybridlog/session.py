@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.topic_places import TopicPlaces
 
 _MAX_OPEN_SEGMENTS = 256
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
@@ -78,6 +79,7 @@ class Session:
         self._recordings: list[RecordingEntry] | None = None
         self._by_id: dict[str, RecordingEntry] = {}
         self._belief: Belief | None = None
+        self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, list[RecordedChannel]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
@@ -174,6 +176,7 @@ class Session:
         """Disconnect from MongoDB; questions are then answered from the files."""
         self.connection.close()
         self._belief = None
+        self._places = None
 
     def take_over(self) -> None:
         """Record in the index that the store is at this location."""
@@ -227,6 +230,19 @@ class Session:
             raise IndexChangedError(
                 f"{error} This MongoDB user may only read: ask once as a user who may write."
             ) from error
+
+    def places(self, purpose: str) -> TopicPlaces:
+        """The places of topics in the index.
+
+        Raises:
+            DatabaseError: it is unavailable; has the purpose and the reason.
+        """
+        from hybridlog_storage.topic_places import TopicPlaces
+
+        database = self.database_for(purpose)
+        if self._places is None:
+            self._places = TopicPlaces(database)
+        return self._places
 
     def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
         """The state of the index of some recordings, as of the catalog's snapshot.
@@ -498,6 +514,7 @@ class Session:
         self._by_id = {}
         self._is_indexed = False
         self._belief = None
+        self._places = None
         self._schemas = {}
         self._channels.clear()
         with self._lock:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
+    from hybridlog_storage.topic_places import TopicPlace
 
 DEFAULT_STORE = "hybridlog-store"
 
@@ -399,6 +400,22 @@ class Store:
         database = self.database_for("Indexes")
         names = self.topic(*topics).topics if topics else self.topics()
         return field_indexes.of_topics(database, names)
+
+    def topic_place(self, topic: str) -> TopicPlace:
+        """The place of a topic's index documents in MongoDB.
+
+        Args:
+            topic: Full name, or an unambiguous short one.
+
+        Returns:
+            Has `collection`, its name, and `documents(begin, end)`, a filter for the
+            documents of the topic with log times in `[begin, end)`, ns.
+
+        Raises:
+            TopicError: The topic does not exist.
+        """
+        (name, *_) = self.topic(topic).topics
+        return self.session.places("The place of a topic").of([name])[name]
 
     def verify(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None

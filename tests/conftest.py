@@ -109,6 +109,7 @@ SLOW = frozenset(
         "test_field_indexes.py",
         "test_groups.py",
         "test_hostile_store.py",
+        "test_many_topics.py",
         "test_model.py",
         "test_mutants.py",
         "test_packaging.py",

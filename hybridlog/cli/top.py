@@ -134,11 +134,13 @@ def _values(
     span: int,
 ) -> list[dict[str, Any]]:
     """Least, mean and greatest of each field in the last seconds, from the index."""
-    from hybridlog_storage.collection_names import collection_of
+    from hybridlog_storage.topic_places import TopicPlaces
 
     since = time.time_ns() - span
     found = []
-    for topic, field in _resolved(state, fields):
+    asked = list(_resolved(state, fields))
+    places = TopicPlaces(database).of({topic for topic, _ in asked})
+    for topic, field in asked:
         value = f"${field.path}"
         group = {
             "_id": None,
@@ -148,11 +150,11 @@ def _values(
             "greatest": {"$max": value},
         }
         pipeline: list[Mapping[str, object]] = [
-            {"$match": {"_meta.rec": recording, "_meta.t": {"$gte": since}}},
+            {"$match": {"_meta.rec": recording, **places[topic].documents(since)}},
             {"$group": group},
         ]
         row: dict[str, Any] = {"topic": topic, "field": field.path, "n": 0}
-        for document in database.aggregate(collection_of(topic), pipeline, max_time_ms=2000):
+        for document in database.aggregate(places[topic].collection, pipeline, max_time_ms=2000):
             row |= {key: document[key] for key in ("n", "least", "mean", "greatest")}
         found.append(row)
     return found

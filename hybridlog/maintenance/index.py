@@ -17,10 +17,10 @@ from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import stamps_of
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.index_state import Indexed, IndexState
 from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.topic_places import TopicPlace
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
@@ -187,7 +188,7 @@ def _ids_of(directory: StoreDirectory, labels: Iterable[str]) -> set[str] | None
 
 def forget(state: IndexState, key: str) -> None:
     """Remove all documents of a recording, and its mirror last."""
-    state.clear(key, state.topic_collections())
+    state.clear(key)
     state.remove(key)
 
 
@@ -213,9 +214,8 @@ def catch_up(
         DatabaseError: MongoDB fails.
         SegmentError: A segment cannot be read.
     """
-    state = IndexState(database)
     entry = put_entry(directory, catalog, label)
-    indexed, done = _prepare(state, entry, catalog)
+    indexed, done = _prepare(database, entry, catalog)
     whole = {int(number) for number in indexed.segments}
     missing = {
         (number, chunk): offset
@@ -237,12 +237,12 @@ def catch_up(
     catalog.put_damage(entry.id, damage)
     entry = finish(directory, catalog, database, label, turn=indexed.turn)
     if not entry.is_decoded:  # documents indexed before
-        state.show(decode_again(directory, catalog, entry, progress))
+        IndexState(database).show(decode_again(directory, catalog, entry, progress))
     return len(missing.keys() - damage.keys())
 
 
 def _prepare(
-    state: IndexState, entry: RecordingEntry, catalog: Catalog
+    database: Database, entry: RecordingEntry, catalog: Catalog
 ) -> tuple[Indexed, dict[Place, int]]:
     """Remove documents from the index that do not fit the segments; return the rest.
 
@@ -250,6 +250,7 @@ def _prepare(
         The state of the recording's index, and the offsets of indexed chunks in
         incompletely indexed segments.
     """
+    state = IndexState(database)
     indexed = state.one(entry.key)
     done = state.places(entry.key)
     if (
@@ -271,9 +272,9 @@ def _prepare(
     state.put(entry, "clearing", turn=turn, segments=left)
     if indexed is None:
         # No documents are known. Unknown ones are within the same times.
-        state.clear(entry.key, {collection_of(c.topic) for c in entry.channels}, entry.span)
+        state.clear(entry.key, _places(database, [entry]).values(), entry.span)
     else:
-        state.clear(entry.key, state.topic_collections(), but=[int(n) for n in left])
+        state.clear(entry.key, but=[int(n) for n in left])
     state.put(entry, "indexing", turn=turn, segments=left)
     return Indexed(entry.id, "indexing", left, turn, ()), {}
 
@@ -437,7 +438,6 @@ def reindex(
     Raises:
         DatabaseError: MongoDB fails.
     """
-    state = IndexState(database)
     left = []
     for label in labels:
         with directory.writing(label) as mine:
@@ -446,18 +446,28 @@ def reindex(
                 continue
             entry = put_entry(directory, catalog, label)
             # Finding documents outside of its times would read every document.
-            _clear(state, entry, entry.span if everything else None)
+            _clear(database, entry, in_its_times=everything)
             catch_up(directory, catalog, database, label, progress)
     return left
 
 
-def _clear(state: IndexState, entry: RecordingEntry, span: tuple[int, int] | None = None) -> None:
-    """Remove the documents of a recording before it is indexed from the beginning."""
+def _clear(database: Database, entry: RecordingEntry, *, in_its_times: bool = False) -> None:
+    """Remove the documents of a recording before it is indexed from the beginning.
+
+    Args:
+        database: The index.
+        entry: The recording.
+        in_its_times: Whether to remove only documents of its topics, at its times.
+    """
+    state = IndexState(database)
     indexed = state.one(entry.key)
     turn = 1 if indexed is None else indexed.turn + 1
     # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn)
-    state.clear(entry.key, state.topic_collections(), span)
+    if in_its_times:
+        state.clear(entry.key, _places(database, [entry]).values(), entry.span)
+    else:
+        state.clear(entry.key)
     state.put(entry, "indexing", turn=turn)
 
 
@@ -484,35 +494,41 @@ def remove_rest(
     """
     state = IndexState(database)
     known = {entry.key: entry for entry in entries}
+    places = _places(database, known.values())
     again: set[str] = set()
-    strangers: list[tuple[object, str]] = []
-    for collection in state.topic_collections():
+    strangers: list[object] = []
+    for collection in state.document_collections():
         pipeline = [{"$group": {"_id": "$_meta.rec", "count": {"$sum": 1}}}]
         for found in database.aggregate(collection, pipeline):
             key = found["_id"]
             entry = known.get(key) if isinstance(key, str) else None
             if entry is None:
-                strangers.append((key, collection))
+                strangers.append(key)
                 continue
             # Fewer, too: a document of no recording may have had the key of one.
-            missing = _messages_in(entry, collection) - found["count"]
+            missing = _messages_in(entry, collection, places) - found["count"]
             if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
                 again.add(entry.key)
     # Listed after the index: a recording that has begun meanwhile has a directory by now.
     present = ids_present(directory) if strangers else None
-    for key, collection in strangers:
+    for key in strangers:
         if present is not None and not (isinstance(key, str) and key in present):
-            state.clear(key, [collection])
+            state.clear(key)
     for key in sorted(again):
         entry = known[key]
         with directory.writing(entry.label) as mine:
             if mine:
-                _clear(state, entry)
+                _clear(database, entry)
                 catch_up(directory, catalog, database, entry.label, progress)
 
 
-def _messages_in(entry: RecordingEntry, collection: str) -> int:
-    return sum(c.stats.messages for c in entry.channels if collection_of(c.topic) == collection)
+def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, TopicPlace]:
+    """The places of the topics of some recordings."""
+    return TopicPlaces(database).of({c.topic for entry in entries for c in entry.channels})
+
+
+def _messages_in(entry: RecordingEntry, collection: str, places: Mapping[str, TopicPlace]) -> int:
+    return sum(c.stats.messages for c in entry.channels if places[c.topic].collection == collection)
 
 
 def mirror(catalog: Catalog, database: Database, recording: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -12,10 +13,11 @@ from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
 from hybridlog_storage.directory import LOCK
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
-from hybridlog_storage.index_documents import key_bound, recording_key
+from hybridlog_storage.index_documents import recording_key, with_prefix
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.topic_places import SHARED, TopicPlaces
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segment_reader import ChunkPlace
+    from hybridlog_storage.topic_places import Filter, TopicPlace
 
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
@@ -122,7 +125,8 @@ class _Check:
         self._label = label
         self._result = result
         self._path = directory.recording(label)
-        self._expected: dict[str, int] = {}
+        self._places = None if database is None else TopicPlaces(database)
+        self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
         self._is_damaged = False
         self._has_index = False
@@ -241,12 +245,28 @@ class _Check:
             return
         documents, _ = self._indexer.documents_of([chunk], channels)
         key = self._indexer.recording[:16]
-        for collection, want in _by_collection(documents).items():
-            self._expected[collection] = self._expected.get(collection, 0) + len(want)
-            problem = _compare(self._database, key, chunk, collection, want)
+        for collection, (places, want) in self._by_collection(documents).items():
+            self._expected[collection] += len(want)
+            problem = _compare(self._database, key, chunk, places, want)
             if problem:
                 where = f"{name} byte {chunk.offset}, collection {collection}"
                 self.found(where, problem, self._reindex)
+
+    def _by_collection(
+        self, documents: Iterable[Documents]
+    ) -> dict[str, tuple[list[TopicPlace], list[bytes]]]:
+        """Places and documents by collection; several channels of a chunk may share a topic."""
+        assert self._places is not None
+        by_topic: dict[str, list[Documents]] = defaultdict(list)
+        for part in documents:
+            by_topic[part.topic].append(part)
+        found: dict[str, tuple[list[TopicPlace], list[bytes]]] = {}
+        for place in self._places.of(by_topic.keys()).values():
+            places, rows = found.setdefault(place.collection, ([], []))
+            places.append(place)
+            for table in (table for part in by_topic[place.topic] for table in part.tables):
+                rows += [row.tobytes() for row in with_prefix(table, place.prefix)]
+        return found
 
     @property
     def _reindex(self) -> str:
@@ -267,7 +287,7 @@ class _Check:
 
     def _index(self, entry: RecordingEntry) -> None:
         """Find documents that are not in the segments."""
-        if self._database is None:
+        if self._database is None or self._places is None:
             return
         state = IndexState(self._database)
         indexed = state.of([entry.key]).get(entry.key)
@@ -275,11 +295,22 @@ class _Check:
             self.found("index", "it is not complete", self._reindex)
         elif not state.is_mirrored(entry):
             self.found("index", "its entry of the recording differs", self._reindex)
-        for collection in state.topic_collections():
-            have = self._database.count(collection, {"_meta.rec": entry.key})
-            want = self._expected.get(collection, 0)
-            if have != want:
-                problem = f"{have} index documents, {want} messages in the segments"
+        asked: Filter = {"_meta.rec": entry.key}
+        have = {
+            collection: self._database.count(collection, asked)
+            for collection in state.document_collections()
+            if collection != SHARED
+        }
+        shared = [
+            p for p in self._places.of({c.topic for c in entry.channels}).values() if p.is_shared
+        ]
+        if shared:
+            each = [(SHARED, {**place.documents(), **asked}) for place in shared]
+            have[SHARED] = sum(self._database.count_each(each))
+        for collection, found in have.items():
+            want = self._expected[collection]
+            if found != want:
+                problem = f"{found} index documents, {want} messages in the segments"
                 self.found(f"collection {collection}", problem, self._reindex)
 
     def _tables(self, entry: RecordingEntry) -> None:
@@ -287,29 +318,27 @@ class _Check:
             self.found(f"table of {topic}", problem, _REPAIR)
 
 
-def _by_collection(documents: Iterable[Documents]) -> dict[str, list[bytes]]:
-    """Documents by collection; several channels of a chunk may share a topic."""
-    found: dict[str, list[bytes]] = {}
-    for part in documents:
-        found.setdefault(part.collection, []).extend(
-            row.tobytes() for table in part.tables for row in table
-        )
-    return found
-
-
 def _compare(
-    database: Database, key: str, chunk: StoredChunk, collection: str, want: list[bytes]
+    database: Database, key: str, chunk: StoredChunk, places: list[TopicPlace], want: list[bytes]
 ) -> str | None:
-    """Compare the documents of a chunk in one collection; return a problem or None."""
-    times = chunk.batch.log_time
-    query = {
-        "_id": {"$gte": key_bound(int(times.min())), "$lt": key_bound(int(times.max()) + 1)},
-        "_meta.ref.chunk": chunk.number,
-        "_meta.ref.seg": chunk.segment,
-    }
+    """Compare the documents of a chunk in one collection.
+
+    Args:
+        database: The index.
+        key: Key of the recording.
+        chunk: The chunk.
+        places: The topics of the chunk that are in the collection.
+        want: The documents that should be there.
+
+    Returns:
+        A problem or None.
+    """
+    first, end = int(chunk.batch.log_time.min()), int(chunk.batch.log_time.max()) + 1
+    asked = {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
+    filters = [{**place.documents(first, end), **asked} for place in places]
     have = {
         document
-        for raw in database.find_raw(collection, query)
+        for raw in database.find_each(places[0].collection, filters)
         for document in _split(raw)
         if recording_key(document) == key
     }

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
+import json
 import operator
 import re
 import struct
@@ -117,6 +119,21 @@ class CollectionStats:
     document_bytes: int
     storage_bytes: int
     index_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Index:
+    """An index of a collection.
+
+    Attributes:
+        name: Its name.
+        keys: Field paths with 1 (ascending) or -1 (descending).
+        only: Values of fields; documents with other values are not in the index.
+    """
+
+    name: str
+    keys: tuple[tuple[str, int], ...]
+    only: Mapping[str, object]
 
 
 class Database:
@@ -336,6 +353,14 @@ class Database:
             part = documents if is_whole else whole[start:end]
             inserted += self._insert_batch(collection, bytes(part), journal=journal)
         return inserted
+
+    def insert_missing(self, collection: str, documents: Sequence[Mapping[str, object]]) -> int:
+        """Insert the documents whose `_id` does not exist; return their number."""
+        from bson import encode
+
+        with _mapped(self._address):
+            encoded = [encode(document) for document in documents]
+        return self.insert_raw(collection, b"".join(encoded), len(encoded))
 
     def _insert_batch(self, collection: str, documents: bytes, *, journal: bool) -> int:
         if not collection or "$" in collection or "\0" in collection:
@@ -569,7 +594,7 @@ class Database:
         self,
         collection: str,
         filters: Sequence[Mapping[str, object]],
-        projection: Mapping[str, object],
+        projection: Mapping[str, object] | None = None,
     ) -> Iterator[bytes]:
         """Find the documents of many questions, one after the other, as in `find_raw`.
 
@@ -579,12 +604,13 @@ class Database:
                 hundred of them find must fit into memory.
             projection: MongoDB's projection document; names the fields to return.
         """
-        of, shape = self._collection(collection), {"$project": dict(projection)}
+        of = self._collection(collection)
+        shape = [] if projection is None else [{"$project": dict(projection)}]
         for _, part in _together([(collection, query) for query in filters]):
             if len(part) == 1:  # one command; a pipeline takes two
                 yield from self.find_raw(collection, part[0][1], projection, sort=[("_id", 1)])
                 continue
-            parts = [(where, [{"$match": dict(query)}, _IN_ORDER, shape]) for where, query in part]
+            parts = [(where, [{"$match": dict(query)}, _IN_ORDER, *shape]) for where, query in part]
             _, pipeline = _union(parts)
 
             def ask(pipeline: list[Document] = pipeline) -> list[bytes]:
@@ -659,6 +685,16 @@ class Database:
         of = self._collection(collection)
         return self._again(lambda: of.delete_many(dict(filter))).deleted_count
 
+    def delete_each(self, collection: str, filters: Sequence[Mapping[str, object]]) -> int:
+        """Delete every document that matches one of many filters; return their number."""
+        from pymongo import DeleteMany
+
+        if not filters:
+            return 0
+        of = self._collection(collection)
+        each = [DeleteMany(dict(query)) for query in filters]
+        return self._again(lambda: of.bulk_write(each, ordered=False)).deleted_count
+
     def drop(self, collection: str) -> None:
         """Remove a collection if it exists."""
         self._again(self._collection(collection).drop)
@@ -679,26 +715,53 @@ class Database:
         *,
         unique: bool = False,
         sparse: bool = False,
+        only: Mapping[str, str] | None = None,
     ) -> str:
-        """Create an index unless it exists; return its name."""
+        """Create an index unless it exists; return its name.
+
+        Args:
+            collection: The collection.
+            keys: The indexed fields.
+            unique: Whether to refuse equal values.
+            sparse: Whether to leave out documents without the fields.
+            only: Values of fields; documents with other values are not in the index.
+        """
         of = self._collection(collection)
         options: dict[str, Any] = {"sparse": True} if sparse else {}
+        if only:
+            options["partialFilterExpression"] = dict(only)
+            # By default indexes of equal keys have equal names.
+            text = json.dumps([keys, sorted(only.items())])
+            options["name"] = hashlib.sha256(text.encode()).hexdigest()
         return self._again(lambda: of.create_index(list(keys), unique=unique, **options))
 
-    def indexes(self, collection: str) -> list[list[tuple[str, int]]]:
-        """The keys of all indexes but the one on `_id`, sorted."""
+    def indexes(self, collection: str) -> list[Index]:
+        """All indexes but the one on `_id`, sorted by their keys."""
         of = self._collection(collection)
-        found = self._again(lambda: [about["key"].items() for about in of.list_indexes()])
-        keys = [[(str(field), int(order)) for field, order in key] for key in found]
-        return sorted(key for key in keys if [field for field, _ in key] != ["_id"])
+        found = [
+            Index(
+                str(about["name"]),
+                tuple((str(field), int(order)) for field, order in about["key"].items()),
+                dict(about.get("partialFilterExpression") or {}),
+            )
+            for about in self._again(lambda: list(of.list_indexes()))
+        ]
+        return sorted(
+            (index for index in found if [field for field, _ in index.keys] != ["_id"]),
+            key=operator.attrgetter("keys"),
+        )
 
-    def drop_index(self, collection: str, keys: Sort) -> bool:
-        """Drop the index with these keys; return whether it existed."""
-        if list(keys) not in self.indexes(collection):
-            return False
+    def drop_index(
+        self, collection: str, keys: Sort, *, only: Mapping[str, str] | None = None
+    ) -> bool:
+        """Drop the index with these keys and documents; return whether it existed."""
+        wanted = tuple(keys), dict(only or {})
         of = self._collection(collection)
-        self._again(lambda: of.drop_index(list(keys)))
-        return True
+        for index in self.indexes(collection):
+            if (index.keys, index.only) == wanted:
+                self._again(functools.partial(of.drop_index, index.name))
+                return True
+        return False
 
     def stats(self, collection: str) -> CollectionStats:
         """Size of a collection."""

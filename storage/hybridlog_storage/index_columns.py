@@ -9,11 +9,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.index_documents import KEY_BYTES, PREFIX_BYTES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,10 +25,8 @@ KEY: Final = {"_id": 1}
 REFERENCE: Final = {"_id": 1, "_meta.ref": 1}
 """The projection that `reference_columns` reads."""
 
+_LONG_KEY = bytes([KEY_BYTES + PREFIX_BYTES])
 _KEY_VALUE = np.dtype([("time", ">u8"), ("recording", ">u8"), ("seq", ">u8")])
-_KEY_HEAD = np.void(b"\x27\0\0\0\x05_id\0\x18\0\0\0\0")
-"""What precedes the key: 39 bytes in all, a binary value named `_id` of 24 bytes."""
-_KEY_DOCUMENT = np.dtype([("head", "V14"), ("key", _KEY_VALUE), ("end", "u1")])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,8 +99,9 @@ def key_columns(batch: bytes) -> KeyColumns:
     Raises:
         StoreError: a document is not one of hybridlog's.
     """
-    documents = _documents(batch, _KEY_DOCUMENT)
-    if len(documents) and (documents["head"] != _KEY_HEAD).any():
+    layout, head = _key_layout(_prefix_bytes(batch))
+    documents = _documents(batch, layout)
+    if len(documents) and (documents["head"] != head).any():
         raise _strange("_id")
     keys = documents["key"]
     return KeyColumns(
@@ -119,8 +120,9 @@ def reference_columns(batch: bytes) -> ReferenceColumns:
     Raises:
         StoreError: a document is not one of hybridlog's.
     """
-    documents = _documents(batch, _REFERENCE_DOCUMENT)
-    for name, expected in _REFERENCE_TEXT.items():
+    layout, text = _reference_layout(_prefix_bytes(batch))
+    documents = _documents(batch, layout)
+    for name, expected in text.items():
         if len(documents) and (documents[name] != expected).any():
             raise _strange("_meta.ref")
     return ReferenceColumns(
@@ -143,17 +145,41 @@ def _strange(what: str) -> StoreError:
     )
 
 
-def _reference_layout() -> tuple[np.dtype[np.void], dict[str, np.void]]:
-    """The layout of a projected document, and the bytes between its values."""
+def _prefix_bytes(batch: bytes) -> int:
+    """Bytes before the keys of documents, which come from one collection."""
+    return PREFIX_BYTES if batch[9:10] == _LONG_KEY else 0
+
+
+@cache
+def _key_layout(prefix: int) -> tuple[np.dtype[np.void], np.void]:
+    """The layout of a projected document, and the bytes before its key.
+
+    Args:
+        prefix: Bytes before the key.
+    """
+    size = KEY_BYTES + prefix
+    head = struct.pack("<i", size + 15) + b"\x05_id\0" + struct.pack("<iB", size, 0)
+    fields = [("head", f"V{len(head)}"), ("prefix", f"V{prefix}"), ("key", _KEY_VALUE)]
+    return np.dtype([*fields, ("end", "u1")]), np.void(head)
+
+
+@cache
+def _reference_layout(prefix: int) -> tuple[np.dtype[np.void], dict[str, np.void]]:
+    """The layout of a projected document, and the bytes between its values.
+
+    Args:
+        prefix: Bytes before the key.
+    """
     integers = [("seg", 0x10, "<i4"), ("chunk", 0x12, "<i8"), ("off", 0x12, "<i8")]
     integers.append(("len", 0x12, "<i8"))
     sizes = {"<i4": 4, "<i8": 8}
     inner = 4 + sum(2 + len(name) + sizes[kind] for name, _, kind in integers) + 1
     meta = 4 + len(b"\x03ref\0") + inner + 1
-    key = b"\x05_id\0" + struct.pack("<i", _KEY_VALUE.itemsize) + b"\0"
-    whole = 4 + len(key) + _KEY_VALUE.itemsize + len(b"\x03_meta\0") + meta + 1
+    key = b"\x05_id\0" + struct.pack("<iB", KEY_BYTES + prefix, 0)
+    whole = 4 + len(key) + KEY_BYTES + prefix + len(b"\x03_meta\0") + meta + 1
     head = struct.pack("<i", whole) + key
-    fields: list[tuple[str, Any]] = [("before key", f"V{len(head)}"), ("key", _KEY_VALUE)]
+    fields: list[tuple[str, Any]] = [("before key", f"V{len(head)}")]
+    fields += [("prefix", f"V{prefix}"), ("key", _KEY_VALUE)]
     expected = {"before key": np.void(head)}
     text = b"\x03_meta\0" + struct.pack("<i", meta)
     text += b"\x03ref\0" + struct.pack("<i", inner)
@@ -165,6 +191,3 @@ def _reference_layout() -> tuple[np.dtype[np.void], dict[str, np.void]]:
     fields.append(("end", "V3"))
     expected["end"] = np.void(b"\0\0\0")
     return np.dtype(fields), expected
-
-
-_REFERENCE_DOCUMENT, _REFERENCE_TEXT = _reference_layout()

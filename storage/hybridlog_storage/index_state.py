@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, NamedTuple
 
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
-from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database, ReadConcern
-from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.topic_places import SHARED, TopicPlace
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
@@ -49,7 +49,7 @@ class Indexed:
         state: Progress of the index.
         segments: Digest of each completely indexed segment, by its number as text.
         turn: Counts how often its documents were removed or rebuilt.
-        collections: Collections of its documents, as far as known.
+        topics: Topics of its documents, as far as known.
         has_list: Whether the list of its chunks may still exist although it is complete.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
@@ -59,7 +59,7 @@ class Indexed:
     state: State
     segments: Mapping[str, str]
     turn: int
-    collections: tuple[str, ...]
+    topics: tuple[str, ...]
     has_list: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
@@ -116,7 +116,7 @@ class IndexState:
                 index.get("state", "indexing"),
                 dict(index.get("segments") or {}),
                 int(index.get("turn", 0)),
-                tuple(sorted(collection_of(topic) for topic in topics)),
+                tuple(sorted(topics)),
                 bool(index.get("has_list")),
                 {name: document.get(name) for name in _SHOWN},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
@@ -245,7 +245,7 @@ class IndexState:
     def clear(
         self,
         key: object,
-        collections: Iterable[str],
+        places: Iterable[TopicPlace] | None = None,
         span: tuple[int, int] | None = None,
         but: Collection[int] = (),
     ) -> None:
@@ -253,27 +253,38 @@ class IndexState:
 
         Args:
             key: Key of the recording, or another value of `_meta.rec` in foreign documents.
-            collections: Collections that may hold its documents.
-            span: First and last log time of its documents, ns; None for any.
+            places: Places of topics that may have documents; None for all documents, which
+                takes a scan.
+            span: First and last log time of its documents at these places, ns; None for any.
             but: Segments whose documents stay.
         """
         asked: dict[str, object] = {"_meta.rec": key}
         if but:
             asked["_meta.ref.seg"] = {"$nin": sorted(but)}
-        if span is not None:
-            asked["_id"] = {"$gte": key_bound(span[0]), "$lt": key_bound(span[1] + 1)}
         if isinstance(key, str) and _KEY.fullmatch(key):
             self.forget_chunks(key)
-        for collection in collections:
-            self._db.delete(collection, asked)
+        if places is None:
+            for collection in self.document_collections():
+                self._db.delete(collection, asked)
+            return
+        bounds = (None, None) if span is None else (span[0], span[1] + 1)
+        shared: list[dict[str, object]] = []
+        for place in places:
+            chosen = {**asked, **place.documents(*bounds)}
+            if place.is_shared:
+                shared.append(chosen)
+            else:
+                self._db.delete(place.collection, chosen)
+        self._db.delete_each(SHARED, shared)
 
     def remove(self, key: str) -> None:
         """Remove a recording from the mirror, as the last step of its removal."""
         self._db.delete(RECORDINGS, {"_id": key})
 
-    def topic_collections(self) -> list[str]:
-        """Names of the collections of topics."""
-        return [c for c in self._db.list_collections() if not c.startswith(CATALOG_PREFIX)]
+    def document_collections(self) -> list[str]:
+        """Names of the collections that hold index documents."""
+        names = self._db.list_collections()
+        return [c for c in names if c == SHARED or not c.startswith(CATALOG_PREFIX)]
 
     def mark(self) -> Mapping[str, Any] | None:
         """The store that owns the database, and its place; None without an owner."""

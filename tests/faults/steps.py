@@ -330,6 +330,7 @@ def step_database(seam: Seam) -> None:
         setattr(Database, method, call)
 
     insert, delete, replace_all = Database.insert_raw, Database.delete, Database.replace_all
+    delete_each = Database.delete_each
 
     def half_of_insert(
         self: Database, collection: str, documents: Any, count: int, **_: Any
@@ -343,11 +344,15 @@ def step_database(seam: Seam) -> None:
         ids = [found["_id"] for found in self.find(collection, query, {"_id": 1})]
         delete(self, collection, {"_id": {"$in": ids[: len(ids) // 2]}})
 
+    def half_of_delete_each(self: Database, collection: str, filters: Sequence[Any]) -> None:
+        delete_each(self, collection, filters[: len(filters) // 2])
+
     def half_of_replace_all(self: Database, collection: str, documents: Sequence[Any]) -> None:
         replace_all(self, collection, documents[: len(documents) // 2])
 
     stepped("insert_raw", "insert", half_of_insert)
     stepped("delete", "delete", half_of_delete)
+    stepped("delete_each", "delete", half_of_delete_each)
     stepped("replace_all", "replace all", half_of_replace_all)
     for method in ("replace", "update"):
         stepped(method, method)

@@ -7,7 +7,7 @@ import json
 import re
 import shutil
 import sqlite3
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -24,11 +24,12 @@ from hybridlog.maintenance.opening import describe_now
 from hybridlog.tables.layout import PARTS, TABLES
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog import _crc as crc_of
-from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database
 from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, IndexState
 from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.topic_places import SHARED, TOPICS, TopicPlaces
 from tests.faults.logs import Content
 
 WHERE = 20
@@ -118,7 +119,7 @@ class Prepared:
         try:
             with Database.connect(uri) as database:
                 for collection, data in self.documents.items():
-                    if not collection.startswith(CATALOG_PREFIX):
+                    if collection in {SHARED, TOPICS} or not collection.startswith(CATALOG_PREFIX):
                         database.ensure_collection(collection)
                     count = len(bson.decode_all(data))
                     if count and collection != STORE:
@@ -340,13 +341,12 @@ def _check_database(store: hl.Store, database: Database) -> None:
         _check(index["segments"] == entry.digests, f"of {entry.label} other segments are indexed")
         wanted = bson.decode(bson.encode(entry.to_document()))
         _check(document == wanted, f"the mirror of {entry.label}: {document} not {wanted}")
-    expected: dict[str, dict[str, int]] = defaultdict(dict)
+    expected: dict[str, Counter[str]] = defaultdict(Counter)
     for key, entry in entries.items():
-        for topic in {c.topic for c in entry.channels}:
-            if entry.messages_of(topic):
-                expected[collection_of(topic)][key] = entry.messages_of(topic)
-    state = IndexState(database)
-    for collection in state.topic_collections():
+        for place in TopicPlaces(database).of({c.topic for c in entry.channels}).values():
+            if entry.messages_of(place.topic):
+                expected[place.collection][key] += entry.messages_of(place.topic)
+    for collection in IndexState(database).document_collections():
         pipeline = [{"$group": {"_id": "$_meta.rec", "n": {"$sum": 1}}}]
         found = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}
         _check(found == expected[collection], f"{collection} has {found}")

@@ -33,6 +33,7 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.query import Query
+from hybridlog_storage import topic_places
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.segment_writer import SegmentSettings
 
@@ -190,6 +191,13 @@ class World:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     place = tmp_path_factory.mktemp("engines")
+    with pytest.MonkeyPatch.context() as patch:
+        # One topic has a collection of its own, the others share one.
+        patch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+        yield from _world(place)
+
+
+def _world(place: Path) -> Iterator[World]:
     with hl.open(place / "store", create=True, require_database=True) as store:
         everything: list[Sent] = []
         ids = {}
@@ -209,6 +217,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
                 )  # fmt: skip
             assert len(everything) == 400 * (seed + 1)
         everything.sort(key=lambda m: (m.log_time, m.recording[:16], m.seq))
+        assert store.database is not None
+        assert store.database.count(topic_places.SHARED, {"_meta.seq": {"$gte": 0}}) > 400
         yield World(store, everything, ids)
 
 

@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, channel_entry
-from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database
 from hybridlog_storage.index_documents import key_bound
 from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, Indexed, IndexState
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.topic_places import TopicPlace
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 DIGESTS = {"0": "sha256:a", "1": "sha256:b", "10": "sha256:c"}
@@ -110,7 +111,7 @@ def test_a_state_comes_back(state: IndexState, step: str) -> None:
     assert found is not None
     assert (found.id, found.state, found.turn) == (ONE, step, 3)
     assert dict(found.segments) == {"0": "sha256:a"}
-    assert found.collections == tuple(sorted(map(collection_of, ("/ä b", "/b"))))
+    assert found.topics == ("/b", "/ä b")
     assert (found.has_list, dict(found.damage)) == (False, {})
     assert found.mirrors(entry)
     assert not found.is_whole(entry)
@@ -228,7 +229,7 @@ def test_what_another_program_has_put_there_is_not_whole(
     database.replace(RECORDINGS, {"_id": ONE[:16]}, {"_id": ONE[:16]})
     found = indexed(state)
     assert found is not None
-    assert (found.state, found.turn, found.collections) == ("indexing", 0, ())
+    assert (found.state, found.turn, found.topics) == ("indexing", 0, ())
     assert state.progress([ONE[:16]]) == {ONE[:16]: (0, {})}
     assert not found.is_whole(recording())
     assert not found.mirrors(recording())
@@ -321,7 +322,7 @@ def left(database: Database, of: str, name: str = "one") -> list[int]:
 def test_clearing_removes_the_documents_of_one_recording(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[:16], ["one", "not there"])
+    filled.clear(ONE[:16], [TopicPlace("/one"), TopicPlace("/not_there")])
     assert left(database, ONE) == []
     assert left(database, ONE, "two") == list(range(5))
     assert left(database, OTHER) == list(range(5))
@@ -331,15 +332,15 @@ def test_clearing_removes_the_documents_of_one_recording(
 def test_clearing_leaves_the_segments_that_are_to_stay(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[:16], ["one"], but=[1, 3])
+    filled.clear(ONE[:16], [TopicPlace("/one")], but=[1, 3])
     assert left(database, ONE) == [1, 3]
     assert left(database, OTHER) == list(range(5))
 
 
 def test_clearing_looks_at_some_times_only(filled: IndexState, database: Database) -> None:
-    filled.clear(ONE[:16], ["one"], (1, 3))
+    filled.clear(ONE[:16], [TopicPlace("/one")], (1, 3))
     assert left(database, ONE) == [0, 4]
-    filled.clear(ONE[:16], ["one"], (4, 2**63 - 1))
+    filled.clear(ONE[:16], [TopicPlace("/one")], (4, 2**63 - 1))
     assert left(database, ONE) == [0]
     assert left(database, OTHER) == list(range(5))
 
@@ -350,7 +351,7 @@ def test_documents_of_what_is_no_recording_can_be_cleared(
 ) -> None:
     made = {"_id": b"x" * 24, "_meta": {"rec": key}}
     database.replace("one", {"_id": made["_id"]}, made)
-    filled.clear(key, ["one"])
+    filled.clear(key)
     assert database.count("one", {"_id": made["_id"]}) == 0
     assert left(database, ONE) == left(database, OTHER) == list(range(5))
     assert len(filled.places(ONE[:16])) == 1
@@ -369,7 +370,7 @@ def test_a_recording_leaves_the_mirror_last_and_alone(
 def test_collections_of_topics_are_not_ours(filled: IndexState, database: Database) -> None:
     filled.put(recording(), "complete", turn=1)
     filled.claim({"id": "x"})
-    assert sorted(filled.topic_collections()) == ["one", "two"]
+    assert sorted(filled.document_collections()) == ["one", "two"]
     assert {RECORDINGS, CHUNKS, STORE} <= set(database.list_collections())
     assert all(name.startswith(CATALOG_PREFIX) for name in (RECORDINGS, CHUNKS, STORE))
 

@@ -12,6 +12,7 @@ import bson
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import ConnectionLostError
+from hybridlog_storage.index_documents import KEY_BYTES
 
 if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
@@ -41,7 +42,7 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
         for stream in _of_topic(planner, mongo, of_topic, reverse=question.reverse)
     ]
     # Keys are ordered by log time, recording and arrival, over all topics.
-    merged = heapq.merge(*streams, key=lambda pair: pair[1]["_id"], reverse=question.reverse)
+    merged = heapq.merge(*streams, key=_key, reverse=question.reverse)
     seen: Counter[str] = Counter()
     given = 0
     for topic, document in merged:
@@ -51,6 +52,11 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
         if (seen[topic] - 1) % question.every == 0:
             given += 1
             yield document
+
+
+def _key(pair: tuple[str, Document]) -> bytes:
+    """The key of a document, without the prefix that it has among those of other topics."""
+    return bytes(pair[1]["_id"][-KEY_BYTES:])
 
 
 def _of_topic(

@@ -14,10 +14,8 @@ from hybridlog.query.predicate.to_mongo import MongoFilter, to_mongo
 from hybridlog.query.predicate.tree import And
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import STAMP
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns
-from hybridlog_storage.index_documents import key_bound
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.index_columns import KeyColumns
+    from hybridlog_storage.topic_places import TopicPlace
 
 _QUESTION_S = 0.4e-3  # seconds for a query to MongoDB
 _LOOK_S = 0.7e-6  # seconds to examine a document
@@ -59,6 +58,7 @@ class Mongo:
         self._together = together
         self._undecided: dict[Part, int] = {}
         self._ahead: dict[Part, list[Outcomes]] = {}
+        self._placed: dict[str, TopicPlace] = {}
         self._is_known = False
         self._is_away = False
 
@@ -143,12 +143,12 @@ class Mongo:
             yield from self._ahead.pop(part)
             return
         own = self.filter_of(part).filter
-        collection = collection_of(part.topic)
-        for condition, _ in conditions(part):
-            yes = self._keys(part, collection, joined(condition, own))
+        place = self._place(part)
+        for condition, _ in conditions(part, place):
+            yes = self._keys(part, place, joined(condition, own))
             no: Iterator[KeyColumns] = iter(())
             if own:
-                no = self._keys(part, collection, joined(condition, {"$nor": [own]}))
+                no = self._keys(part, place, joined(condition, {"$nor": [own]}))
             yield from _merged(yes, no)
 
     def _look_ahead(self, part: Part) -> bool:
@@ -177,7 +177,7 @@ class Mongo:
     def _all_keys(self, parts: Sequence[Part], of: Callable[[MongoFilter], _Filter]) -> KeyColumns:
         """Keys of the documents of parts of one topic, by recording and in order."""
         asked = [query for (_, query), _ in self._questions(parts, of)]
-        found = self._index(parts).find_each(collection_of(parts[0].topic), asked, KEY)
+        found = self._index(parts).find_each(self._place(parts[0]).collection, asked, KEY)
         keys = key_columns(b"".join(found))
         self._counters.documents_read += len(keys)
         order = np.lexsort((keys.seq, keys.time, keys.recording))
@@ -196,23 +196,23 @@ class Mongo:
         times: dict[str, list[int]] = defaultdict(list)
         for task in tasks:
             times[task.key[0]] += [task.first, task.last + 1]
-        alike: dict[tuple[str, str], list[Part]] = defaultdict(list)
+        alike: dict[tuple[TopicPlace, str], list[Part]] = defaultdict(list)
         for part in parts:
             if part.recording.id in times:
                 own = self.filter_of(part).filter
-                alike[collection_of(part.topic), repr(own)].append(part)
+                alike[self._place(part), repr(own)].append(part)
         index = self._index([part for group in alike.values() for part in group])
         wanted = {task.key for task in tasks}
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-        for (collection, _), group in alike.items():
+        for (where, _), group in alike.items():
             spans = [(min(t), max(t)) for t in (times[part.recording.id] for part in group)]
             # More documents than those of the chunks may be found, but no others are used.
             asked = [
-                joined(_chosen(span, own), self.filter_of(own[0]).filter)
+                joined(_chosen(where, span, own), self.filter_of(own[0]).filter)
                 for span, own in self._ranges(group, spans)
             ]
             id_of = {int(part.recording.key, 16): part.recording.id for part in group}
-            for raw in index.find_each(collection, asked, REFERENCE):
+            for raw in index.find_each(where.collection, asked, REFERENCE):
                 reference = reference_columns(raw)
                 self._counters.documents_read += len(reference)
                 for (recording, *place), offsets in reference.by_chunk():
@@ -261,25 +261,25 @@ class Mongo:
         Parts that differ only in their recordings are asked about together, where nothing
         else lies between them.
         """
-        alike: dict[tuple[str, str, str, Span | None], list[tuple[Part, Span]]]
+        alike: dict[tuple[TopicPlace, str, str, Span | None], list[tuple[Part, Span]]]
         alike = defaultdict(list)
         found: list[tuple[tuple[str, _Filter], Span]] = []
         for part in parts:
-            collection, own = collection_of(part.topic), of(self.filter_of(part))
+            place, own = self._place(part), of(self.filter_of(part))
             if part.windows is not None:
-                for condition, span in conditions(part):
-                    found.append(((collection, joined(condition, own)), span))
+                for condition, span in conditions(part, place):
+                    found.append(((place.collection, joined(condition, own)), span))
                 continue
             span, bounds = _time_of(part)
             if span[0] < span[1]:
-                alike[collection, repr(own), part.clock, bounds].append((part, span))
-        for (collection, _, clock, bounds), group in alike.items():
+                alike[place, repr(own), part.clock, bounds].append((part, span))
+        for (place, _, clock, bounds), group in alike.items():
             own = of(self.filter_of(group[0][0]))
             for span, there in self._ranges([p for p, _ in group], [s for _, s in group], most):
-                condition = _chosen(span, there)
+                condition = _chosen(place, span, there)
                 if clock != "log" and bounds is not None:
                     condition.update(_on_clock(clock, bounds))
-                found.append(((collection, joined(condition, own)), span))
+                found.append(((place.collection, joined(condition, own)), span))
         return found
 
     def _ranges(
@@ -313,6 +313,17 @@ class Mongo:
             for group in groups
         ]
 
+    def _place(self, part: Part) -> TopicPlace:
+        """The place of the documents of a part; asked for all topics of the question at once.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+        """
+        if part.topic not in self._placed:
+            topics = {part.topic, *(other.topic for other in self._together())}
+            self._placed |= self._session.places("A predicate").of(topics)
+        return self._placed[part.topic]
+
     def _index(self, parts: Iterable[Part]) -> GuardedIndex:
         entries = list({part.recording.id: part.recording for part in parts}.values())
         if not self._is_known:
@@ -323,10 +334,12 @@ class Mongo:
             self._is_known = True
         return self._session.index_for("A predicate", entries)
 
-    def _keys(self, part: Part, collection: str, asked: _Filter) -> Iterator[KeyColumns]:
+    def _keys(self, part: Part, place: TopicPlace, asked: _Filter) -> Iterator[KeyColumns]:
         """Keys of the documents that a filter finds, in order; no batch is empty."""
-        index = self._index([part])
-        for raw in index.find_raw(collection, asked, KEY, sort=[("_id", 1)], batch_size=_BATCH):
+        found = self._index([part]).find_raw(
+            place.collection, asked, KEY, sort=[("_id", 1)], batch_size=_BATCH
+        )
+        for raw in found:
             keys = key_columns(raw)
             self._counters.documents_read += len(keys)
             if len(keys):
@@ -346,13 +359,13 @@ def joined(condition: _Filter, predicate: Mapping[str, object]) -> _Filter:
     return {"$and": [condition, dict(predicate)]} if predicate else condition
 
 
-def conditions(part: Part) -> Iterator[tuple[_Filter, Span]]:
-    """The recording and time of a part as filters, one for each window, in order."""
+def conditions(part: Part, place: TopicPlace) -> Iterator[tuple[_Filter, Span]]:
+    """The recording, topic and time of a part as filters, one for each window, in order."""
     recording: _Filter = {"_meta.rec": part.recording.key}
     if part.bounds is not None and part.clock != "log":
         recording.update(_on_clock(part.clock, part.bounds))
     for begin, end in part.log_windows.tolist():
-        yield {**recording, **_between((begin, end))}, (begin, end)
+        yield {**recording, **_between(place, (begin, end))}, (begin, end)
 
 
 def _on_clock(clock: str, bounds: Span) -> _Filter:
@@ -360,10 +373,10 @@ def _on_clock(clock: str, bounds: Span) -> _Filter:
     return {name: {"$gte": bounds[0], "$lt": bounds[1]}}
 
 
-def _chosen(span: Span, parts: Sequence[Part]) -> _Filter:
-    """The recordings of some parts, in a range of log time."""
+def _chosen(place: TopicPlace, span: Span, parts: Sequence[Part]) -> _Filter:
+    """The recordings of some parts of a topic, in a range of log time."""
     keys = sorted(part.recording.key for part in parts)
-    return {"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0], **_between(span)}
+    return {"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0], **_between(place, span)}
 
 
 def _time_of(part: Part) -> tuple[Span, Span | None]:
@@ -391,11 +404,11 @@ def _extent(entry: RecordingEntry) -> Span:
     return entry.span[0], entry.span[1] + 1
 
 
-def _between(span: Span) -> _Filter:
+def _between(place: TopicPlace, span: Span) -> _Filter:
     begin, end = span
     if begin <= 0 and end >= TIME_LIMIT - 1:
-        return {}
-    return {"_id": {"$gte": key_bound(begin), "$lt": key_bound(end)}}
+        return place.documents()
+    return place.documents(begin, end)
 
 
 def _keys_in(keys: KeyColumns, part: Part) -> KeyColumns:

@@ -1,0 +1,269 @@
+"""A store of more topics than MongoDB has collections for: the same answers, all maintenance."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pymongo
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog_storage import topic_places
+from hybridlog_storage.database import Database
+from hybridlog_storage.topic_places import OWN_COLLECTIONS, SHARED, TOPICS
+from tests.many_topics import BASE, handles, mongod_of, topic, write_log
+
+FEW = 12
+"""Topics of a small log, of which three have collections of their own."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_collections() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(topic_places, "OWN_COLLECTIONS", 3)
+        yield
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    place = tmp_path_factory.mktemp("logs")
+    return {
+        "one": write_log(place / "one.mcap", FEW),
+        "two": write_log(place / "two.mcap", FEW, 4, start=BASE + 10**9),
+    }
+
+
+@pytest.fixture
+def store(tmp_path: Path, logs: dict[str, Path]) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        for log in logs.values():
+            opened.record(log)
+        yield opened
+
+
+@pytest.fixture
+def only_mongo(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Returns a function after which MongoDB alone answers questions with a predicate."""
+
+    def forbid() -> None:
+        for engine in (PayloadScan, TablesEngine):
+            monkeypatch.setattr(engine, "cost", lambda *_: None)
+
+    return forbid
+
+
+def database_of(store: hl.Store) -> Database:
+    return store.database_for("this test")
+
+
+def documents(store: hl.Store) -> Counter[str]:
+    """Documents by collection and recording."""
+    found: Counter[str] = Counter()
+    labels = {entry.key: entry.label for entry in store.recordings()}
+    for name in database_of(store).list_collections():
+        if name == SHARED or not name.startswith("hybridlog."):
+            for document in database_of(store).find(name, {}, {"_meta.rec": 1}):
+                key = document["_meta"]["rec"]
+                found[f"{'shared' if name == SHARED else 'own'} {labels.get(key, key)}"] += 1
+    return found
+
+
+ALL = {"own one": 15, "shared one": 45, "own two": 12, "shared two": 36}
+
+
+def test_questions_are_answered_from_both_kinds_of_collections(
+    store: hl.Store, only_mongo: Callable[[], None]
+) -> None:
+    assert documents(store) == ALL
+    only_mongo()
+    everything = store.all_topics()
+    assert everything.where("data >= 3").count() == 3 * FEW
+    for number in (0, 2, 3, FEW - 1):
+        one = store.topic(topic(number)).where("data >= 2")
+        assert one.count() == 5
+        assert [m.fields["data"] for m in one] == [n + number / 65536 for n in (2, 3, 4, 2, 3)]
+        assert [d["data"] for d in one.documents()] == [m.fields["data"] for m in one]
+        assert one.in_recording("two").count() == 2
+        assert one.between(BASE, BASE + 10**9).count() == 3
+    merged = list(everything.where("data >= 0").documents())
+    assert [d["_meta"]["t"] for d in merged] == [m.log_time_ns for m in everything]
+    assert {d["_meta"]["topic"] for d in merged} == set(store.topics())
+
+
+def test_reindex_and_verify(store: hl.Store, only_mongo: Callable[[], None]) -> None:
+    assert store.verify().findings == []
+    database = database_of(store)
+    stray = {"_id": b"x" * 32, "_meta": {"rec": "f" * 16, "topic": topic(5)}}
+    database.replace(SHARED, {"_id": stray["_id"]}, stray)
+    key = store.entry("one").key
+    asked = {"_meta.rec": key, "_meta.topic": topic(7)}
+    assert database.delete(SHARED, asked) == 5
+    findings = store.verify().findings
+    assert {finding.recording for finding in findings} == {"one"}
+    assert any("hybridlog.shared" in finding.place for finding in findings)
+    store.reindex()
+    assert documents(store) == ALL
+    assert store.verify().findings == []
+    only_mongo()
+    assert store.all_topics().where("data >= 3").count() == 3 * FEW
+
+
+def test_a_changed_document_of_a_shared_collection_is_found(store: hl.Store) -> None:
+    key = store.entry("two").key
+    asked = {"_meta.rec": key, "_meta.topic": topic(9), "_meta.seq": 9}
+    assert database_of(store).update(SHARED, asked, {"$set": {"data": 7.0}}) == 1
+    (finding,) = store.verify(["two"]).findings
+    assert "1 index documents are missing or differ" in finding.problem
+    assert store.verify(["one"]).findings == []
+
+
+def test_a_removed_recording_leaves_the_others(store: hl.Store) -> None:
+    store.remove("one")
+    assert documents(store) == {"own two": 12, "shared two": 36}
+    assert store.verify().findings == []
+
+
+def test_a_lost_database_is_made_again(store: hl.Store, only_mongo: Callable[[], None]) -> None:
+    database_of(store).drop_all()
+    path = store.directory.path
+    store.close()
+    with hl.open(path, require_database=True) as again:
+        assert documents(again) == ALL
+        only_mongo()
+        assert again.topic(topic(FEW - 1)).where("data >= 3").count() == 3
+
+
+def test_an_interrupted_recording_is_indexed_where_it_was_begun(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is killed when its topics are listed, but no document is written."""
+    real = Database.insert_raw
+
+    def killed(self: Database, collection: str, *args: Any, **options: Any) -> int:
+        if collection == TOPICS:
+            return real(self, collection, *args, **options)
+        raise KeyboardInterrupt
+
+    log = write_log(tmp_path / "three.mcap", 4, start=BASE + 10**10, prefix="/new")
+    monkeypatch.setattr(Database, "insert_raw", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.record(log)
+    monkeypatch.setattr(Database, "insert_raw", real)
+    assert database_of(store).count(TOPICS, {"topic": {"$regex": "^/new"}}) == 4
+    store.record(log)
+    assert documents(store) == {**ALL, "shared three": 20}
+    assert store.verify().findings == []
+
+
+def test_an_index_on_a_field_of_a_shared_collection(
+    store: hl.Store, only_mongo: Callable[[], None]
+) -> None:
+    own, mine, other = topic(0), topic(5), topic(6)
+    for name in (own, mine):
+        store.add_index(name, "data")
+    assert [(one.topic, one.fields) for one in store.indexes()] == [
+        (own, ("data",)),
+        (mine, ("data",)),
+    ]
+    assert store.indexes(other) == []
+    database = database_of(store)
+    question = {"_meta.topic": mine, "data": {"$gt": 2.5}}
+    with pymongo.MongoClient[dict[str, Any]](database.address) as client:
+        found = client[database.name][SHARED].find(question)
+        assert "IXSCAN" in str(found.explain()["queryPlanner"]["winningPlan"])
+    store.reindex()
+    assert len(store.indexes()) == 2
+    only_mongo()
+    assert store.topic(mine).where("data >= 3").count() == 3
+    assert store.topic(other).where("data >= 3").count() == 3
+    assert store.remove_index(other, "data") == 0
+    assert store.remove_index(mine, "data") == 1
+    assert [one.topic for one in store.indexes()] == [own]
+
+
+# Many.
+
+
+def commands_of(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Counts the inserts and the questions sent to MongoDB, by method."""
+    sent: Counter[str] = Counter()
+    for method in ("_insert_batch", "ensure_collection", "find_raw", "find", "aggregate", "count"):
+        real = getattr(Database, method)
+
+        def counted(
+            self: Database, *args: Any, of: Any = real, name: str = method, **options: Any
+        ) -> Any:
+            sent[name] += 1
+            return of(self, *args, **options)
+
+        monkeypatch.setattr(Database, method, counted)
+    return sent
+
+
+def test_a_store_of_a_thousand_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, only_mongo: Callable[[], None]
+) -> None:
+    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 100)
+    log = write_log(tmp_path / "log.mcap", 1000)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        before = handles(store)
+        sent = commands_of(monkeypatch)
+        store.record(log)
+        # One for each collection in each parcel, the chunks, the topics.
+        assert sent["_insert_batch"] < 300
+        assert sent["ensure_collection"] == 102
+        assert handles(store) - before < 130
+        assert database_of(store).count(SHARED, {"_meta.seq": {"$gte": 0}}) == 900 * 5
+        only_mongo()
+        sent.clear()
+        assert store.all_topics().where("data >= 3").count() == 2000
+        # A hundred questions a command.
+        assert sent["aggregate"] <= 12
+        assert sent["find"] <= 10
+        sent.clear()
+        assert store.topic(topic(999)).where("data >= 3").count() == 2
+        assert sent.total() <= 8
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("topics", "limit"), [(3000, 1024), (10_000, None)])
+def test_thousands_of_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topics: int, limit: int | None
+) -> None:
+    """Recorded by a command, as a user does it; with a hard limit of handles."""
+    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", OWN_COLLECTIONS)
+    log = write_log(tmp_path / "log.mcap", topics)
+
+    def limited() -> None:
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
+
+    command = [sys.executable, "-m", "hybridlog", "record", log, "--store", tmp_path / "store"]
+    subprocess.run(
+        command,
+        check=True,
+        preexec_fn=limited,
+        env={**os.environ, "HYBRIDLOG_MONGOD_LINGER_S": "60"},
+        timeout=600,
+    )
+    with hl.open(tmp_path / "store", require_database=True) as store:
+        assert handles(store) < 1000
+        memory = (mongod_of(store) / "status").read_text().partition("VmHWM:")[2].split()[0]
+        assert int(memory) < 400_000  # kB
+        if limit is not None:
+            said = (mongod_of(store) / "limits").read_text()
+            assert f"Max open files            {limit}" in said
+        assert store.all_topics().count() == 5 * topics
+        assert store.topic(topic(topics - 1)).where("data >= 3").count() == 2
+        assert database_of(store).count(SHARED, {"_meta.seq": {"$gte": 0}}) == 5 * (
+            topics - OWN_COLLECTIONS
+        )
