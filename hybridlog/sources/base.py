@@ -31,8 +31,8 @@ BATCH_BYTES = 2 << 20
 BATCH_MESSAGES = 16384
 """Most messages of one batch."""
 
-MAX_CHUNK = 1 << 30
-"""Largest chunk or payload that a source unpacks, in uncompressed bytes."""
+MAX_CHUNK = 4 << 30
+"""Largest chunk that a source unpacks, in uncompressed bytes; large ones in parts."""
 
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 

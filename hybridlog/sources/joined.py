@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zstandard
 
-from hybridlog.sources.base import BATCH_BYTES, MAX_CHUNK, Damage, Source, regroup
+from hybridlog.sources.base import BATCH_BYTES, Damage, Source, regroup
 from hybridlog.sources.spool import ZSTD_MAGIC, spool
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -264,15 +264,15 @@ def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> byt
     """The content of a zstd frame, None if it is damaged or too large."""
     try:
         size = zstandard.frame_content_size(payload)
-        if size > MAX_CHUNK:
+        if size > MAX_PAYLOAD:
             return None
         if size >= 0:
             return unpacker.decompress(payload)
         with unpacker.stream_reader(payload) as reader:
-            data = reader.read(MAX_CHUNK + 1)
+            data = reader.read(MAX_PAYLOAD + 1)
     except zstandard.ZstdError:
         return None
-    return data if len(data) <= MAX_CHUNK else None
+    return data if len(data) <= MAX_PAYLOAD else None
 
 
 def _without_path(error: SourceError, path: Path) -> str:

@@ -27,7 +27,6 @@ from hybridlog_storage.mcap_scan import (
     Loose,
     ScanDamage,
     ScannedChunk,
-    parse_content,
     read_summary,
     scan,
 )
@@ -57,6 +56,7 @@ class _Open:
         reason: Description of the damage.
         chunk: A whole chunk is lost, so the message indexes behind it list its messages.
         counted: Messages listed by the message indexes behind it, None before the first.
+        got: Messages of the chunk that were read.
     """
 
     offset: int
@@ -64,6 +64,7 @@ class _Open:
     reason: str
     chunk: bool
     counted: int | None = None
+    got: int = 0
 
 
 class McapSource(Source):
@@ -178,22 +179,25 @@ class McapSource(Source):
             self._indexed.add(item.channel_id)
 
     def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
+        before = self._given
         try:
-            content = parse_content(chunk.content_bytes())
+            for content in chunk.contents():
+                yield from self._content(content, chunk.offset)
         except SegmentError as error:
             reason = f"a chunk is damaged: {error}"
-            self._pending = _Open(chunk.offset, chunk.length, reason, chunk=True)
-            return
-        yield from self._content(content, chunk.offset)
+            got = self._given - before
+            if got:
+                reason += f"; {got} messages before that were read"
+            self._pending = _Open(chunk.offset, chunk.length, reason, chunk=True, got=got)
 
     def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
         reason = item.reason
         if item.opcode == Opcode.DATA_END and (self.damage or self._uncounted):
             return  # the checksum of all data adds nothing to known damage
         if item.torn is not None:
-            content = item.torn.content()
             before = self._given
-            yield from self._content(content, item.offset)
+            for content in item.torn.contents():
+                yield from self._content(content, item.offset)
             reason += f"; {self._given - before} messages of its beginning were read"
         if item.length is not None and item.offset + item.length >= self.size_bytes:
             self._end_is_noted = True
@@ -267,7 +271,8 @@ class McapSource(Source):
         if pending.counted is None and self.message_count is not None:
             self._uncounted.append(pending)  # the totals at the end may show it
         else:
-            self._note_open(pending, pending.counted)
+            counted = pending.counted
+            self._note_open(pending, None if counted is None else max(counted - pending.got, 0))
 
     def _note_open(self, pending: _Open, lost: int | None) -> None:
         self._note(pending.offset, pending.length, pending.reason, lost)

@@ -15,12 +15,14 @@ from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from io import BytesIO
+from tempfile import SpooledTemporaryFile
+from typing import IO, TYPE_CHECKING, BinaryIO, Protocol
 
 import lz4.frame
 import numpy as np
 
-from hybridlog.sources.base import MAX_CHUNK, Damage, Source, cannot_open, regroup
+from hybridlog.sources.base import Damage, Source, cannot_open, regroup
 from hybridlog.sources.rosbag1_records import (
     MAX_HEADER,
     OP_BAG_HEADER,
@@ -37,8 +39,10 @@ from hybridlog.sources.rosbag1_records import (
     parse_fields,
     parse_header,
 )
+from hybridlog_storage.compression import is_implausible
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.mcap_content import MIN_RECORDS
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -49,6 +53,12 @@ MAGIC = b"#ROSBAG V2.0\n"
 _WINDOW = 4 << 20
 _SEARCH = 1 << 20
 _OVERLAP = 8 << 10
+_MAX_DEFINITION = 64 << 20
+_AT_ONCE = 64 << 20  # bytes of an unpacked chunk in memory; larger ones go to a file
+_UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
+_MOST = 2 << 30  # and whatever it says
+_STEP = 64 << 10  # bytes that are unpacked at once
+_STREAMS = 1000  # compressed streams in a chunk, and as many bytes for each further one
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +128,39 @@ class _Unpacked:
     """The result of unpacking a compressed chunk.
 
     Attributes:
-        data: The bytes; an intact prefix if `state` is `short`, empty if `broken`.
+        file: The bytes, in memory up to `_AT_ONCE`; an intact prefix if `state` is `short`,
+            empty if `broken`.
         used: Compressed bytes of the stream.
         state: `whole`, `short` (the stream continues past its bytes) or `broken`.
         reason: Description of the damage of a broken one.
     """
 
-    data: bytes
+    file: IO[bytes]
     used: int
     state: str
     reason: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return self.file.seek(0, 2)
+
+    def space(self) -> _Space:
+        """The bytes as a space with records."""
+        size = self.size
+        self.file.seek(0)
+        if size > _AT_ONCE:
+            return _Space(self._read, size, packed=True, cut=self.state == "short")
+        data = self.file.read()
+
+        def read(pos: int, count: int) -> bytes:
+            return data if pos == 0 and count >= size else data[pos : pos + count]
+
+        return _Space(read, size, packed=True, cut=self.state == "short")
+
+    def _read(self, pos: int, count: int) -> bytes:
+        self.file.seek(pos)
+        return self.file.read(count)
 
 
 class Rosbag1Source(Source):
@@ -248,7 +281,7 @@ class Rosbag1Source(Source):
 
     def _keep_definition(self, record: _Record) -> None:
         """Store a connection of the index: its definition in a chunk may be lost."""
-        if record.end - record.start > MAX_CHUNK:
+        if record.end - record.start > _MAX_DEFINITION:
             return
         data = self._read(record.start, record.end - record.start)
         raw = record.raw + data
@@ -362,7 +395,13 @@ class Rosbag1Source(Source):
         if compression not in _UNPACKERS:
             yield from self._plain_chunk(place, record, compression, size)
             return
-        unpacked = self._unpack(record, compression, size)
+        with SpooledTemporaryFile(max_size=_AT_ONCE) as file:
+            yield from self._packed_chunk(place, record, self._unpack(record, file), size)
+
+    def _packed_chunk(
+        self, place: _Place, record: _Record, unpacked: _Unpacked, size: int
+    ) -> Iterator[Batch]:
+        """Read an unpacked chunk."""
         if unpacked.state == "broken":
             place.blame(unpacked.reason)
             self._after_broken_chunk(record)
@@ -377,11 +416,15 @@ class Rosbag1Source(Source):
                 f"the chunk's record says {record.end - record.start} compressed bytes, "
                 f"there are {unpacked.used}"
             )
-        if unpacked.state == "whole" and len(unpacked.data) != size:
-            place.reasons.append(
-                f"the chunk's header says {size} bytes, there are {len(unpacked.data)}"
-            )
-        yield from self._packed_messages(unpacked)
+        if unpacked.state == "whole" and unpacked.size != size:
+            place.reasons.append(f"the chunk's header says {size} bytes, there are {unpacked.size}")
+        space = unpacked.space()
+        for batch in self._run(space, 0, space.size):
+            if place.got > MIN_RECORDS + unpacked.used:
+                place.got -= len(batch)
+                place.blame("the chunk holds too many messages for its size")
+                break
+            yield batch
         self._pos = place.end = end
 
     def _plain_chunk(
@@ -402,30 +445,23 @@ class Rosbag1Source(Source):
             )
         yield from self._run(self._space, record.start, record.end)
 
-    def _packed_messages(self, unpacked: _Unpacked) -> Iterator[Batch]:
-        data = unpacked.data
-
-        def read(pos: int, count: int) -> bytes:
-            return data if pos == 0 and count >= len(data) else data[pos : pos + count]
-
-        space = _Space(read, len(data), packed=True, cut=unpacked.state == "short")
-        yield from self._run(space, 0, len(data))
-
-    def _unpack(self, record: _Record, compression: bytes, size: int) -> _Unpacked:
+    def _unpack(self, record: _Record, file: IO[bytes]) -> _Unpacked:
         """Unpack a chunk; read further if its record states too few bytes."""
         length = min(record.end, self.size_bytes) - record.start
-        if length > MAX_CHUNK:
-            return _Unpacked(b"", length, "broken", "the chunk is too large to be one")
-        unpack = _UNPACKERS[compression]
-        unpacked = unpack(self._read(record.start, length), size)
+        if length > MAX_PAYLOAD:
+            return _broken(length, "the chunk is too large to be one")
+        unpack = _UNPACKERS[record.header.raw(record.raw, b"compression")]
+        size = record.header.u32(record.raw, b"size")
+        unpacked = unpack(self._read(record.start, length), size, file)
         rest = self.size_bytes - record.end
         if unpacked.state == "short" and rest > 0:
             # In a valid bag index records follow, so a little more is enough.
             more = min(length + max(length, 1 << 20), self.size_bytes - record.start)
-            unpacked = unpack(self._read(record.start, more), size)
+            file.seek(0)
+            file.truncate()
+            unpacked = unpack(self._read(record.start, more), size, file)
             if unpacked.state == "short":
-                reason = "the chunk's compressed bytes end too early"
-                return _Unpacked(b"", length, "broken", reason)
+                return _broken(length, "the chunk's compressed bytes end too early")
         return unpacked
 
     def _after_broken_chunk(self, record: _Record) -> None:
@@ -453,7 +489,8 @@ class Rosbag1Source(Source):
         need = 0
         while pos < space.size and (soft_end is None or pos < soft_end):
             stop = space.size if soft_end is None else soft_end
-            count = space.size if space.packed else max(min(_WINDOW, stop - pos), need)
+            at_once = space.packed and space.size <= _AT_ONCE
+            count = space.size if at_once else max(min(_WINDOW, stop - pos), need)
             data = space.read(pos, count)
             if not data:
                 break
@@ -501,14 +538,14 @@ class Rosbag1Source(Source):
 
     def _need(self, space: _Space, run: Run, end: int, soft_end: int | None) -> int:
         """Bytes to read for the incomplete record at `end`, 0 if it cannot be complete."""
-        if end + run.need > space.size or run.need > MAX_CHUNK:
+        if end + run.need > space.size or run.need > MAX_PAYLOAD:
             return 0
         if soft_end is None or end + run.need <= soft_end:
             return run.need
         # It crosses the end of its chunk: the chunk's length or its own is wrong. The right
         # one is followed by another record.
         record = self._record(end)
-        if record is None or record.end - end > MAX_CHUNK or not _is_sound(space, 0, record.end):
+        if record is None or record.end - end > MAX_PAYLOAD or not _is_sound(space, 0, record.end):
             return 0
         return record.end - end
 
@@ -713,46 +750,71 @@ class _Decompressor(Protocol):
     def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
 
 
-def _unpack_with(
-    make: Callable[[], _Decompressor], data: bytes, magic: bytes, size: int
-) -> _Unpacked:
-    """Unpack the streams at the start of `data`, at most `MAX_CHUNK` bytes."""
-    parts: list[bytes] = []
-    total = 0
-    rest = data
-    step = min(max(size, 1 << 16), MAX_CHUNK) + 1
-    try:
-        while rest.startswith(magic):
-            stream = make()
+class _Streams:
+    """The compressed streams at the start of some bytes.
+
+    Attributes:
+        count: Number of streams found.
+        used: Bytes of them.
+        is_short: Whether the last one continues past the bytes.
+    """
+
+    def __init__(self, make: Callable[[], _Decompressor], data: bytes, magic: bytes) -> None:
+        self.count = self.used = 0
+        self.is_short = False
+        self._make = make
+        self._data = data
+        self._magic = magic
+
+    def parts(self) -> Iterator[bytes]:
+        """Yield the unpacked bytes in small parts.
+
+        Raises:
+            ValueError: There are too many streams; or another error of the format.
+        """
+        size = len(self._data)
+        while self._data.startswith(self._magic, self.used):
+            self.count += 1
+            if self.count > _STREAMS + size // _STREAMS:
+                raise ValueError("it consists of too many streams")
+            stream = self._make()
             while not stream.eof:
-                part = stream.decompress(rest, step)
-                parts.append(part)
-                total += len(part)
-                if total > MAX_CHUNK:
-                    reason = f"the chunk unpacks to more than {MAX_CHUNK >> 20} MiB"
-                    return _Unpacked(b"", len(data), "broken", reason)
-                if not stream.eof and (stream.needs_input or not part):
-                    return _Unpacked(b"".join(parts), len(data), "short")
-                rest = b""
-            rest = stream.unused_data or b""
+                taken = self._data[self.used : self.used + _STEP] if stream.needs_input else b""
+                if stream.needs_input and not taken:
+                    self.is_short = True
+                    return
+                yield stream.decompress(taken, _STEP)
+                self.used += len(taken)
+            self.used -= len(stream.unused_data or b"")
+
+
+def _unpack_with(
+    make: Callable[[], _Decompressor], magic: bytes, data: bytes, size: int, file: IO[bytes]
+) -> _Unpacked:
+    """Unpack the streams at the start of `data`, at most `size` or `_UNSTATED` bytes."""
+    most = min(max(size, _UNSTATED), _MOST)
+    streams = _Streams(make, data, magic)
+    total = 0
+    try:
+        for part in streams.parts():
+            total += file.write(part)
+            if total > most:
+                raise ValueError(f"its header says {size} bytes, it has more than {most}")
+            if is_implausible(total, len(data)):
+                raise ValueError(f"its {len(data)} bytes become more than {total}")
     except (OSError, EOFError, RuntimeError, ValueError) as error:
-        return _Unpacked(b"", len(data), "broken", f"the chunk cannot be unpacked: {error}")
-    if not parts and data:
-        if magic.startswith(data):
-            return _Unpacked(b"", len(data), "short")
-        return _Unpacked(b"", 0, "broken", "the chunk cannot be unpacked: it has another format")
-    return _Unpacked(b"".join(parts), len(data) - len(rest), "whole")
+        return _broken(len(data), f"the chunk cannot be unpacked: {error}")
+    if not streams.count and data and not magic.startswith(data):
+        return _broken(0, "the chunk cannot be unpacked: it has another format")
+    is_short = streams.is_short or not streams.count
+    return _Unpacked(file, streams.used, "short" if is_short else "whole")
 
 
-def _unpack_bz2(data: bytes, size: int) -> _Unpacked:
-    return _unpack_with(bz2.BZ2Decompressor, data, b"BZh", size)
+def _broken(used: int, reason: str) -> _Unpacked:
+    return _Unpacked(BytesIO(), used, "broken", reason)
 
 
-def _unpack_lz4(data: bytes, size: int) -> _Unpacked:
-    return _unpack_with(lz4.frame.LZ4FrameDecompressor, data, b"\x04\x22\x4d\x18", size)
-
-
-_UNPACKERS: dict[bytes, Callable[[bytes, int], _Unpacked]] = {
-    b"bz2": _unpack_bz2,
-    b"lz4": _unpack_lz4,
+_UNPACKERS: dict[bytes, Callable[[bytes, int, IO[bytes]], _Unpacked]] = {
+    b"bz2": partial(_unpack_with, bz2.BZ2Decompressor, b"BZh"),
+    b"lz4": partial(_unpack_with, lz4.frame.LZ4FrameDecompressor, b"\x04\x22\x4d\x18"),
 }

@@ -18,7 +18,6 @@ import numpy as np
 from hybridlog.sources.base import (
     BATCH_BYTES,
     BATCH_MESSAGES,
-    MAX_CHUNK,
     Damage,
     Source,
     cannot_open,
@@ -27,7 +26,7 @@ from hybridlog.sources.rosbag2_metadata import parse_metadata
 from hybridlog.sources.spool import copy_start
 from hybridlog.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -420,7 +419,7 @@ def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
 
 def _guarded(db: sqlite3.Connection) -> sqlite3.Connection:
     db.text_factory = lambda data: data.decode(errors="replace")
-    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
+    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_PAYLOAD)
     db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA cell_size_check = ON")
     db.execute("PRAGMA query_only = ON")

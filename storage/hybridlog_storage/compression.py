@@ -1,13 +1,14 @@
 """Compresses chunks that gain from it, and decompresses untrusted data.
 
-A size claimed by a file is compared with a limit, and with the maximum ratio of its
-codec, before memory is allocated.
+A size claimed by a file is compared with a limit, and with the ratio of its codec, before
+memory is allocated. Above `MAX_FREE` bytes, content may be `MAX_RATIO` times as large as its
+compressed form; `Compressor` keeps to that, too.
 """
 
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import lz4.frame
 import zstandard
@@ -16,11 +17,18 @@ from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from typing import IO, BinaryIO
 
     from hybridlog_storage.messages import Buffer
 
 MAX_UNCOMPRESSED = 1 << 30
 """Default limit of a chunk's uncompressed size, bytes."""
+
+MAX_FREE = 256 << 20
+"""Uncompressed size up to which any ratio is believed, bytes."""
+
+MAX_RATIO = 1000
+"""Largest believed ratio above that."""
 
 # Maximum ratio of each codec: an RLE block of zstd spends 4 bytes on 128 KiB, a run of
 # lz4 one byte on 255. A larger claim is false.
@@ -61,51 +69,99 @@ def decompress(
         if len(data) != uncompressed_size:
             raise SegmentError(f"it holds {len(data)} bytes, not {uncompressed_size} as it claims")
         return memoryview(data)
-    if compression not in _MAX_RATIO:
+    check_size(compression, uncompressed_size, len(data))
+    if is_implausible(uncompressed_size, len(data)):
         raise SegmentError(
-            f"its compression {compression[:32]!r} is not known; rewrite the file with zstd"
-        )
-    if uncompressed_size > len(data) * _MAX_RATIO[compression] + _RATIO_SLACK:
-        raise SegmentError(
-            f"it claims {uncompressed_size} bytes uncompressed, which {len(data)} bytes "
-            f"of {compression} cannot hold"
+            f"it claims {uncompressed_size} bytes uncompressed, more than {MAX_RATIO} times "
+            f"its {len(data)} bytes of {compression}"
         )
     try:
         if compression == "zstd":
             return _unpack_zstd(data, uncompressed_size)
         return _unpack_lz4(data, uncompressed_size)
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+    except MemoryError as error:
+        raise SegmentError(f"there is no memory for its {uncompressed_size} bytes") from error
+    except (zstandard.ZstdError, RuntimeError) as error:
         raise SegmentError(f"its {compression} data is damaged ({error})") from error
 
 
-def decompress_prefix(
-    compression: str, data: Buffer, uncompressed_size: int, *, limit: int = MAX_UNCOMPRESSED
-) -> bytes | memoryview:
-    """Decompress as much as possible of data whose end is missing or damaged.
+def check_size(compression: str, uncompressed_size: int, size: int) -> None:
+    """Raise if compressed data cannot hold what it claims to hold.
+
+    Raises:
+        SegmentError: The ratio is above the maximum of the codec, or the codec is unknown.
+    """
+    if compression not in _MAX_RATIO:
+        raise SegmentError(
+            f"its compression {compression[:32]!r} is not known; rewrite the file with zstd"
+        )
+    if uncompressed_size > size * _MAX_RATIO[compression] + _RATIO_SLACK:
+        raise SegmentError(
+            f"it claims {uncompressed_size} bytes uncompressed, which {size} bytes "
+            f"of {compression} cannot hold"
+        )
+
+
+def is_implausible(uncompressed_size: int, size: int) -> bool:
+    """True if this much content of so few compressed bytes is not believed."""
+    return uncompressed_size > MAX_FREE and uncompressed_size > size * MAX_RATIO
+
+
+class FilePart:
+    """A part of a file that is read piece by piece.
+
+    Args:
+        file: Seekable; its position is moved.
+        start: First byte.
+        size: Number of bytes, all of them in the file.
+    """
+
+    def __init__(self, file: BinaryIO, start: int, size: int) -> None:
+        self._file = file
+        self._start = start
+        self._size = size
+        self._at = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def again(self) -> FilePart:
+        """The same part from its start."""
+        return FilePart(self._file, self._start, self._size)
+
+    def read(self, size: int = -1) -> bytes:
+        """The next bytes: at most `size`, all without it; none at the end."""
+        left = self._size - self._at
+        self._file.seek(self._start + self._at)
+        data = self._file.read(left if size < 0 else min(size, left))
+        self._at += len(data)
+        return data
+
+
+def decompress_pieces(compression: str, data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
+    """Decompress piece by piece, in memory independent of the size.
 
     Args:
         compression: MCAP name of the codec.
-        data: The beginning of the compressed data.
-        uncompressed_size: Bytes of the whole output.
-        limit: Most bytes of output.
+        data: The compressed data.
 
-    Returns:
-        The beginning of the content, possibly empty.
+    Yields:
+        Pieces of up to 256 KiB.
+
+    Raises:
+        SegmentError: The data is damaged; the pieces before are intact. A missing end is
+            no error.
     """
-    most = min(uncompressed_size, limit)
+    if isinstance(data, FilePart):
+        data = data.again()
     if compression == "":
-        return memoryview(data)[:most]
-    pieces = {"zstd": _zstd_pieces, "lz4": _lz4_pieces}.get(compression)
-    out = bytearray()
-    if pieces is not None:
-        try:
-            for piece in pieces(data):
-                out += piece
-                if len(out) >= most:
-                    break
-        except (zstandard.ZstdError, RuntimeError, MemoryError):
-            pass  # the pieces before it are intact
-    return bytes(out[:most])
+        yield from _slices(data)
+        return
+    check_size(compression, 0, len(data))
+    try:
+        yield from _zstd_pieces(data) if compression == "zstd" else _lz4_pieces(data)
+    except (zstandard.ZstdError, RuntimeError) as error:
+        raise SegmentError(f"its {compression} data is damaged ({error})") from error
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:
@@ -135,31 +191,50 @@ def _unpack_zstd(data: Buffer, size: int) -> bytes | memoryview:
 
 
 def _unpack_lz4(data: Buffer, size: int) -> bytes:
+    frame = lz4.frame.LZ4FrameDecompressor()
     # One byte more than expected shows data that goes on.
-    out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    out: bytes = frame.decompress(data, max_length=size + 1)
+    if len(out) < size and frame.eof and frame.unused_data:
+        pieces = _lz4_pieces(frame.unused_data)  # several frames, one after the other
+        while len(out) <= size and (piece := next(pieces, b"")):
+            out += piece
     if len(out) != size:
         more = "more" if len(out) > size else "only " + str(len(out))
         raise SegmentError(f"it decompresses to {more} bytes, not {size} as it claims")
     return out
 
 
-def _zstd_pieces(data: Buffer) -> Iterator[bytes]:
-    reader = _decompressor().stream_reader(memoryview(data), read_across_frames=True)
+def _slices(data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
+    if isinstance(data, FilePart):
+        while piece := data.read(_PIECE):
+            yield piece
+    else:
+        view = memoryview(data)
+        yield from (view[at : at + _PIECE] for at in range(0, len(view), _PIECE))
+
+
+def _zstd_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
+    # Of a file, a reader needs only `read`.
+    source = cast("IO[bytes]", data) if isinstance(data, FilePart) else memoryview(data)
+    reader = _decompressor().stream_reader(source, read_across_frames=True, closefd=False)
     while piece := reader.read(_PIECE):
         yield piece
 
 
-def _lz4_pieces(data: Buffer) -> Iterator[bytes]:
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    view = memoryview(data)
-    for at in range(0, len(view), _PIECE):
-        piece: bytes = decompressor.decompress(view[at : at + _PIECE], max_length=_PIECE)
-        yield piece
-        while not decompressor.eof and not decompressor.needs_input:
-            piece = decompressor.decompress(b"", max_length=_PIECE)
-            yield piece
-        if decompressor.eof:
-            return
+def _lz4_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
+    frame = lz4.frame.LZ4FrameDecompressor()
+    for taken in _slices(data):
+        rest: Buffer = taken
+        while rest:
+            piece: bytes = frame.decompress(rest, max_length=_PIECE)
+            while piece or not (frame.eof or frame.needs_input):
+                if piece:
+                    yield piece
+                piece = b"" if frame.eof else frame.decompress(b"", max_length=_PIECE)
+            rest = b""
+            if frame.eof:
+                rest = frame.unused_data or b""
+                frame = lz4.frame.LZ4FrameDecompressor()
 
 
 class Compressor:
@@ -218,7 +293,7 @@ class Compressor:
         if self.name == "none" or len(data) == 0 or not self._promising(data, bound):
             return "", data
         packed = self._pack(data, min(self.level, _FAST) if hurried else self.level)
-        if len(packed) > len(data) * self._keep_above:
+        if len(packed) > len(data) * self._keep_above or is_implausible(len(data), len(packed)):
             return "", data
         return self.name, packed
 

@@ -7,6 +7,7 @@ other kinds are rare and become objects.
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -18,15 +19,16 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.compression import decompress_prefix
+from hybridlog_storage.compression import decompress_pieces, is_implausible
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
+    from hybridlog_storage.compression import FilePart
     from hybridlog_storage.messages import Buffer
 
 RECORD_HEAD = struct.Struct("<BQ")
@@ -50,6 +52,10 @@ _MESSAGE = int(Opcode.MESSAGE)
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIELDS = _PAYLOAD - RECORD_HEAD.size
 _TIME_LIMIT = 1 << 63
+_PART = 4 << 20  # bytes of content that are read together
+
+MIN_RECORDS = 1 << 16
+"""Records that a chunk may hold in addition to one a compressed byte."""
 
 Record: TypeAlias = (
     records.Attachment
@@ -111,20 +117,16 @@ class TornChunk:
         compression: MCAP name of the codec.
         uncompressed_size: Bytes of the whole chunk, uncompressed.
         data: The available compressed bytes.
-        limit: Most bytes to decompress.
     """
 
     compression: str
     uncompressed_size: int
-    data: memoryview
-    limit: int
+    data: FilePart
 
-    def content(self) -> ChunkContent:
-        """The whole records. No checksum covers them."""
-        found = decompress_prefix(
-            self.compression, self.data, self.uncompressed_size, limit=self.limit
-        )
-        return parse_content(found, torn=True)
+    def contents(self) -> Iterator[ChunkContent]:
+        """The whole records, in parts. No checksum covers them."""
+        with suppress(SegmentError):
+            yield from parse_parts(self.compression, self.data, self.uncompressed_size)
 
 
 class ChunkContent(NamedTuple):
@@ -140,6 +142,7 @@ class ChunkContent(NamedTuple):
             with a time beyond 2^63 - 1 ns.
         damage: Definitions that could not be read; offsets are into the buffer.
         end: Byte of the buffer behind the last record.
+        records: Number of all records.
     """
 
     batch: Batch
@@ -149,10 +152,16 @@ class ChunkContent(NamedTuple):
     invalid: NDArray[np.int64]
     damage: list[ScanDamage]
     end: int
+    records: int
 
 
 def parse_content(
-    buffer: Buffer, base: int = 0, *, torn: bool = False, messages_only: bool = False
+    buffer: Buffer,
+    base: int = 0,
+    *,
+    torn: bool = False,
+    messages_only: bool = False,
+    most: int = 1 << 62,
 ) -> ChunkContent:
     """Read the records of an uncompressed chunk.
 
@@ -162,19 +171,22 @@ def parse_content(
         torn: The end of the records is missing: omit an incomplete record.
         messages_only: Stop, without error, at the first record that is not a whole
             message.
+        most: Most records.
 
     Returns:
         Messages and definitions. Records of other kinds are skipped, as MCAP requires.
 
     Raises:
-        SegmentError: A record runs over the end; the message names its offset.
+        SegmentError: A record runs over the end, or has the invalid kind 0; the message
+            names its offset. Or there are more than `most`.
     """
-    walk = _Walk(buffer, base, messages_only=messages_only)
+    walk = _Walk(buffer, base, most, messages_only=messages_only)
     starts = np.fromiter(walk.messages(), np.int64)
+    if walk.records > most:
+        raise SegmentError("it holds too many records for its size")
     if not (torn or messages_only) and walk.end != len(buffer):
-        raise SegmentError(
-            f"the record at byte {walk.end} of its content runs over the end at {len(buffer)}"
-        )
+        problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
+        raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
     batch, good = _batch(buffer, starts)
     # Rows count valid messages only.
     kept = None if good is None else np.concatenate(([0], np.cumsum(good)))
@@ -197,16 +209,127 @@ def parse_content(
         starts[:0] if good is None else starts[~good],
         damage,
         walk.end,
+        walk.records,
     )
+
+
+def parse_parts(compression: str, data: FilePart, size: int) -> Iterator[ChunkContent]:
+    """Decompress and read a chunk from a foreign file in parts, in bounded memory.
+
+    Args:
+        compression: MCAP name of the codec.
+        data: The compressed content, or its beginning.
+        size: Bytes of the whole content.
+
+    Yields:
+        The records, in order, in parts of at least `_PART` bytes.
+
+    Raises:
+        SegmentError: The rest cannot be read.
+    """
+    parts = _Parts(size, len(data))
+    damage: SegmentError | None = None
+    pieces = decompress_pieces(compression, data)
+    while damage is None:
+        try:
+            piece = next(pieces, None)
+        except SegmentError as error:
+            damage = error
+            break
+        if piece is None:
+            break
+        yield from parts.add(piece)
+    yield from parts.rest()
+    if damage is not None:
+        raise damage
+    parts.check()
+
+
+class _Parts:
+    """Collects content until its records can be read together.
+
+    Args:
+        size: Bytes of the whole content.
+        compressed: Bytes of its compressed form.
+    """
+
+    def __init__(self, size: int, compressed: int) -> None:
+        self._size = size
+        self._compressed = compressed
+        self._most = MIN_RECORDS + compressed
+        self._held = bytearray()
+        self._base = 0  # content before `_held`
+        self._skipped = 0  # bytes to skip
+        self._wanted = _PART
+
+    def add(self, piece: Buffer) -> Iterator[ChunkContent]:
+        """Take the next piece; yields the records if there are enough.
+
+        Raises:
+            SegmentError: The next record is not believed, or there are too many.
+        """
+        skipped = min(self._skipped, len(piece))
+        self._skipped -= skipped
+        self._base += skipped
+        self._held += memoryview(piece)[skipped:]
+        if self._base + len(self._held) > self._size:
+            raise SegmentError(f"it decompresses to more bytes, not {self._size} as it claims")
+        if len(self._held) >= min(self._wanted, max(self._size - self._base, 1)):
+            yield from self.rest()
+            self._look_ahead()
+
+    def rest(self) -> Iterator[ChunkContent]:
+        """Yield the whole records so far."""
+        if self._held:
+            part = parse_content(self._held, torn=True, most=self._most)
+            self._most -= part.records
+            self._base += part.end
+            self._held = self._held[part.end :]  # the batch keeps the old one
+            yield part
+
+    def check(self) -> None:
+        """Raise if records are missing at the end.
+
+        Raises:
+            SegmentError: The content ends too early.
+        """
+        found = self._base + len(self._held)
+        if found < self._size:
+            raise SegmentError(f"it decompresses to only {found} bytes, not {self._size}")
+        if self._held:
+            raise SegmentError(f"the record at byte {self._base} of its content runs over the end")
+
+    def _look_ahead(self) -> None:
+        """Decide how much the next, incomplete record needs."""
+        self._wanted = _PART
+        if len(self._held) < RECORD_HEAD.size:
+            return
+        opcode, length = RECORD_HEAD.unpack_from(self._held)
+        length += RECORD_HEAD.size
+        where = f"the record at byte {self._base} of its content"
+        if not opcode:
+            raise SegmentError(f"{where} has no kind")
+        if self._base + length > self._size:
+            raise SegmentError(f"{where} runs over the end at {self._size}")
+        if opcode not in {Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL}:
+            self._skipped = length - len(self._held)
+            self._base += len(self._held)
+            self._held = bytearray()
+        elif length > MAX_PAYLOAD or is_implausible(length, self._compressed):
+            raise SegmentError(f"{where} claims {length} bytes, too many to be believed")
+        else:
+            self._wanted = max(_PART, length)
 
 
 class _Walk:
     """Walks from record to record; collects the other records and the end position."""
 
-    def __init__(self, buffer: Buffer, start: int, *, messages_only: bool) -> None:
+    def __init__(self, buffer: Buffer, start: int, most: int, *, messages_only: bool) -> None:
         self.end = start
+        self.records = 0
         self.others: list[tuple[int, int, int, int]] = []
         self._buffer = buffer
+        self._most = most
         self._messages_only = messages_only
 
     def messages(self) -> Iterator[int]:
@@ -215,8 +338,8 @@ class _Walk:
         head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
         size = len(buffer)
         last = size - head_size
-        row = 0
-        while at <= last:
+        row = skipped = 0
+        while at <= last and row + skipped <= self._most:
             opcode, length = head(buffer, at)
             end = at + head_size + length
             if end > size:
@@ -224,12 +347,14 @@ class _Walk:
             if opcode == _MESSAGE:
                 yield at
                 row += 1
-            elif self._messages_only:
+            elif self._messages_only or not opcode:
                 break
-            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                others.append((row, opcode, at, end))
+            else:
+                skipped += 1
+                if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                    others.append((row, opcode, at, end))
             at = end
-        self.end = at
+        self.end, self.records = at, row + skipped
 
 
 def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_] | None]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 import struct
 from dataclasses import dataclass
+from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,9 +19,16 @@ from mcap.opcode import Opcode
 from mcap.summary import Summary
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.compression import MAX_UNCOMPRESSED, decompress
+from hybridlog_storage.compression import (
+    MAX_UNCOMPRESSED,
+    FilePart,
+    check_size,
+    decompress,
+    decompress_pieces,
+)
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import (
+    MIN_RECORDS,
     RECORD_HEAD,
     ChunkContent,
     Definition,
@@ -28,8 +36,10 @@ from hybridlog_storage.mcap_content import (
     ScanDamage,
     TornChunk,
     parse_content,
+    parse_parts,
     read_record,
 )
+from hybridlog_storage.messages import MAX_PAYLOAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,6 +72,7 @@ _FIRST_PRIVATE = 0x80
 _WINDOW = 1 << 20
 _MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
+_AT_ONCE = 64 << 20  # content of a chunk that is decompressed at once
 
 _DATA_OPCODES = frozenset(
     {
@@ -115,8 +126,8 @@ class ScannedChunk:
         message_end: Largest log time, ns, as stated by the chunk.
         uncompressed_size: Bytes of the content, as stated by the chunk.
         uncompressed_crc: CRC-32 of the content, 0 for none.
-        data: The compressed content.
-        limit: Most bytes of content to allocate.
+        part: The compressed content, in the file.
+        limit: Most bytes of content.
     """
 
     offset: int
@@ -126,8 +137,32 @@ class ScannedChunk:
     message_end: int
     uncompressed_size: int
     uncompressed_crc: int
-    data: memoryview
+    part: FilePart
     limit: int = MAX_UNCOMPRESSED
+
+    def contents(self) -> Iterator[ChunkContent]:
+        """The records in parts of bounded size, after comparing the checksum.
+
+        Raises:
+            SegmentError: The rest does not decompress, or is not believed.
+        """
+        if max(self.uncompressed_size, len(self.part)) <= _AT_ONCE:
+            yield parse_content(self.content_bytes(), most=MIN_RECORDS + len(self.part))
+            return
+        if self.uncompressed_size > self.limit:
+            raise SegmentError(
+                f"it claims {self.uncompressed_size} bytes uncompressed, more than the limit "
+                f"of {self.limit}"
+            )
+        if self.compression:
+            check_size(self.compression, self.uncompressed_size, len(self.part))
+        if self.uncompressed_crc:
+            crc = 0
+            for piece in decompress_pieces(self.compression, self.part):
+                crc = crc32(piece, crc)
+            if crc != self.uncompressed_crc:
+                raise SegmentError("its checksum differs")
+        yield from parse_parts(self.compression, self.part, self.uncompressed_size)
 
     def content_bytes(self, *, check_crc: bool = True) -> bytes | memoryview:
         """The uncompressed content, for `parse_content`.
@@ -138,7 +173,8 @@ class ScannedChunk:
         Raises:
             SegmentError: It does not decompress, or its checksum differs.
         """
-        content = decompress(self.compression, self.data, self.uncompressed_size, limit=self.limit)
+        data = self.part.again().read()
+        content = decompress(self.compression, data, self.uncompressed_size, limit=self.limit)
         if check_crc and self.uncompressed_crc not in {0, crc32(content)}:
             raise SegmentError("its checksum differs")
         return content
@@ -205,8 +241,8 @@ def scan(
         file: Seekable; its position is moved.
         size: Bytes of the file.
         start: Byte of the first record.
-        limit: Largest record, and largest chunk uncompressed, in bytes; larger ones count
-            as damage and are skipped.
+        limit: Largest chunk, compressed or not, in bytes; larger ones, and messages above
+            `MAX_PAYLOAD`, count as damage and are skipped.
         summary: From `read_summary`, which is called if this is None. It gives the
             position of the next chunk behind damage.
 
@@ -319,6 +355,13 @@ class _Window:
         """Bytes in memory from `offset` on; at least a record's head, if it exists."""
         self.at(offset, _HEAD)
         return self._data[offset - self._start :]
+
+    def part(self, offset: int, length: int) -> FilePart:
+        """A part that is read later, piece by piece; in memory if it is small."""
+        if length > _WINDOW:
+            return FilePart(self._file, offset, length)
+        data = self.at(offset, length)
+        return FilePart(BytesIO(data), 0, len(data))
 
     def peek(self, offset: int, length: int) -> bytes:
         """A few bytes at any position, fewer at the end, without moving the window."""
@@ -544,9 +587,8 @@ class _Scanner:
             self._crc = None
             yield from self._chunk(at, fields.end)
         elif fields is not None and fields.end == end > self._window.size:
-            there = min(self._window.size - fields.data, self._limit)
-            data = self._window.at(fields.data, there)
-            torn = TornChunk(fields.compression, fields.size, data, self._limit)
+            data = self._window.part(fields.data, self._window.size - fields.data)
+            torn = TornChunk(fields.compression, fields.size, data)
             yield from self._torn(at, "the file ends in the middle of a chunk", torn)
         elif fits and self._goes_on(end):
             yield from self._chunk(at, end)
@@ -567,7 +609,7 @@ class _Scanner:
             yield at, self._too_large(at, end, Opcode.CHUNK)
         else:
             data_end = min(fields.end, end)
-            data = self._window.at(at, end - at)[fields.data - at : data_end - at]
+            data = self._window.part(fields.data, data_end - fields.data)
             self._behind = data_end
             yield (
                 at,
@@ -591,7 +633,7 @@ class _Scanner:
         if end > self._window.size or length < _LEAST[Opcode.MESSAGE] or self._swallows(at, end):
             yield from self._lost(at, f"a message record claims {length} bytes")
             return
-        if length > self._limit:
+        if length > MAX_PAYLOAD:
             self._at = self._behind = end
             yield at, self._too_large(at, end, Opcode.MESSAGE)
             return
@@ -617,7 +659,7 @@ class _Scanner:
             return
         self._at = end
         known = opcode <= max(Opcode)
-        if length > (self._limit if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
+        if length > (MAX_PAYLOAD if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
             if known:
                 yield at, self._too_large(at, end, opcode)
             return
@@ -678,7 +720,8 @@ class _Scanner:
 
     def _too_large(self, at: int, end: int, opcode: int) -> ScanDamage:
         messages = None if opcode == Opcode.CHUNK else int(opcode == Opcode.MESSAGE)
-        reason = f"a record of {end - at} bytes is above the limit of {self._limit}"
+        limit = self._limit if opcode == Opcode.CHUNK else MAX_PAYLOAD
+        reason = f"a record of {end - at} bytes is above the limit of {limit}"
         return ScanDamage(at, end - at, reason, messages, opcode=opcode)
 
     def _torn(

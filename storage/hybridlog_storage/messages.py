@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 Buffer = bytes | bytearray | memoryview
 """Contiguous bytes. A memoryview has itemsize 1."""
 
+MAX_PAYLOAD = (1 << 30) - (1 << 16)
+"""Largest payload, bytes: a chunk, with the heads of its records, has to hold it."""
+
 REDUCED = "hybridlog.reduced"
 """Message encoding of a channel with reduced messages, whose payload was dropped."""
 

@@ -264,9 +264,9 @@ class _Rebuilder:
         if lost:
             raise SegmentError(f"the definition of its channel {min(lost)} is lost")
         head = right_head(
-            batch, len(content), item.uncompressed_crc, item.compression, len(item.data)
+            batch, len(content), item.uncompressed_crc, item.compression, len(item.part)
         )
-        if item.length != len(head) + len(item.data):
+        if item.length != len(head) + len(item.part):
             raise SegmentError("the length of its record is wrong")
         return _Whole(item, batch, head, indexes_of(batch))
 
@@ -314,7 +314,7 @@ class _Rebuilder:
                 length=scanned.length,
                 indexes={channel: len(index) for channel, index in chunk.indexes.items()},
                 compression=scanned.compression,
-                compressed_size=len(scanned.data),
+                compressed_size=len(scanned.part),
                 uncompressed_size=scanned.uncompressed_size,
             ),
             parts,

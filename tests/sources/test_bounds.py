@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import bz2
 import json
 import os
 import resource
+import struct
 import subprocess
 import sys
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import pytest
+import zstandard
 
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.yaml_values import YamlError, parse_yaml
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.compression import Compressor, decompress
+from hybridlog_storage.errors import SegmentError, UsageError
+from tests.sources import test_rosbag1 as bags
 from tests.sources.test_rosbag2 import make
 
 CPU_S = 5
@@ -152,3 +161,198 @@ def test_overrides_that_grow_are_shown_in_short(tmp_path: Path) -> None:
     path.write_text("/b:\n  depth: &a0 [x]\n" + "/a: {depth: 1}\n")
     with pytest.raises(UsageError, match="depth is a number"):
         read_overrides(path)
+
+
+# Chunks of MCAP files
+
+GIB = 1 << 30
+PIECE = 1 << 20
+
+
+def zeros(size: int) -> Iterator[bytes]:
+    yield from (bytes(PIECE) for _ in range(size >> 20))
+
+
+def private(size: int, opcode: int = 0x90) -> Iterator[bytes]:
+    """A record whose content is zeros."""
+    yield struct.pack("<BQ", opcode, size)
+    yield from zeros(size)
+
+
+def noisy(size: int) -> Iterator[bytes]:
+    yield record(0x90, os.urandom(1 << 16))
+    yield from private(size)
+
+
+def repeat(data: bytes, times: int = 1 << 20) -> Iterator[bytes]:
+    yield data * times
+
+
+def zstd(parts: Iterable[bytes]) -> tuple[bytes, int]:
+    return _packed(zstandard.ZstdCompressor(level=1).compressobj(), parts)
+
+
+def lz4_(parts: Iterable[bytes]) -> tuple[bytes, int]:
+    packer = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
+    start = packer.begin()
+    data, size = _packed(packer, parts)
+    return start + data, size
+
+
+def _packed(packer: Any, parts: Iterable[bytes]) -> tuple[bytes, int]:
+    found, size = [], 0
+    for part in parts:
+        found.append(packer.compress(part))
+        size += len(part)
+    return b"".join([*found, packer.flush()]), size
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(value: str | bytes) -> bytes:
+    value = value.encode() if isinstance(value, str) else value
+    return struct.pack("<I", len(value)) + value
+
+
+def schema(number: int, name: str = "a/T", data: str = "uint8 n") -> bytes:
+    return record(3, struct.pack("<H", number) + text(name) + text("ros1msg") + text(data))
+
+
+def channel(number: int, topic: str = "/a", schema_id: int = 1) -> bytes:
+    fields = struct.pack("<HH", number, schema_id) + text(topic) + text("ros1")
+    return record(4, fields + struct.pack("<I", 0))
+
+
+def message(number: int = 1, payload: bytes = b"\1", time: int = 1) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, 0, time, time) + payload)
+
+
+def chunk(codec: str, data: bytes, size: int, crc: int = 0) -> bytes:
+    head = struct.pack("<QQQI", 1, 1, size, crc) + text(codec)
+    return record(6, head + struct.pack("<Q", len(data)) + data)
+
+
+def write(path: Path, *parts: bytes) -> Path:
+    magic = b"\x89MCAP0\r\n"
+    start = record(1, text("ros1") + text("")) + schema(1) + channel(1)
+    end = record(15, bytes(4)) + record(2, bytes(20))
+    path.write_bytes(magic + start + b"".join(parts) + end + magic)
+    return path
+
+
+Data = Callable[[], tuple[bytes, int]]
+"""Makes compressed data and the number of bytes that it stands for."""
+
+
+@pytest.mark.parametrize(
+    ("codec", "made", "claim", "reason"),
+    [
+        ("zstd", lambda: zstd(zeros(GIB)), None, "the record at byte 0 of its content has no kind"),
+        ("lz4", lambda: lz4_(zeros(GIB)), None, "the record at byte 0 of its content has no kind"),
+        ("zstd", lambda: zstd(zeros(PIECE)), 100, "to more bytes, not 100 as it claims"),
+        ("lz4", lambda: lz4_(zeros(GIB)), 100, "to more bytes, not 100 as it claims"),
+        ("zstd", lambda: zstd(zeros(PIECE)), 8 << 30, "more than the limit of"),
+        ("lz4", lambda: lz4_(zeros(PIECE)), 4 << 30, "bytes of lz4 cannot hold"),
+        ("zstd", lambda: zstd(private(3 * GIB)), 2 * GIB, "runs over the end at 2147483648"),
+        ("zstd", lambda: zstd(repeat(record(0x90, b""))), None, "too many records for its size"),
+        ("zstd", lambda: zstd(repeat(schema(2))), None, "too many records for its size"),
+        ("zstd", lambda: zstd(repeat(message())), None, "too many records for its size"),
+        ("zstd", lambda: zstd(private(300 << 20, 5)), None, "too many to be believed"),
+        ("zstd", lambda: zstd(noisy(99 << 20)), 100 << 20, "bytes, not 104857600"),
+    ],
+)
+def test_chunks_of_any_kind_are_bounded(
+    tmp_path: Path, codec: str, made: Data, claim: int | None, reason: str
+) -> None:
+    good = chunk("", message() * 10, len(message() * 10))
+    data, size = made()
+    path = write(tmp_path / "a.mcap", good, chunk(codec, data, claim or size), good)
+    messages, _, damage = read(path)
+    assert 20 <= messages <= 20 + (1 << 18)
+    assert [row[0].startswith("a chunk is damaged") for row in damage] == [True]
+    assert reason in damage[0][0]
+
+
+def test_what_a_large_record_holds_is_passed_over(tmp_path: Path) -> None:
+    data, size = zstd(chain([message()], private(GIB), [message()]))
+    assert read(write(tmp_path / "a.mcap", chunk("zstd", data, size)))[::2] == (2, [])
+
+
+@pytest.mark.parametrize(
+    "size", [100 << 20, pytest.param(1200 << 20, marks=pytest.mark.exhaustive)]
+)
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+def test_large_chunks_are_read_in_little_memory(tmp_path: Path, codec: str, size: int) -> None:
+    parts = [message(payload=os.urandom(PIECE))] * (size // PIECE)
+    data, size = zstd(iter(parts)) if codec == "zstd" else lz4_(iter(parts))
+    crc = 0
+    for part in parts:
+        crc = zlib.crc32(part, crc)
+    path = write(tmp_path / "a.mcap", chunk(codec, data, size, crc))
+    assert read(path)[::2] == (len(parts), [])
+    path = write(tmp_path / "b.mcap", chunk(codec, data, size, crc ^ 1), message())
+    messages, _, damage = read(path)
+    assert messages == 1
+    assert damage == [["a chunk is damaged: its checksum differs", None]]
+    path = write(tmp_path / "c.mcap", chunk(codec, data, size))
+    os.truncate(path, path.stat().st_size // 2)
+    messages, _, damage = read(path)
+    assert len(parts) // 3 < messages < len(parts)
+    assert f"{messages} messages of its beginning were read" in damage[0][0]
+
+
+def test_several_lz4_frames_in_a_chunk(tmp_path: Path) -> None:
+    data = b"".join(lz4_(iter([message() * 10]))[0] for _ in range(3))
+    path = write(tmp_path / "a.mcap", chunk("lz4", data, len(message()) * 30))
+    assert read(path)[::2] == (30, [])
+    path = write(tmp_path / "b.mcap", chunk("lz4", data, len(message()) * 20), message())
+    assert "to more bytes" in read(path)[2][0][0]
+
+
+def test_segments_keep_to_the_ratio_that_readers_believe() -> None:
+    large = bytes(300 << 20)
+    assert Compressor("zstd").compress(large) == ("", large)
+    assert Compressor("zstd").compress(large[: 100 << 20])[0] == "zstd"
+    with pytest.raises(SegmentError, match="more than 1000 times its"):
+        decompress("zstd", zstandard.compress(large), len(large))
+
+
+# Chunks of ROS 1 bags
+
+
+def test_chunks_of_bags_are_bounded(tmp_path: Path) -> None:
+    good = bags.chunk(bags.connection(0) + bags.message(0, 1, b"a"), "none")
+    small = bags.message(0, 2, b"a")
+    packed = {
+        "bz2": bz2.compress(bytes(300 << 20)),
+        "lz4": lz4_(zeros(300 << 20))[0],
+    }
+    cases = [
+        ("lz4", packed["lz4"], 100, "says 100 bytes, it has more than 16777216"),
+        ("lz4", packed["lz4"], 2**32 - 1, "says 4294967295 bytes, there are 314572800"),
+        ("bz2", packed["bz2"], 100, "says 100 bytes, it has more than 16777216"),
+        ("bz2", packed["bz2"], 2**32 - 1, "bytes become more than"),
+        ("bz2", bz2.compress(b"") * 100_000, 0, "too many streams"),
+        ("lz4", lz4.frame.compress(b"") * 100_000, 0, "too many streams"),
+        ("lz4", lz4.frame.compress(small * 200_000), len(small) * 200_000, "too many messages"),
+        ("lz4", lz4.frame.compress(small), 100, f"says 100 bytes, there are {len(small)}"),
+        ("bz2", bz2.compress(small), 2**32 - 1, f"there are {len(small)}"),
+    ]
+    bad = [bags.packed_chunk(data, codec, size) for codec, data, size, _ in cases]
+    path = tmp_path / "a.bag"
+    path.write_bytes(bags.bag(good, *bad, good))
+    messages, _, damage = read(path)
+    assert messages == 4
+    assert len(damage) == len(cases)
+    for (reason, _), (*_, wanted) in zip(damage, cases, strict=True):
+        assert wanted in reason
+
+
+def test_large_chunks_of_bags_are_read_in_little_memory(tmp_path: Path) -> None:
+    rows = [bags.connection(0)] + [bags.message(0, 1, os.urandom(PIECE))] * 200
+    data, size = lz4_(iter(rows))
+    path = tmp_path / "a.bag"
+    path.write_bytes(bags.bag(bags.packed_chunk(data, "lz4", size)))
+    assert read(path)[::2] == (200, [])
