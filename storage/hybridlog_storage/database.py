@@ -100,6 +100,7 @@ _UNNAMED_CODE = "Location"
 operators and expressions. Failures of the server itself have names."""
 _WRITING_STAGES = frozenset({"$out", "$merge"})
 _WRITES = frozenset({"insert", "remove", "update"})
+_UNAUTHORIZED = 13
 _LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
@@ -185,6 +186,8 @@ class Database:
                 f"{address} is not a MongoDB connection string ({type(error).__name__}). Write "
                 f"mongodb://host:port/, and percent-encode user name, password and socket path."
             ) from None
+        except OSError as error:
+            raise _unusable_file(address, error) from error
         except PyMongoError as error:  # an SRV record that cannot be resolved
             raise DatabaseError(f"MongoDB at {address} cannot be found: {error}") from error
         name = parsed["database"] or name
@@ -204,8 +207,11 @@ class Database:
             options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
         if "connecttimeoutms" not in given:
             options["connectTimeoutMS"] = int(timeout_s * 1000)
-        with _mapped(address):
-            client: MongoClient[Document] = MongoClient(uri, **options)  # type: ignore[arg-type]
+        try:
+            with _mapped(address):
+                client: MongoClient[Document] = MongoClient(uri, **options)  # type: ignore[arg-type]
+        except OSError as error:
+            raise _unusable_file(address, error) from error
         try:
             if not client.write_concern.acknowledged:
                 raise UsageError(f"{address}: w=0 would lose errors; leave it out.")
@@ -488,16 +494,27 @@ class Database:
                 if last is not None:
                     rest = {"$and": [query, {"_id": {"$gt" if order > 0 else "$lt": key(last)}}]}
                 try:
-                    with ask(rest) as cursor:
+                    with _closing(ask(rest)) as cursor:
                         for item in cursor:
                             yield item
                             last, tries = item, _TRIES
-                    return
+                            if order and self._has_moved(cursor.address):
+                                break
+                        else:
+                            return
                 except _broken() as error:
                     tries -= 1
                     if not tries or (last is not None and not order):
                         raise
                     _wait(self._client, error)
+
+    def _has_moved(self, address: tuple[str, int] | None) -> bool:
+        """True if a member of a replica set is no longer its primary.
+
+        A cursor there would wait for it, as long as for another primary.
+        """
+        is_set = self._client.topology_description.topology_type_name.startswith("ReplicaSet")
+        return is_set and self._client.primary != address
 
     def find_one(
         self,
@@ -615,7 +632,7 @@ class Database:
 
             def ask(pipeline: list[Document] = pipeline) -> list[bytes]:
                 found = of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
-                with found as cursor:
+                with _closing(found) as cursor:
                     return [*cursor]
 
             yield from self._again(ask, question=True)
@@ -886,6 +903,18 @@ def _wait(client: MongoClient[Document], error: Exception) -> None:
         raise error from None
 
 
+@contextlib.contextmanager
+def _closing(cursor: Any) -> Iterator[Any]:
+    """Close a cursor; its server may have ended, which closing would wait for."""
+    from pymongo import timeout
+
+    try:
+        yield cursor
+    finally:
+        with timeout(_GONE_S):
+            cursor.close()
+
+
 def _key_order(sort: Sort | None) -> int:
     """1 or -1 if documents come in the order of `_id`, or the other way round; else 0."""
     (first, order), *more = sort or [("_id", 1)]
@@ -1063,10 +1092,7 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
     except ConnectionFailure as error:
         is_down = isinstance(error, ServerSelectionTimeoutError)
         kind = ConnectionLostError if is_down else ConnectionBrokenError
-        raise kind(
-            f"MongoDB at {address} does not answer: {_first_words(error)}. Check that it runs and "
-            f"can be reached."
-        ) from error
+        raise kind(_unreachable(address, _first_words(error))) from error
     except (DocumentTooLarge, BSONError, OverflowError, RecursionError, UnicodeError) as error:
         if question:
             raise WhereError(f"The predicate cannot be sent to MongoDB: {error}") from error
@@ -1078,10 +1104,42 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         raise DatabaseError(f"MongoDB at {address}: {_first_words(error)}{cure}") from error
 
 
+def _unusable_file(address: str, error: OSError) -> UsageError:
+    named = error.filename or "A file with certificates"
+    return UsageError(
+        f"{named}, which the URI of {address} names, cannot be used: {error.strerror}."
+    )
+
+
+def _unreachable(address: str, text: str) -> str:
+    """What is wrong when no connection can be made or kept, with its cure."""
+    if "CERTIFICATE_VERIFY_FAILED" in text:
+        reason = text.rpartition("certificate verify failed: ")[2].partition(" (_ssl")[0]
+        return (
+            f"MongoDB at {address} cannot be trusted: {reason}. Name the certificate of the "
+            "authority that signed its own in the URI: tlsCAFile=FILE."
+        )
+    if "SSL handshake failed" in text or "[SSL" in text:
+        return (
+            f"MongoDB at {address} does not answer with TLS. If it has none, leave tls=true out "
+            "of the URI."
+        )
+    is_closed = "connection closed" in text or "reset by peer" in text
+    tls = "; if it wants TLS, write tls=true into the URI" if is_closed else ""
+    return (
+        f"MongoDB at {address} does not answer: {text}. Check that it runs and can be reached{tls}."
+    )
+
+
 def _refused(address: str, code: int, text: str) -> DatabaseError | DiskFullError:
     if code in _DISK_FULL or "No space left on device" in text:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
     cure = f" {LOGIN_CURE}" if code == _LOGIN_FAILED else ""
+    if code == _UNAUTHORIZED and "requires authentication" in text:
+        cure = f": name a user in the URI, mongodb://USER@host/NAME. {LOGIN_CURE}"
+    elif code == _UNAUTHORIZED:
+        text = text.partition(" to execute command")[0]
+        cure = ": the user needs the role readWrite on this database, or read to ask only."
     return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
 
 

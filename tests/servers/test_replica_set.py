@@ -1,0 +1,159 @@
+"""The primary of a replica set is killed: nothing is lost, and questions go on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.engines import mongo
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog_storage.database import Database
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.faults import logs
+from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
+
+NUMBERS = count()
+MESSAGES = 4000  # of each of three topics
+KILLED_AT = 4  # inserts
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ReplicaSet]:
+    with replica_set(tmp_path_factory.mktemp("set")) as found:
+        yield found
+
+
+@pytest.fixture
+def members(running: ReplicaSet) -> ReplicaSet:
+    running.heal()
+    return running
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return logs.write(tmp_path_factory.mktemp("log") / "a.mcap", logs.content(0, MESSAGES))
+
+
+@pytest.fixture
+def store(members: ReplicaSet, tmp_path: Path) -> Iterator[hl.Store]:
+    uri = members.uri(f"store{next(NUMBERS)}")
+    with hl.open(tmp_path / "store", create=True, mongo=uri, require_database=True) as opened:
+        yield opened
+
+
+@pytest.fixture
+def only_mongodb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing else answer what MongoDB can."""
+    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+    monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
+
+
+def check(store: hl.Store, messages: int) -> None:
+    """All messages are in the index, byte for byte."""
+    assert store.verify().findings == []
+    database = store.connect()
+    topics = [n for n in database.list_collections() if not n.startswith("hybridlog.")]
+    assert sum(database.count(topic, {"_meta.seq": {"$gte": 0}}) for topic in topics) == messages
+
+
+@pytest.fixture
+def killing(members: ReplicaSet, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The primary is killed when some documents are on their way; collections of all inserts."""
+    inserts: list[str] = []
+    insert = Database._insert_batch
+
+    def counted(self: Database, collection: str, *arguments: object, **options: object) -> int:
+        inserts.append(collection)
+        if len(inserts) == KILLED_AT:
+            members.kill_primary()
+        return insert(self, collection, *arguments, **options)
+
+    monkeypatch.setattr(Database, "_insert_batch", counted)
+    return inserts
+
+
+def test_killed_while_a_log_is_recorded(store: hl.Store, log: Path, killing: list[str]) -> None:
+    report = store.record(log, settings=SegmentSettings(chunk_size=1 << 12))
+    assert len(killing) > KILLED_AT
+    assert report.failure is None
+    assert report.missed == 0
+    check(store, 3 * MESSAGES)
+
+
+def test_killed_during_a_live_recording(store: hl.Store, killing: list[str]) -> None:
+    channel = Channel("/n", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)
+    recording = store.start("live", flush_interval_s=0.05)
+    written = 0
+    while len(killing) < KILLED_AT + 2 or written < 1000:
+        recording.write(channel, written.to_bytes(4, "little"))
+        written += 1
+        if written % 20 == 0:
+            time.sleep(0.01)
+    report = recording.close()
+    assert report.failure is None
+    check(store, written)
+
+
+def test_questions_go_on(
+    members: ReplicaSet,
+    store: hl.Store,
+    log: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    only_mongodb: None,
+) -> None:
+    store.record(log)
+    query = store.topic("/number").where("n >= 100")
+    assert query.count() == MESSAGES - 100
+    members.kill_primary()
+    assert query.count() == MESSAGES - 100
+    members.heal()
+    # In the middle of an answer.
+    monkeypatch.setattr(mongo, "_DOCUMENTS", 500)
+    documents = query.documents()
+    found = [next(documents)["n"] for _ in range(10)]
+    members.kill_primary()
+    found += [document["n"] for document in documents]
+    assert found == list(range(100, MESSAGES))
+    members.heal()
+    members.kill_primary()
+    assert [m.fields["n"] for m in query.limit(300)] == list(range(100, 400))
+
+
+def test_what_only_the_primary_had_is_not_lost(
+    members: ReplicaSet, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writes that are acknowledged by the primary alone, as the URI wants, are taken back."""
+    insert = Database._insert_batch
+    uri = members.uri("weak", "&w=1")
+    killer: list[threading.Thread] = []
+
+    def kill_when_written(primary: Mongod, collection: str) -> None:
+        alone = f"mongodb://{primary.address}/weak?directConnection=true"
+        with Database.connect(alone) as old:
+            eventually(lambda: old.count(collection), "nothing is written")
+        primary.kill()
+        members.resume()
+
+    def alone(self: Database, collection: str, *arguments: object, **options: object) -> int:
+        if not killer:
+            primary = members.stop_secondaries()
+            killer.append(threading.Thread(target=kill_when_written, args=(primary, collection)))
+            killer[0].start()
+        return insert(self, collection, *arguments, **options)
+
+    with hl.open(tmp_path / "store", create=True, mongo=uri, require_database=True) as store:
+        monkeypatch.setattr(Database, "_insert_batch", alone)
+        report = store.record(log)
+        killer[0].join()
+        assert report.failure is None
+        check(store, 3 * MESSAGES)
+        members.heal()  # the old primary takes back what it had alone
+        check(store, 3 * MESSAGES)

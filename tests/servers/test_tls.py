@@ -1,0 +1,204 @@
+"""A MongoDB with TLS, user and password, as commands meet it."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+from pymongo import MongoClient
+
+import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
+from tests.cli.running import COMMAND, environment, run
+from tests.faults import logs
+from tests.servers.mongods import Mongod, eventually, free_port
+
+PASSWORD = "s3cret/pä:ss@word"
+MESSAGES = 300
+NUMBERS = count()
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A server with TLS and login."""
+
+    port: int
+    authority: Path
+    other_authority: Path
+
+    def uri(self, *, user: str = "robot@", options: str | None = None) -> str:
+        """URI of a new database."""
+        tls = f"tls=true&tlsCAFile={quote(str(self.authority), safe='/')}"
+        chosen = tls if options is None else options
+        return (
+            f"mongodb://{user}127.0.0.1:{self.port}/robots{next(NUMBERS)}"
+            f"?authSource=admin&serverSelectionTimeoutMS=1500&{chosen}"
+        )
+
+
+def openssl(*arguments: object) -> None:
+    subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True)
+
+
+def authority(place: Path) -> Path:
+    """A certificate authority of our own; its key lies beside it."""
+    openssl(
+        *("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", place.with_suffix(".key"), "-out", place, "-days", 2),
+        *("-subj", f"/CN={place.stem}"),
+    )
+    return place
+
+
+def certificate(place: Path, signer: Path) -> Path:
+    """Certificate and key of a server on loopback, in one file."""
+    request, key, extra = (place.with_suffix(end) for end in (".csr", ".key", ".ext"))
+    extra.write_text("subjectAltName=IP:127.0.0.1\n")
+    openssl(
+        *("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", key, "-out", request, "-subj", "/CN=server"),
+    )
+    openssl(
+        *("x509", "-req", "-in", request, "-CA", signer, "-CAkey", signer.with_suffix(".key")),
+        *("-CAcreateserial", "-out", place, "-days", 2, "-extfile", extra),
+    )
+    place.write_bytes(place.read_bytes() + key.read_bytes())
+    return place
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    place = tmp_path_factory.mktemp("tls")
+    ours, others = authority(place / "ours.pem"), authority(place / "others.pem")
+    identity = certificate(place / "server.pem", ours)
+    port = free_port()
+    with Mongod(
+        place / "data",
+        *("--auth", "--tlsMode", "requireTLS", "--tlsCertificateKeyFile", identity),
+        *("--tlsCAFile", ours, "--tlsAllowConnectionsWithoutCertificates"),
+        port=port,
+    ):
+        first = f"mongodb://127.0.0.1:{port}/?tls=true&tlsCAFile={ours}"
+        with MongoClient(first) as client:
+            roles = ["root"]
+            eventually(
+                lambda: client.admin.command("createUser", "robot", pwd=PASSWORD, roles=roles),
+                "no server with TLS",
+            )
+        yield Guarded(port, ours, others)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return logs.write(tmp_path / "a.mcap", logs.content(0, MESSAGES))
+
+
+def test_everything_works_and_the_password_stays_where_it_is(
+    server: Guarded, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, uri = tmp_path / "store", server.uri()
+    password = tmp_path / "password"
+    password.touch(0o600)
+    password.write_text(PASSWORD + "\n")
+    env = {"HYBRIDLOG_MONGO_PASSWORD_FILE": str(password)}
+    said = [run("record", log, "--mongo", uri, store=store, **env)]
+    where = ("fetch", "-t", "/number", "--where", "n >= 100")
+    counted = run(*where, "--count", "--quiet", store=store, **env)
+    assert counted.out.split() == [str(MESSAGES - 100)]
+    rows = run(*where, "--format", "jsonl", "--quiet", store=store, **env)
+    assert len(rows.lines) == MESSAGES - 100
+    indexed = run("index", "/number", "n", store=store, **env)
+    verified = run("verify", store=store, **env)
+    again = run("reindex", store=store, **env)
+    said += [counted, rows, indexed, verified, again, run("verify", store=store, **env)]
+    monkeypatch.setenv("HYBRIDLOG_MONGO_PASSWORD_FILE", str(password))
+    channel = Channel("/live", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)
+    with hl.open(store, require_database=True) as opened:
+        recording = opened.start("live")
+        for n in range(100):
+            recording.write(channel, n.to_bytes(4, "little"))
+        assert recording.close().failure is None
+        assert opened.topic("/live").where({"n": {"$gte": 40}}).count() == 60
+        assert opened.verify().findings == []
+    parts = (PASSWORD, quote(PASSWORD, safe=""), "s3cret")
+    for done in said:
+        assert not any(part in done.out + done.err for part in parts)
+    for path in (p for p in store.rglob("*") if p.is_file()):
+        assert not any(part.encode() in path.read_bytes() for part in parts), path
+
+
+def test_other_users_do_not_see_the_password(server: Guarded, log: Path, tmp_path: Path) -> None:
+    """While a command runs: in the arguments of all processes, and in what they do not hide."""
+    seen: list[bytes] = []
+    process = subprocess.Popen(
+        [*COMMAND, "record", str(log), "--mongo", server.uri(), "--store", str(tmp_path / "store")],
+        env=environment(HYBRIDLOG_MONGO_PASSWORD=PASSWORD),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    has_ended = threading.Event()
+
+    def look() -> None:
+        while not has_ended.wait(0.05):
+            for process_dir in Path("/proc").glob("[0-9]*"):
+                try:
+                    seen.append((process_dir / "cmdline").read_bytes())
+                except OSError:
+                    continue
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    _, err = process.communicate(timeout=60)
+    has_ended.set()
+    watcher.join()
+    assert process.returncode == 0, err
+    assert any(b"record\0" in line and str(server.port).encode() in line for line in seen)
+    assert not any(b"s3cret" in line for line in seen)
+
+
+@pytest.mark.parametrize(
+    ("user", "password", "options", "cure"),
+    [
+        ("robot@", "wrong", None, "HYBRIDLOG_MONGO_PASSWORD"),
+        ("robot@", "", None, "HYBRIDLOG_MONGO_PASSWORD"),
+        ("", "", None, "mongodb://USER@"),
+        ("robot@", PASSWORD, "tls=true&tlsCAFile={other}", "tlsCAFile"),
+        ("robot@", PASSWORD, "tls=true", "tlsCAFile"),
+        ("robot@", PASSWORD, "tls=true&tlsCAFile=/nowhere.pem", "/nowhere.pem"),
+        ("robot@", PASSWORD, "tls=false", "tls=true"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_cure(
+    server: Guarded,
+    log: Path,
+    tmp_path: Path,
+    user: str,
+    password: str,
+    options: str | None,
+    cure: str,
+) -> None:
+    given = None if options is None else options.format(other=server.other_authority)
+    uri = server.uri(user=user, options=given)
+    env = {"HYBRIDLOG_MONGO_PASSWORD": password}
+    done = run("record", log, "--mongo", uri, "-q", store=tmp_path / "store", code=None, **env)
+    assert done.code not in {0, 1}
+    assert cure in done.err
+    assert "s3cret" not in done.err
+    assert "_ssl.c" not in done.err
+    assert len(done.err.strip().splitlines()) == 1
+
+
+def test_tls_with_a_server_that_has_none(log: Path, tmp_path: Path) -> None:
+    with Mongod(tmp_path / "mongod") as server:
+        with MongoClient(f"mongodb://{server.address}/") as client:
+            eventually(lambda: client.admin.command("ping"), "no server")
+        uri = f"mongodb://{server.address}/x?tls=true&serverSelectionTimeoutMS=1500"
+        done = run("record", log, "--mongo", uri, "-q", store=tmp_path / "store", code=None)
+        assert done.code not in {0, 1}
+        assert "tls=true" in done.err
