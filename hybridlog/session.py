@@ -18,6 +18,7 @@ from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
+from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import (
     CatalogError,
     ConnectionBrokenError,
@@ -328,7 +329,11 @@ class Session:
         found = self._channels.get(recording.id)
         if found is None:
             by_id = self._read_channels(recording)
-            found = [RecordedChannel(recording, i, c) for i, c in sorted(by_id.items())]
+            known = {c.id: (c.stats, c.reason) for c in recording.channels}
+            found = [
+                RecordedChannel(recording, i, channel, *known.get(i, (ChannelStats(), None)))
+                for i, channel in sorted(by_id.items())
+            ]
             self._channels[recording.id] = found
         return found
 

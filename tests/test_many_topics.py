@@ -193,6 +193,39 @@ def test_an_index_on_a_field_of_a_shared_collection(
 # Many.
 
 
+class Walked(list[Any]):
+    """A list that counts how often somebody walks through it."""
+
+    walks = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        self.walks += 1
+        return super().__iter__()
+
+
+def test_no_question_about_all_topics_walks_through_them_once_a_topic(
+    tmp_path: Path, only_mongo: Callable[[], None]
+) -> None:
+    log = write_log(tmp_path / "log.mcap", 40)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(log)
+        store.all_topics().where("data >= 3").count()  # everything is open now
+        store.session._channels.clear()
+        store.session.tables.invalidate()
+        (entry,) = store.recordings()
+        channels = entry.channels = Walked(entry.channels)
+        everything = store.all_topics()
+        for query in (everything, everything.where("data >= 3"), everything.where("data < 1")):
+            query.count()
+            list(query)
+            len(query.to_pandas())
+        assert 0 < channels.walks < 40
+        channels.walks = 0
+        only_mongo()
+        assert everything.where("data >= 2").count() == 120
+        assert channels.walks < 10
+
+
 def commands_of(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts the inserts and the questions sent to MongoDB, by method."""
     sent: Counter[str] = Counter()

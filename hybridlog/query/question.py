@@ -78,11 +78,15 @@ class RecordedChannel:
         recording: The recording.
         channel_id: Its id in the recording.
         channel: Topic, type and metadata.
+        stats: Statistics of its messages.
+        reason: The reason why the catalog knows no fields of them; None if it does.
     """
 
     recording: RecordingEntry
     channel_id: int
     channel: Channel
+    stats: ChannelStats
+    reason: str | None
 
     @cached_property
     def codec(self) -> Codec:
@@ -131,9 +135,8 @@ class Part:
 
     @property
     def stats(self) -> list[ChannelStats]:
-        """Statistics of its channels, except those without messages."""
-        wanted = {channel.channel_id for channel in self.channels}
-        return [c.stats for c in self.recording.channels if c.id in wanted]
+        """Statistics of its channels."""
+        return [channel.stats for channel in self.channels]
 
     @property
     def messages(self) -> int:

@@ -9,10 +9,11 @@ and other engines answer.
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.intervals import Span
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 MAX_BYTES: Final = 64 << 20
 """Maximum memory of decoded columns."""
@@ -338,6 +339,13 @@ class _Cache:
             self._size = 0
 
 
+class _SmallFile(NamedTuple):
+    """A file of several topics, and the first row of each."""
+
+    file: ParquetFileReader
+    first_rows: dict[str, int]
+
+
 class Tables:
     """The tables of a store. Thread safe.
 
@@ -350,7 +358,8 @@ class Tables:
         self._root = root
         self._cache = _Cache(most_bytes)
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._small: OrderedDict[Path, ParquetFileReader] = OrderedDict()
+        self._small: OrderedDict[Path, _SmallFile] = OrderedDict()
+        self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._generation = 0
         self._lock = threading.Lock()
 
@@ -360,6 +369,7 @@ class Tables:
             self._generation += 1
             self._found.clear()
             self._small.clear()
+            self._channels = None
         self._cache.clear()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
@@ -407,10 +417,11 @@ class Tables:
         """
         if recording.status == "open":
             raise FileNotFoundError
+        channels = self._channels_of(recording, topic)
         schemas = {
             table_schema(c.message_encoding, c.schema, c.metadata): c.type
-            for c in recording.channels
-            if c.topic == topic and c.stats.messages
+            for c in channels
+            if c.stats.messages
         }
         if len(schemas) != 1:
             raise FileNotFoundError
@@ -424,16 +435,26 @@ class Tables:
         table = TopicTable(topic, parts, self._cache)
         for file in table.files:
             _confirm(file, recording, topic, schema)
-        if table.rows != recording.messages_of(topic):
+        messages = sum(channel.stats.messages for channel in channels)
+        if table.rows != messages:
             raise StoreError(
-                f"The tables of {topic} have {table.rows} messages, the segments "
-                f"{recording.messages_of(topic)}."
+                f"The tables of {topic} have {table.rows} messages, the segments {messages}."
             )
         try:
             table.fields()
         except UnfitError as error:
             raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
         return table
+
+    def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
+        """The channels of a topic; those of the recording asked about last are at hand."""
+        found = self._channels
+        if found is None or found[0] is not recording:
+            by_topic: dict[str, list[ChannelEntry]] = defaultdict(list)
+            for channel in recording.channels:
+                by_topic[channel.topic].append(channel)
+            found = self._channels = recording, dict(by_topic)
+        return found[1].get(topic, [])
 
     def _own_parts(self, folder: Path) -> Iterator[_Part]:
         """Row groups of the files of one topic."""
@@ -457,31 +478,30 @@ class Tables:
 
     def _small_parts(self, path: Path, topic: str) -> Iterator[_Part]:
         """Rows of a topic in a file of several topics."""
-        file = self._small_file(path)
-        begin = 0
-        for name, rows in file.about.topics.items():
-            if name == topic:
-                break
-            begin += rows
-        else:
+        file, first_rows = self._small_file(path)
+        if topic not in first_rows:
             return
-        end, before = begin + rows, 0
+        begin = first_rows[topic]
+        end, before = begin + file.about.topics[topic], 0
         for group, (count, *_) in enumerate(file.about.bounds):
             low, high = max(begin, before), min(end, before + count)
             if low < high:
                 yield _Part(file, group, low - before, high - low, _FIRST, _LAST)
             before += count
 
-    def _small_file(self, path: Path) -> ParquetFileReader:
+    def _small_file(self, path: Path) -> _SmallFile:
         with self._lock:
             if path in self._small:
                 return self._small[path]
         file = ParquetFileReader(path)
+        counts = file.about.topics
+        begins = accumulate(counts.values(), initial=0)
+        found = _SmallFile(file, dict(zip(counts, begins, strict=False)))
         with self._lock:
-            self._small[path] = file
+            self._small[path] = found
             while len(self._small) > _OPEN_FILES:
                 self._small.popitem(last=False)
-        return file
+        return found
 
 
 def _confirm(file: ParquetFileReader, recording: RecordingEntry, topic: str, schema: str) -> None:

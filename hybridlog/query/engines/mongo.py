@@ -350,8 +350,7 @@ def _is_older(part: Part) -> bool:
     """True if the index is older than the package that reads the fields of the messages."""
     if part.predicate is None:
         return False
-    unread = {c.id for c in part.recording.channels if c.reason is not None}
-    return any(c.channel_id in unread and c.codec.indexed for c in part.channels)
+    return any(c.reason is not None and c.codec.indexed for c in part.channels)
 
 
 def joined(condition: _Filter, predicate: Mapping[str, object]) -> _Filter:
