@@ -112,6 +112,7 @@ SLOW = frozenset(
         "test_faults.py",
         "test_field_indexes.py",
         "test_groups.py",
+        "test_healing.py",
         "test_hostile_store.py",
         "test_many_topics.py",
         "test_model.py",

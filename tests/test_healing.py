@@ -1,0 +1,446 @@
+"""What a store derives from its recordings may be damaged in any way: it is made again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from pymongo import MongoClient
+
+import hybridlog as hl
+from hybridlog import session as session_module
+from hybridlog.demo.write import write_bag
+from hybridlog_storage.database import Database
+from hybridlog_storage.errors import DatabaseError, IndexChangedError, ResourceError
+from hybridlog_storage.mongod import find_mongod
+from tests.cli.running import run
+from tests.damage import WAYS
+
+TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
+IMU, SCAN = TOPICS[:2]
+WHERE = "header.seq >= 100"
+NOWHERE = "mongodb://127.0.0.1:1/none?serverSelectionTimeoutMS=1"
+REPLACED = "The data files of the embedded MongoDB were damaged, and were replaced: "
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with two recordings, whose mongod has ended."""
+    base = tmp_path_factory.mktemp("healing")
+    for number, name in enumerate(("one", "two")):
+        write_bag(base / f"{name}.bag", duration_s=2, seed=number, topics=TOPICS)
+    with hl.open(base / "store", create=True) as store:
+        for name in ("one", "two"):
+            store.record(base / f"{name}.bag")
+    ended(base / "store")
+    return base / "store"
+
+
+@pytest.fixture
+def store(template: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(template, tmp_path / "store"))
+
+
+def pids(store: Path) -> list[int]:
+    """Processes with the store's mongod directory in their command line."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if any(str(store / "mongod") in part for part in process.cmdline()):
+                found.append(process.pid)
+    return found
+
+
+def wait_for(condition: Callable[[], object], limit_s: float = 30) -> None:
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+def ended(store: Path) -> None:
+    wait_for(lambda: not pids(store))
+
+
+def kill_mongod(store: Path) -> None:
+    pid = json.loads((store / "mongod" / "mongod.json").read_bytes())["mongod"]
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: not psutil.pid_exists(pid))
+
+
+def documents(store: hl.Store) -> list[int]:
+    """What only the index can answer."""
+    return [sum(1 for _ in store.topic(topic).documents()) for topic in TOPICS]
+
+
+# --- damaged data files ---
+
+SOME = [
+    "WiredTiger.turtle garbled",  # mongod does not start
+    "a collection removed",  # mongod ends when a question needs it
+    "a file for the directory",
+]
+
+
+def heal(store: Path, way: str) -> str:
+    """Damage the index; return what the commands say until all is well again."""
+    WAYS[way](store / "mongod" / "data")
+    said = ""
+    for _ in range(2):
+        done = run("verify", store=store)
+        assert "all is well" in done.out
+        assert "in the files" not in done.out
+        said += done.err
+    assert not list(store.glob("mongod*/data.damaged-*"))
+    return said
+
+
+@pytest.mark.parametrize("way", SOME)
+def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
+    said = heal(store, way)
+    if way == "a file for the directory":
+        assert said.count("added to the index") == 2
+    else:
+        assert said.startswith(REPLACED)
+        assert len(said.splitlines()) == 1
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("way", WAYS)
+def test_an_index_damaged_in_any_way_is_made_again(store: Path, way: str) -> None:
+    assert len(heal(store, way).splitlines()) <= 2
+
+
+def test_the_running_question_is_answered(store: Path) -> None:
+    """mongod ends when it reads the damaged file; the question goes on, from where it was."""
+    with hl.open(store) as opened:
+        want = documents(opened)
+        scans = [m.seq for m in opened.topic(SCAN).where(WHERE)]
+    ended(store)
+    WAYS["a collection garbled behind the head"](store / "mongod" / "data")
+    with hl.open(store, require_database=True) as opened:
+        assert documents(opened) == want
+        assert [m.seq for m in opened.topic(SCAN).where(WHERE)] == scans
+        assert len(opened.repairs.damage) == 1
+        assert sorted(opened.repairs.indexed) == ["one", "two"]
+    ended(store)
+    with hl.open(store) as opened:
+        assert documents(opened) == want
+        assert not opened.repairs.damage
+
+
+def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> None:
+    """A server that is not ours is left alone, whatever it says."""
+    with other_mongod(tmp_path) as uri, hl.open(store, mongo=uri) as opened:
+        want = documents(opened)
+        data = tmp_path / "other"
+        assert want
+    shutil.copytree(data, tmp_path / "kept")
+    WAYS["WiredTiger.turtle garbled"](data)
+    before = sorted(p.name for p in data.iterdir())
+    with hl.open(store, mongo=f"{uri}&serverSelectionTimeoutMS=300") as opened:
+        with pytest.raises(DatabaseError, match="does not answer"):
+            documents(opened)
+        assert opened.topic(IMU).where(WHERE).count() > 0
+    assert sorted(p.name for p in data.iterdir()) == before
+
+
+# --- a mongod that ends ---
+
+
+@contextlib.contextmanager
+def other_mongod(tmp_path: Path, *options: str, port: int | None = None) -> Iterator[str]:
+    """The URI of a mongod that is not the store's own, on the loopback interface."""
+    data = tmp_path / "other"
+    data.mkdir(exist_ok=True)
+    if port is None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+    command = [str(find_mongod()), "--dbpath", str(data), "--port", str(port), "--bind_ip",
+               "127.0.0.1", "--nounixsocket", "--wiredTigerCacheSizeGB", "0.25",
+               *options]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        uri = f"mongodb://127.0.0.1:{port}/healing?directConnection=true"
+        with MongoClient(uri, serverSelectionTimeoutMS=30000) as client:
+            client.admin.command("ping")
+        yield uri
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def test_a_killed_mongod_is_started_again(store: Path) -> None:
+    with hl.open(store, require_database=True) as opened:
+        want = documents(opened)
+        imu = opened.topic(IMU)
+        counts = imu.count(), imu.where(WHERE).count()
+        kill_mongod(store)
+        assert (imu.count(), imu.where(WHERE).count()) == counts
+        assert documents(opened) == want
+        assert not opened.repairs.damage
+        assert not opened.repairs.indexed
+
+
+def test_a_mongod_killed_in_the_middle_of_an_answer(store: Path) -> None:
+    with hl.open(store, require_database=True) as opened:
+        want = [d["_id"] for d in opened.topic(*TOPICS).documents()]
+        answer = opened.topic(*TOPICS).documents()
+        got = [next(answer)["_id"]]
+        kill_mongod(store)
+        got += [d["_id"] for d in answer]
+        assert got == want
+
+
+def test_an_unreachable_server_is_not_waited_for_by_each_question(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[str] = []
+    connect = Database.connect.__func__  # type: ignore[attr-defined]
+
+    def counted(cls: type[Database], uri: str, **options: float) -> Database:
+        tried.append(uri)
+        return connect(cls, uri, **options)
+
+    monkeypatch.setattr(Database, "connect", classmethod(counted))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    uri = f"mongodb://127.0.0.1:{port}/healing?directConnection=true&serverSelectionTimeoutMS=100"
+    with hl.open(store, mongo=uri) as opened:
+        for _ in range(3):
+            with pytest.raises(DatabaseError, match="does not answer"):
+                documents(opened)
+            assert opened.topic(IMU).where(WHERE).count() > 0
+        assert len(tried) == 1
+        # When that is some time ago, the next question tries again.
+        monkeypatch.setattr(session_module.time, "monotonic", lambda: time.perf_counter() + 1e9)
+        with other_mongod(tmp_path, port=port):
+            assert sum(documents(opened)) > 0
+            assert len(tried) == 2
+
+
+# --- resets, handles, roles ---
+
+
+class Resetting:
+    """A TCP proxy that resets the connection of some commands. A context manager.
+
+    Args:
+        target: Port of the server.
+        resets: Number of commands, from the first one, whose connection is reset.
+    """
+
+    def __init__(self, target: int, resets: int) -> None:
+        self._target = target
+        self.left = resets
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+
+    def __enter__(self) -> Resetting:
+        threading.Thread(target=self._accept, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                server = socket.create_connection(("127.0.0.1", self._target))
+                for pair in ((client, server), (server, client)):
+                    threading.Thread(target=self._forward, args=pair, daemon=True).start()
+
+    def _forward(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError), source, target:
+            while data := source.recv(1 << 16):
+                if self.left and b"$db\0\x08\0\0\0healing" in data:
+                    self.left -= 1
+                    source.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                    return
+                target.sendall(data)
+
+
+@pytest.mark.parametrize("resets", [1, 5])
+def test_opening_goes_on_after_resets(
+    store: Path, tmp_path: Path, server: str, resets: int
+) -> None:
+    port = int(server.partition("127.0.0.1:")[2].partition("/")[0])
+    with Resetting(port, resets) as proxy:
+        uri = server.replace(str(port), str(proxy.port))
+        with hl.open(store, mongo=uri, require_database=True) as opened:
+            assert sum(documents(opened)) > 0
+        assert not proxy.left
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    with other_mongod(tmp_path) as uri:
+        yield uri
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Iterator[tuple[str, str]]:
+    """URIs of users of one database who may write and who may only read."""
+    with other_mongod(tmp_path) as uri, MongoClient(uri) as client:
+        for name, role in (("writer", "readWrite"), ("reader", "read")):
+            roles = [{"role": role, "db": "healing"}]
+            client["healing"].command("createUser", name, pwd="secret", roles=roles)
+    with other_mongod(tmp_path, "--auth") as uri:
+        yield (
+            uri.replace("//", "//writer:secret@"),
+            uri.replace("//", "//reader:secret@"),
+        )
+
+
+def test_a_user_who_may_only_read_can_ask_everything(
+    store: Path, reader: tuple[str, str], tmp_path: Path
+) -> None:
+    writes, reads = reader
+    with hl.open(store, mongo=reads) as empty:
+        assert empty.topic(IMU).where(WHERE).count() > 0
+        assert empty.connect() is not None
+        with pytest.raises(IndexChangedError, match="may only read"):
+            documents(empty)
+    with hl.open(store, mongo=writes) as opened:
+        want = documents(opened)
+        counts = [opened.topic(t).where(WHERE).count() for t in TOPICS]
+    with hl.open(store, mongo=reads, require_database=True) as opened:
+        assert documents(opened) == want
+        assert [opened.topic(t).where(WHERE).count() for t in TOPICS] == counts
+        assert opened.topic(IMU).where({"header.seq": {"$mod": [100, 0]}}).count() > 0
+        assert not opened.verify().findings
+        for change in (
+            opened.reindex,
+            lambda: opened.add_index(IMU, "header.seq"),
+            lambda: opened.start("more"),
+        ):
+            with pytest.raises(DatabaseError, match="may only read"):
+                change()
+    # What the index lacks is answered by tables and messages, and is not written.
+    shutil.move(store, tmp_path / "moved")
+    write_bag(tmp_path / "three.bag", duration_s=1, seed=3, topics=TOPICS)
+    with hl.open(tmp_path / "moved", mongo="embedded") as opened:
+        opened.record(tmp_path / "three.bag")
+        counts = [opened.topic(t).where(WHERE).count() for t in TOPICS]
+    done = run("fetch", "-t", IMU, "--where", WHERE, "--count", "--mongo", reads,
+               store=tmp_path / "moved")  # fmt: skip
+    assert int(done.out) == counts[0]
+    with hl.open(tmp_path / "moved", mongo=reads, require_database=True) as opened:
+        assert [opened.topic(t).where(WHERE).count() for t in TOPICS] == counts
+        opened.remove("three")
+        assert documents(opened) == want
+
+
+LIMITED = ["prlimit", "--nofile=24:24"]
+
+
+def test_too_few_handles_are_told_as_that(store: Path) -> None:
+    """Nothing is damaged, and nothing is made again."""
+    before = {p: p.read_bytes() for p in (store / "mongod" / "data").iterdir() if p.is_file()}
+    command = [sys.executable, "-m", "hybridlog", "verify", "--store", str(store)]
+    done = subprocess.run([*LIMITED, *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 6, done.stderr
+    assert "ran out of file handles; the hard limit is 24. Raise it" in done.stderr
+    assert "damaged" not in done.stderr
+    assert "all is well in the files" in done.stdout
+    ended(store)
+    assert before.keys() <= set((store / "mongod" / "data").iterdir())
+    assert run("verify", store=store).err == ""
+
+
+def test_a_store_without_handles_is_not_a_damaged_one(store: Path) -> None:
+    def ask() -> tuple[int, int]:
+        with hl.open(store, mongo=NOWHERE) as opened:
+            return len(opened.recordings()), opened.topic(SCAN).where("ranges < 1").count()
+
+    want = ask()
+    used = {int(path.name) for path in Path("/proc/self/fd").iterdir()}
+    spare = [number for number in range(1000) if number not in used]
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    failures = []
+    for limit in spare[:10]:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+        try:
+            assert ask() == want
+        except ResourceError as error:
+            failures.append(str(error))
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert 3 <= len(failures) < 10
+    assert all("ulimit -n" in failure for failure in failures)
+    assert ask() == want
+    assert run("verify", store=store).err == ""
+
+
+# --- catalog and tables ---
+
+
+def zeroed(catalog: Path) -> None:
+    content = catalog.read_bytes()
+    catalog.write_bytes(content[:4096] + bytes(4096) + content[8192:])
+
+
+CATALOG: dict[str, Callable[[Path], object]] = {
+    "a zeroed page": zeroed,
+    "text": lambda catalog: catalog.write_text("no catalog\n" * 999),
+    "cut": lambda catalog: os.truncate(catalog, 5000),
+    "a folder": lambda catalog: (catalog.unlink(), catalog.mkdir()),
+    "a folder for its journal": lambda catalog: Path(f"{catalog}-journal").mkdir(),
+}
+
+
+@pytest.mark.parametrize("way", CATALOG)
+def test_a_damaged_catalog_is_made_again(store: Path, way: str) -> None:
+    listed = json.loads(run("ls", "--json", store=store).out)
+    CATALOG[way](store / "catalog.sqlite")
+    done = run("ls", "--json", store=store)
+    assert json.loads(done.out) == listed
+    assert done.err == "The catalog was damaged, and was made again.\n"
+    assert run("ls", store=store).err == ""
+
+
+@pytest.mark.parametrize("way", [*CATALOG][:4])
+def test_a_catalog_damaged_while_the_store_is_open(store: Path, way: str) -> None:
+    with hl.open(store, mongo=NOWHERE) as opened:
+        imu = opened.topic(IMU)
+        want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
+        CATALOG[way](store / "catalog.sqlite")
+        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
+        opened.refresh()
+        assert len(opened.recordings()) == 2
+        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
+        assert opened.catalog.is_sound()
+
+
+@pytest.mark.parametrize("way", ["removed", "cut", "garbled"])
+def test_damaged_tables_are_made_again(store: Path, way: str) -> None:
+    question = ("fetch", "-t", IMU, "--where", WHERE, "--count", "-q")
+    want = run(*question, store=store)
+    assert want.err == ""
+    for file in (store / "tables").rglob("*.parquet"):
+        {
+            "removed": file.unlink,
+            "cut": lambda file=file: os.truncate(file, file.stat().st_size // 2),
+            "garbled": lambda file=file: file.write_bytes(b"x" * file.stat().st_size),
+        }[way]()
+    done = run(*question, store=store)
+    assert done.out == want.out
+    assert done.err == "2 tables made again: missing or damaged.\n"
+    assert run(*question, store=store) == want
