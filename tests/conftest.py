@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import real_peers
+from tests import by_uri, real_peers
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in (
@@ -96,6 +97,7 @@ SLOW = frozenset(
         "servers/test_replica_set.py",
         "servers/test_resets.py",
         "servers/test_tls.py",
+        "servers/test_uri.py",
         "sources/test_rosbag1.py",
         "sources/test_rosbag2.py",
         "storage/test_catalog.py",
@@ -128,7 +130,36 @@ SLOW = frozenset(
 """Files left out by `-m "not slow"`: with them, a run takes ten minutes instead of one."""
 
 
+EMBEDDED = (
+    "benchmarks/",
+    "cli/",
+    "demo/",
+    "faults/",
+    "storage/test_mongod.py",
+    "test_consent.py",
+    "test_docs.py",
+    "test_faults.py",
+    "test_healing.py",
+    "test_hostile_store.py",
+    "test_many_topics.py",
+    "test_packaging.py",
+    "test_power_cut.py",
+)
+"""Files about the MongoDB that comes with hybridlog, and such whose stores are opened by other
+processes, which use it. `@pytest.mark.embedded` marks single tests of other files."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--mongo-uri",
+        default=os.environ.get("HYBRIDLOG_TESTS_MONGO"),
+        help="MongoDB for the tests' stores, each in a database of its own that is dropped at "
+        "the end; tests about the embedded MongoDB are left out",
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "embedded: about the MongoDB that comes with hybridlog")
     config.addinivalue_line("markers", 'slow: left out by -m "not slow", the quick loop')
     config.addinivalue_line("markers", "exhaustive: takes hours; run by -m exhaustive")
     config.addinivalue_line("markers", "peer(kind): speaks with a real peer, not one of ours")
@@ -145,11 +176,28 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.fixture(scope="session", autouse=True)
+def mongo_by_uri(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Stores that would use the embedded MongoDB use the one of `--mongo-uri`, if it is given."""
+    uri = request.config.getoption("--mongo-uri")
+    if uri is None:
+        yield
+        return
+    with by_uri.stores_at(uri):
+        yield
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     real_peers.mark(items)
     here = Path(__file__).parent
     for item in items:
         if item.path.relative_to(here).as_posix() in SLOW or item.get_closest_marker("exhaustive"):
             item.add_marker(pytest.mark.slow)
+        if item.path.relative_to(here).as_posix().startswith(EMBEDDED):
+            item.add_marker(pytest.mark.embedded)
+    if config.getoption("--mongo-uri") is not None:
+        left = [item for item in items if item.get_closest_marker("embedded")]
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if not item.get_closest_marker("embedded")]
     rank = {name: at for at, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))

@@ -200,6 +200,7 @@ def test_a_store_for_its_owner_alone(place: Path) -> None:
     assert "Permission denied" in done.err
 
 
+@pytest.mark.embedded
 @needs_root
 def test_root_takes_no_ones_server(place: Path) -> None:
     ann = User(place, 12345, 12345, (LAB,))

@@ -6,8 +6,10 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -85,12 +87,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
         port=port,
     ):
         first = f"mongodb://127.0.0.1:{port}/?tls=true&tlsCAFile={ours}"
-        with MongoClient(first) as client:
-            roles = ["root"]
-            eventually(
-                lambda: client.admin.command("createUser", "robot", pwd=PASSWORD, roles=roles),
-                "no server with TLS",
-            )
+        with MongoClient[dict[str, Any]](first) as client:
+            make = partial(client.admin.command, "createUser", pwd=PASSWORD)
+            eventually(lambda: make("admin", roles=["root"]), "no server with TLS")
+        with MongoClient[dict[str, Any]](first, username="admin", password=PASSWORD) as client:
+            # What the documentation says is enough.
+            roles = [{"role": "readWrite", "db": f"robots{n}"} for n in range(20)]
+            client.admin.command("createUser", "robot", pwd=PASSWORD, roles=roles)
         yield Guarded(port, ours, others)
 
 
