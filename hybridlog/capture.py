@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
     from hybridlog_storage.segment_file import Sealed
 
 
@@ -77,6 +78,8 @@ class Capture:
         source: Origin of its messages, for the catalog.
         settings: Rotation, chunks and compression of segments.
         pressure: Settings for a caller that cannot wait for compression, disk and index.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
+            no topic.
         check: Called with the catalog before anything is written, while no other process can
             start a recording; raises to refuse.
 
@@ -97,10 +100,12 @@ class Capture:
         source: Mapping[str, Any],
         settings: SegmentSettings,
         pressure: Backpressure | None = None,
+        no_index: Callable[[str], bool] | None = None,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = catalog
         self._directory = directory
+        self._no_index = no_index or (lambda _: False)
         self._sync = settings.sync != "never"
         self._end: Mapping[str, Any] | None = None
         self._turn = 1
@@ -124,12 +129,22 @@ class Capture:
             recording_metadata(self.entry),
             self.index.submit,
             settings,
+            no_index=self._no_index,
             on_sealing=self._announce,
             hurry=pressure.hurry if pressure else None,
             next_chunk_size=pressure.next_chunk_size if pressure else None,
             spare=pressure.spare if pressure else None,
             on_written=pressure.on_written if pressure else None,
         )
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages in the index, after the end."""
+        return max(0, self.index.indexed - (self.entry.messages - self.entry.documents))
+
+    def expect(self, channel: Channel) -> None:
+        """Prepare a channel before its first message."""
+        self.index.prepare(channel, with_place=not self._no_index(channel.topic))
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.

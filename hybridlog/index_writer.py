@@ -338,10 +338,16 @@ class IndexWriter:
             size += self._bytes_in_memory
         return (is_usual or self._lag.has_room(size)) and self._room.acquire(blocking=False)
 
-    def prepare(self, channel: Channel) -> None:
-        """Prepare a channel before its first message."""
+    def prepare(self, channel: Channel, *, with_place: bool) -> None:
+        """Prepare a channel before its first message.
+
+        Args:
+            channel: The channel.
+            with_place: Whether to assign a place in MongoDB to its topic.
+        """
         self._indexer.prepare(channel)
-        self._maker.submit(self._prepare, channel).add_done_callback(self._done)
+        if with_place:
+            self._maker.submit(self._prepare, channel).add_done_callback(self._done)
 
     def _prepare(self, channel: Channel) -> None:
         if self._is_away:

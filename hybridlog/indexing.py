@@ -84,10 +84,13 @@ class ChunkIndexer:
                     found.stamped(group.rows, group.stamps)
                 if group.error is not None:
                     found.unreadable(group.rows)
-                tables.append(assembler.assemble(placed, rows[group.rows], group.body, group.error))
+                if channel.is_indexed:
+                    row = rows[group.rows]
+                    tables.append(assembler.assemble(placed, row, group.body, group.error))
             if stamped:
                 _read_stamps(codec, batch, found)
-            documents.append(Documents(channel.topic, tables))
+            if channel.is_indexed:
+                documents.append(Documents(channel.topic, tables))
             for number, of_chunk in found.by_chunk():
                 stats[number][channel_id] = of_chunk
         entries = [

@@ -50,6 +50,7 @@ class RecordOptions:
         between: Log time `[begin, end)`, ns; None for all.
         again: True to record even if the same content is in the store.
         settings: Rotation, chunks and compression of segments.
+        no_index: Selects topics whose messages get no documents in MongoDB; None for none.
     """
 
     name: str | None = None
@@ -58,6 +59,7 @@ class RecordOptions:
     between: tuple[int, int] | None = None
     again: bool = False
     settings: SegmentSettings = field(default_factory=SegmentSettings)
+    no_index: TopicMatcher | None = None
 
 
 @dataclass(slots=True)
@@ -129,6 +131,7 @@ def record(
             "fingerprint": fingerprint,
         },
         settings=options.settings,
+        no_index=options.no_index,
         check=refuse_known,
     )
     try:
@@ -142,7 +145,7 @@ def record(
     return RecordReport(
         capture.entry,
         list(source.damage),
-        capture.index.indexed,
+        capture.indexed,
         capture.index.missed,
         failure,
         skipped,

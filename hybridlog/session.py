@@ -429,6 +429,7 @@ class Session:
                 self._schemas[c.schema] if c.schema is not None else None,
                 c.metadata,
                 has_publish_time=c.has_publish_time,
+                is_indexed=c.is_indexed,
             )
             for c in recording.channels
         }

@@ -322,7 +322,7 @@ class Store:
             return
         if report.failure is not None:
             report.entry = self.entry(report.entry.id)
-            report.indexed, report.missed, report.failure = report.entry.messages, 0, None
+            report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     def reindex(
         self,

@@ -119,6 +119,7 @@ SLOW = frozenset(
         "test_many_topics.py",
         "test_model.py",
         "test_mutants.py",
+        "test_no_index.py",
         "test_packaging.py",
         "test_power_cut.py",
         "test_reader.py",

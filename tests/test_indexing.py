@@ -81,11 +81,11 @@ def chunk_of(messages: Sequence[Message], number: int) -> StoredChunk:
     )
 
 
-def by_collection(parts: Iterable[Documents]) -> Mapping[str, list[bytes]]:
+def by_topic(parts: Iterable[Documents]) -> Mapping[str, list[bytes]]:
     found: dict[str, list[bytes]] = defaultdict(list)
     for part in parts:
         for table in part.tables:
-            found[part.collection] += [row.tobytes() for row in table]
+            found[part.topic] += [row.tobytes() for row in table]
     return {name: sorted(rows) for name, rows in found.items()}
 
 
@@ -95,7 +95,7 @@ def test_chunks_together_are_what_they_are_apart(chunks: list[list[Message]]) ->
     indexer = ChunkIndexer(RECORDING)
     documents, entries = indexer.documents_of(stored, CHANNELS)
     apart = [indexer.documents_of([chunk], CHANNELS) for chunk in stored]
-    assert by_collection(documents) == by_collection(part for parts, _ in apart for part in parts)
+    assert by_topic(documents) == by_topic(part for parts, _ in apart for part in parts)
     assert entries == [entry for _, (entry,) in apart]
 
 

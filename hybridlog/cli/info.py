@@ -75,7 +75,7 @@ def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
                 "last_ns": c.stats.last,
                 "skew_ns": _skew(c),
                 "unreadable": c.stats.unreadable if entry.is_decoded else None,
-                "not_indexed": c.reason,
+                "not_indexed": c.unindexed,
                 "metadata": c.metadata,
             }
             for c in entry.channels
@@ -164,8 +164,8 @@ def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> li
     stats = channel.stats
     rate = _rate(channel)
     notes = []
-    if channel.reason is not None:
-        notes.append(f"not indexed: {channel.reason}")
+    if channel.unindexed is not None:
+        notes.append(f"not indexed: {channel.unindexed}")
     if stats.unreadable:
         notes.append(f"{stats.unreadable} unreadable")
     if channel.message_encoding == REDUCED:

@@ -59,6 +59,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(choices),
+        no_index=matcher(choices.no_index) if choices.no_index else None,
     )
 
 

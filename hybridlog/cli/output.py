@@ -147,6 +147,12 @@ def stored(messages: int) -> str:
     return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
 
 
+def without_documents(messages: int) -> str:
+    """The end of a line that names messages of topics recorded with `--no-index`, if any."""
+    verb = "has" if messages == 1 else "have"
+    return f"; {counted(messages, 'message')} {verb} no documents (--no-index)" if messages else ""
+
+
 def unfit(messages: int) -> str:
     """A number of unreadable messages: `1 message does not fit its definition`."""
     verb = "does not fit its" if messages == 1 else "do not fit their"

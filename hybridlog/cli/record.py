@@ -71,6 +71,12 @@ def _is_file(word: str) -> bool:
     help="Only these: name, glob, or re:REGEX. Repeatable.",
 )
 @click.option("--exclude", "-x", multiple=True, metavar="TOPIC", help="Not these. Repeatable.")
+@click.option(
+    "--no-index",
+    multiple=True,
+    metavar="TOPIC",
+    help="No documents in MongoDB for these: questions about them read tables. Repeatable.",
+)
 @options.between
 @click.option("--name", metavar="NAME", help="Name of the recording; without, the file's.")
 @options.tags

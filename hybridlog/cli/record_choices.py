@@ -26,6 +26,7 @@ class RecordChoices:
     store: Path | None
     topics: tuple[str, ...]
     exclude: tuple[str, ...]
+    no_index: tuple[str, ...]
     between: tuple[str, str] | None
     name: str | None
     tag: tuple[str, ...]

@@ -43,6 +43,7 @@ def record_logs(choices: RecordChoices) -> None:
     settings = segment_settings(choices)
     tags = parse_tags(choices.tag)
     _matcher(choices)
+    _no_index(choices)
     _check_new_store(choices)
     done = _Results(choices)
     try:
@@ -113,7 +114,7 @@ def _record_one(
     from hybridlog.sources.detect import open_source
 
     with open_source(path) as source:
-        matcher = _matcher(choices)
+        matcher, no_index = _matcher(choices), _no_index(choices)
         options = RecordOptions(
             name=choices.name,
             tags=tags,
@@ -121,6 +122,7 @@ def _record_one(
             between=_between(source, choices),
             again=choices.again,
             settings=settings,
+            no_index=no_index,
         )
         with progress_bar(path.name, source.size_bytes, quiet=choices.quiet) as bar:
             report = store.record(
@@ -129,7 +131,7 @@ def _record_one(
                 lambda read, messages: bar(read, output.counted(messages, "message")),
             )
         _check_not_empty(report, source, store, options)
-    for pattern in matcher.unused() if matcher is not None else ():
+    for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
         output.note(f"{path}: no topic fits {output.quoted(pattern)}.")
     return report
 
@@ -175,6 +177,13 @@ def _matcher(choices: RecordChoices) -> TopicMatcher | None:
     if not choices.topics and not choices.exclude:
         return None
     return matcher(choices.topics, choices.exclude)
+
+
+def _no_index(choices: RecordChoices) -> TopicMatcher | None:
+    """The same for the topics without index documents."""
+    from hybridlog.query.topics import matcher
+
+    return matcher(choices.no_index) if choices.no_index else None
 
 
 class _Results:
@@ -243,7 +252,7 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "ratio": round(_ratio(entry.source["bytes"], entry.stored_bytes), 3),
         "seconds": round(report.elapsed_s, 3),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
-        "not_indexed": {c.topic: c.reason for c in entry.channels if c.reason is not None},
+        "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
     }
 
 
@@ -340,7 +349,7 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
     """Print problems; returns an error for each that sets the exit code."""
     problems: list[HybridlogError] = []
     for channel in report.entry.channels:
-        if channel.reason is not None and not quiet:
+        if channel.is_indexed and channel.reason is not None and not quiet:
             output.note(f"{channel.topic}: not indexed beyond time: {channel.reason}")
         if channel.stats.unreadable:
             output.note(

@@ -50,13 +50,15 @@ def command(
     for entry in done:
         if entry.status == "damaged":
             output.note(f"{entry.label} is damaged: `hybridlog losses {entry.label}` shows where.")
-    messages = sum(r.messages for r in done)
+    messages = sum(r.documents for r in done)
+    without = sum(r.messages for r in done) - messages
     elapsed = time.monotonic() - started
     if as_json:
         output.print_json(
             {
                 "recordings": len(done),
                 "messages": messages,
+                "messages_without_documents": without,
                 "left": left,
                 "seconds": round(elapsed, 3),
             }
@@ -65,4 +67,5 @@ def command(
         output.say(
             f"{output.counted(len(done), 'recording')}, "
             f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
+            f"{output.without_documents(without)}"
         )

@@ -70,4 +70,5 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
         f"{output.counted(result.chunks, 'chunk')}, "
         f"{output.counted(result.messages, 'message')}, "
         f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
+        f"{output.without_documents(result.without_documents)}"
     )

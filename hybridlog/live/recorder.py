@@ -70,6 +70,7 @@ class RecorderOptions:
         flush_interval_s: Seconds of messages that a `kill -9` can cost.
         settings: Settings of segments and chunks.
         snapshots: Store only messages around triggers; None to store everything.
+        no_index: Selects topics whose messages get no documents in MongoDB; None for none.
     """
 
     name: str = "live"
@@ -85,6 +86,7 @@ class RecorderOptions:
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
     snapshots: SnapshotOptions | None = None
+    no_index: TopicMatcher | None = None
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once."""
@@ -228,6 +230,7 @@ class Recorder:
                 budget_bytes=options.budget_bytes,
                 flush_interval_s=options.flush_interval_s,
                 settings=options.settings,
+                no_index=options.no_index,
             ),
         )
 

@@ -39,6 +39,7 @@ from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -76,6 +77,7 @@ class LiveOptions:
         flush_interval_s: Seconds after which a message is in the segment at the latest. A
             `kill -9` can cost the messages of this time.
         settings: Settings of segments and chunks.
+        no_index: Selects topics whose messages get no documents in MongoDB; None for none.
     """
 
     tags: Mapping[str, str] = field(default_factory=dict)
@@ -83,6 +85,7 @@ class LiveOptions:
     budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = field(default_factory=SegmentSettings)
+    no_index: TopicMatcher | None = None
 
     def __post_init__(self) -> None:
         if self.budget_bytes < MIN_USER_BUDGET:
@@ -187,6 +190,7 @@ class LiveRecording:
                 tags=options.tags,
                 source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
                 settings=options.settings,
+                no_index=options.no_index,
                 pressure=Backpressure(
                     hurry=lambda: self._is_under_pressure(self._compression_pressure),
                     behind=lambda: self._is_under_pressure(self._index_pressure),
@@ -234,7 +238,7 @@ class LiveRecording:
             self._check()
             for channel in channels:
                 _check_channel(channel)
-                self._capture.index.prepare(channel)
+                self._capture.expect(channel)
 
     def write(
         self,
@@ -382,12 +386,11 @@ class LiveRecording:
             except BaseException:
                 self._capture.leave()
                 raise
-        index = self._capture.index
         return RecordReport(
             self._capture.entry,
             [],
-            index.indexed,
-            index.missed,
+            self._capture.indexed,
+            self._capture.index.missed,
             failure,
             0,
             time.monotonic() - self._started,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import groupby
@@ -495,6 +496,7 @@ def remove_rest(
     state = IndexState(database)
     known = {entry.key: entry for entry in entries}
     places = _places(database, known.values())
+    expected = {entry.key: _documents(entry, places) for entry in known.values()}
     again: set[str] = set()
     strangers: list[object] = []
     for collection in state.document_collections():
@@ -506,7 +508,7 @@ def remove_rest(
                 strangers.append(key)
                 continue
             # Fewer, too: a document of no recording may have had the key of one.
-            missing = _messages_in(entry, collection, places) - found["count"]
+            missing = expected[entry.key][collection] - found["count"]
             if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
                 again.add(entry.key)
     # Listed after the index: a recording that has begun meanwhile has a directory by now.
@@ -527,8 +529,13 @@ def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, 
     return TopicPlaces(database).of({c.topic for entry in entries for c in entry.channels})
 
 
-def _messages_in(entry: RecordingEntry, collection: str, places: Mapping[str, TopicPlace]) -> int:
-    return sum(c.stats.messages for c in entry.channels if places[c.topic].collection == collection)
+def _documents(entry: RecordingEntry, places: Mapping[str, TopicPlace]) -> Counter[str]:
+    """Number of documents of a recording in each collection."""
+    found: Counter[str] = Counter()
+    for channel in entry.channels:
+        if channel.is_indexed:
+            found[places[channel.topic].collection] += channel.stats.messages
+    return found
 
 
 def mirror(catalog: Catalog, database: Database, recording: str) -> None:

@@ -63,6 +63,7 @@ class Verification:
         bytes_read: Bytes read from segments and journals.
         findings: All problems.
         index: True if the index was compared, too; MongoDB may be unavailable.
+        without_documents: Messages of topics that were recorded with `--no-index`.
     """
 
     recordings: int = 0
@@ -71,6 +72,7 @@ class Verification:
     bytes_read: int = 0
     findings: list[Finding] = field(default_factory=list)
     index: bool = True
+    without_documents: int = 0
 
 
 def verify(
@@ -168,6 +170,7 @@ class _Check:
             return
         entry = describe_inventory(self._catalog, inventory, is_open=is_held).entry
         self._row(entry)
+        self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return
         self._index(entry)

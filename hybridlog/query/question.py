@@ -143,6 +143,11 @@ class Part:
         """Messages of the topic in the recording, at any time."""
         return sum(stats.messages for stats in self.stats)
 
+    @property
+    def is_indexed(self) -> bool:
+        """True if all of its messages have documents in MongoDB."""
+        return all(c.channel.is_indexed for c in self.channels if c.stats.messages)
+
     @cached_property
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""

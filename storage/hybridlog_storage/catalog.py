@@ -144,6 +144,13 @@ class ChannelEntry:
     reason: str | None
     """Reason why its fields are not indexed, None if they are."""
     stats: ChannelStats = field(default_factory=ChannelStats)
+    is_indexed: bool = True
+    """False if its messages get no documents in MongoDB."""
+
+    @property
+    def unindexed(self) -> str | None:
+        """Reason why MongoDB has no fields of its messages, None if it has."""
+        return self.reason if self.is_indexed else "recorded with --no-index"
 
 
 @dataclass(slots=True)
@@ -200,6 +207,11 @@ class RecordingEntry:
     def messages(self) -> int:
         """Number of messages in all channels."""
         return sum(c.stats.messages for c in self.channels)
+
+    @property
+    def documents(self) -> int:
+        """Number of messages that have a document in a complete index."""
+        return sum(c.stats.messages for c in self.channels if c.is_indexed)
 
     def stats_of(self, topic: str) -> list[ChannelStats]:
         """Statistics of each channel of a topic."""
@@ -992,6 +1004,7 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
         metadata=dict(channel.metadata),
         has_publish_time=channel.has_publish_time,
         reason=reason,
+        is_indexed=channel.is_indexed,
     )
 
 

@@ -59,6 +59,7 @@ class Channel:
             `offered_qos_profiles`).
         has_publish_time: False if the source has no publish times; `publish_time`
             then repeats `log_time`.
+        is_indexed: False if its messages get no documents in MongoDB.
     """
 
     topic: str
@@ -66,6 +67,7 @@ class Channel:
     schema: Schema | None
     metadata: Mapping[str, str] = field(default_factory=dict)
     has_publish_time: bool = True
+    is_indexed: bool = True
 
 
 @dataclass(slots=True)

@@ -48,6 +48,7 @@ RECORDING_METADATA: Final = "hybridlog.recording"
 END_METADATA: Final = "hybridlog.end"
 LOSSES_METADATA: Final = "hybridlog.losses"
 NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
+NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: arrival numbers of a chunk's messages."""
@@ -83,9 +84,11 @@ def schema_record(schema_id: int, schema: Schema) -> SchemaRecord:
 def channel_record(channel_id: int, schema_id: int, channel: Channel) -> ChannelRecord:
     """The MCAP record of a channel; private metadata keys hold what MCAP has no field for."""
     metadata = dict(channel.metadata)
-    metadata.pop(NO_PUBLISH_TIME, None)
-    if not channel.has_publish_time:
-        metadata[NO_PUBLISH_TIME] = "1"
+    flags = {NO_PUBLISH_TIME: not channel.has_publish_time, NO_INDEX: not channel.is_indexed}
+    for name, is_set in flags.items():
+        metadata.pop(name, None)
+        if is_set:
+            metadata[name] = "1"
     return ChannelRecord(
         id=channel_id,
         topic=channel.topic,
@@ -108,9 +111,13 @@ def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Ch
             raise SegmentError(f"channel {record.id} refers to schema {record.schema_id}: unknown")
         schema = Schema(found.name, found.encoding, bytes(found.data))
     metadata = dict(record.metadata)
-    unknown = metadata.pop(NO_PUBLISH_TIME, None)
     return Channel(
-        record.topic, record.message_encoding, schema, metadata, has_publish_time=unknown is None
+        record.topic,
+        record.message_encoding,
+        schema,
+        metadata,
+        has_publish_time=metadata.pop(NO_PUBLISH_TIME, None) is None,
+        is_indexed=metadata.pop(NO_INDEX, None) is None,
     )
 
 

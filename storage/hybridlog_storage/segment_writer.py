@@ -129,6 +129,8 @@ class RecordingWriter:
         on_written: Called on a writer thread when less content is waiting. With it `append`
             never waits for the disk, and the caller watches `waiting`. Without it `append`
             waits for a slow disk.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB; None
+            for no topic. The segments keep that.
         on_sealing: Called when a segment is complete and, unless `sync` is never, on the
             disk, before it gets its final name. Called on a writer thread or by `give_up`.
             An exception stops the writer like a failed write.
@@ -145,6 +147,7 @@ class RecordingWriter:
         next_chunk_size: Callable[[], int] | None = None,
         spare: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
+        no_index: Callable[[str], bool] | None = None,
         on_sealing: OnSealing | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -168,6 +171,7 @@ class RecordingWriter:
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
+        self._no_index = no_index or (lambda _: False)
         self._on_sealing: OnSealing = on_sealing or (lambda _: None)
         self._closed_bytes = 0
         self._stored_bytes = 0
@@ -346,6 +350,8 @@ class RecordingWriter:
         channel_id = len(self._known) + 1
         cluster = channel_id if mean >= self.settings.large_payload else _SHARED
         known = self._known[channel] = _Known(channel_id, schema_id, cluster)
+        if channel.is_indexed and self._no_index(channel.topic):
+            channel = replace(channel, is_indexed=False)
         self.channels[channel_id] = channel
         return known
 
@@ -473,7 +479,8 @@ class RecordingWriter:
         for channel_id in first.indexes:
             if channel_id not in segment.channels:
                 channel = self.channels[channel_id]
-                segment.define(channel_id, self._known[channel].schema_id, channel)
+                schema = channel.schema
+                segment.define(channel_id, self._schema_ids[schema] if schema else 0, channel)
         chunks, size = [first], len(first.data)
         while size < _WRITTEN_AT_ONCE and len(chunks) < len(self._packed):
             following = self._packed[len(chunks)]

@@ -11,7 +11,7 @@ import bson
 
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.planner import Planner
-from hybridlog_storage.errors import ConnectionLostError
+from hybridlog_storage.errors import ConnectionLostError, TopicError
 from hybridlog_storage.index_documents import KEY_BYTES
 
 if TYPE_CHECKING:
@@ -28,10 +28,17 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
     Raises:
         DatabaseError: MongoDB is unavailable.
         IndexChangedError: another process changes the index.
+        TopicError: a topic was recorded without index documents.
     """
     session.database_for("Reading index documents")
     planner = Planner(session, question, counters)
     parts = planner.parts()
+    missing = sorted({part.topic for part in parts if not part.is_indexed})
+    if missing:
+        raise TopicError(
+            f"{missing[0]} has no index documents: it was recorded with --no-index. Ask for its "
+            "messages or tables."
+        )
     mongo = Mongo(session, counters, lambda: parts)
     by_topic: dict[str, list[Part]] = defaultdict(list)
     for part in parts:

@@ -64,7 +64,7 @@ class Mongo:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
-        if need is Need.VALUES or self._is_away or _is_older(part):
+        if need is Need.VALUES or self._is_away or _is_older(part) or not part.is_indexed:
             return None
         if self._session.database is None:
             return None

@@ -1,0 +1,166 @@
+"""Topics without documents in MongoDB: the same answers, in every rebuild."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+import hybridlog as hl
+from hybridlog.maintenance.index import catch_up
+from hybridlog.query.engines.mongo import Mongo
+from hybridlog.query.topics import matcher
+from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.errors import TopicError
+from hybridlog_storage.messages import Channel
+from tests.cli.running import run
+from tests.many_topics import topic, write_log
+
+FOUR = [topic(number) for number in range(4)]
+LEFT_OUT = FOUR[2:]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("log") / "log.mcap", 4, 20)
+
+
+@pytest.fixture
+def store(tmp_path: Path, log: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+        report = opened.record(log, no_index=matcher(["re:.*signal[23]"]))
+        assert (report.indexed, report.missed, report.entry.documents) == (40, 0, 40)
+        yield opened
+
+
+def documents(store: hl.Store) -> dict[str, int]:
+    database = store.database_for("this test")
+    found = {name: database.count(collection_of(name), {"_meta.seq": {"$gte": 0}}) for name in FOUR}
+    return {name: count for name, count in found.items() if count}
+
+
+INDEXED = dict.fromkeys(FOUR[:2], 20)
+
+
+def test_tables_and_messages_answer(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert documents(store) == INDEXED
+    everything = store.all_topics()
+    assert everything.count() == 80
+    assert everything.where("data >= 18").count() == 8
+    assert [m.topic for m in everything.where("data >= 19")] == FOUR
+    asked: list[str] = []
+    real = Mongo.cost
+
+    def cost(self: Mongo, part: object, *args: object) -> float | None:
+        found = real(self, part, *args)  # type: ignore[arg-type]
+        if found is not None:
+            asked.append(part.topic)  # type: ignore[attr-defined]
+        return found
+
+    monkeypatch.setattr(Mongo, "cost", cost)
+    for name in FOUR:
+        assert store.topic(name).where("data >= 10").count() == 10
+        assert len(store.topic(name).where("data >= 10").to_pandas()) == 10
+    assert asked
+    assert set(asked) <= set(FOUR[:2])
+    shutil.rmtree(store.directory.path / "tables")
+    store.refresh()
+    assert store.topic(FOUR[3]).where("data >= 10").count() == 10
+
+
+def test_index_documents_that_are_not_there_are_no_empty_answer(store: hl.Store) -> None:
+    assert len(list(store.topic(FOUR[0]).documents())) == 20
+    with pytest.raises(TopicError, match=f"{LEFT_OUT[0]} has no index documents.*--no-index"):
+        list(store.all_topics().documents())
+
+
+def test_every_rebuild_keeps_it(store: hl.Store) -> None:
+    assert store.verify().findings == []
+    store.reindex()
+    assert documents(store) == INDEXED
+    store.reindex(["log"])
+    assert documents(store) == INDEXED
+    store.database_for("this test").drop_all()
+    path = store.directory.path
+    store.close()
+    (path / CATALOG).unlink()
+    with hl.open(path, require_database=True) as again:
+        assert documents(again) == INDEXED
+        assert again.verify().findings == []
+        (entry,) = again.recordings()
+        assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
+        assert catch_up(again.directory, again.catalog, again.connect(), entry.label) == 0
+
+
+def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
+    database = store.database_for("this test")
+    (entry,) = store.recordings()
+    stray = {"_id": b"x" * 24, "_meta": {"rec": entry.key}}
+    database.ensure_collection(collection_of(LEFT_OUT[0]))
+    database.replace(collection_of(LEFT_OUT[0]), {"_id": stray["_id"]}, stray)
+    (finding,) = store.verify().findings
+    assert "1 index documents, 0 messages" in finding.problem
+    store.reindex()
+    assert documents(store) == INDEXED
+    assert store.verify().findings == []
+
+
+def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
+    (segment,) = (store.directory.path / "recordings" / "log").glob("*.mcap")
+    with segment.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()  # type: ignore[union-attr]
+    marked = {c.topic for c in channels if c.metadata.get("hybridlog.no_index") == "1"}
+    assert marked == set(LEFT_OUT)
+    with hl.open(tmp_path / "other", create=True, require_database=True) as other:
+        other.import_from(store.directory.path)
+        assert documents(other) == INDEXED
+        # A slice is a new log.
+        run("fetch", "-t", "**", "-o", tmp_path / "slice.mcap", store=store.directory.path)
+        other.record(tmp_path / "slice.mcap")
+        assert documents(other) == {name: 20 + INDEXED.get(name, 0) for name in FOUR}
+
+
+def test_a_live_recording(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        said, silent = (Channel(name, "json", None) for name in ("/said", "/silent"))
+        with store.start("talk", no_index=matcher(["silent"])) as recording:
+            recording.expect(said, silent)
+            for number in range(5):
+                for channel in (said, silent):
+                    recording.write(channel, b'{"n": %d}' % number)
+        database = store.database_for("this test")
+        assert database.count("said") == 5
+        assert not {"silent", "hybridlog.shared"} & set(database.list_collections())
+        assert store.topic("silent").where("n >= 3").count() == 2
+        assert store.verify().findings == []
+
+
+def test_as_a_command(tmp_path: Path, log: Path) -> None:
+    place = tmp_path / "store"
+    arguments = ("record", log, "--no-index", "signal[23]", "--no-index", "nothing", "--json")
+    done = run(*arguments, store=place)
+    assert "no topic fits 'nothing'" in done.err
+    assert done.json["messages_indexed"] == 40
+    assert done.json["not_indexed"] == dict.fromkeys(LEFT_OUT, "recorded with --no-index")
+    channels = run("info", "log", "--json", store=place).json["channels"]
+    shown = {channel["topic"]: channel["not_indexed"] for channel in channels}
+    assert [name for name in FOUR if shown[name]] == LEFT_OUT
+    assert run("info", "log", store=place).out.count("not indexed: recorded with --no-index") == 2
+    told = run("reindex", "--json", store=place).json
+    assert (told["messages"], told["messages_without_documents"]) == (40, 40)
+    assert run("verify", "--json", store=place).json["without_documents"] == 40
+    for command in ("reindex", "verify"):
+        assert "; 40 messages have no documents (--no-index)" in run(command, store=place).out
+    replayed = run(
+        *("record", "--replay", log, "--speed", 1000, "--name", "live"),
+        *("--no-index", "**", "--quiet"),
+        store=place,
+    )
+    assert replayed.out == ""
+    channels = run("info", "live", "--json", store=place).json["channels"]
+    assert len(channels) == 4
+    assert all(channel["not_indexed"] for channel in channels)
