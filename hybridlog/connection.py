@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from hybridlog_storage.errors import ConnectionLostError, DatabaseError, StoreError
-from hybridlog_storage.settings import EMBEDDED, with_password
+from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, with_password
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
@@ -23,18 +24,23 @@ class Connection:
     Args:
         directory: The store.
         mongo: URI of the MongoDB, or `embedded`; None for the one in the store's settings.
+        cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
+            for the one in the store's settings.
 
     Attributes:
         may_write: False if the user of MongoDB may only read.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
     """
 
-    def __init__(self, directory: StoreDirectory, mongo: str | None) -> None:
+    def __init__(
+        self, directory: StoreDirectory, mongo: str | None, cache_mb: int | None = None
+    ) -> None:
         self.may_write = True
         self.damage: list[str] = []
         self._database: Database | None = None
         self._directory = directory
         self._wanted = mongo
+        self._cache_mb = cache_mb
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
 
@@ -84,7 +90,9 @@ class Connection:
         if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
 
-            self._mongod = self._mongod or EmbeddedMongod(self._directory.mongod)
+            if self._mongod is None:
+                cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
+                self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
             try:
                 uri = self._mongod.start()
             except StoreError as error:
@@ -138,3 +146,14 @@ class Connection:
             place = lease.place_of(self._directory)
             lease.check(state.mark(), place, database, embedded=True)
             state.claim(place)
+
+
+def _bounded_cache_mb(stored: int | None) -> int:
+    """The size of the cache in a store's settings, at most half of the memory.
+
+    The store may come from a larger machine, or from somebody else.
+    """
+    if stored is None:
+        return MIN_CACHE_MB
+    memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+    return max(MIN_CACHE_MB, min(stored, memory_mb // 2))

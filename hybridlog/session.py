@@ -56,6 +56,8 @@ class Session:
         mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in
             the store's settings.
         progress: Called while an index is brought up to date.
+        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
+            settings.
 
     Attributes:
         directory: The store's directory.
@@ -66,10 +68,14 @@ class Session:
     """
 
     def __init__(
-        self, directory: StoreDirectory, mongo: str | None, progress: Progress | None
+        self,
+        directory: StoreDirectory,
+        mongo: str | None,
+        progress: Progress | None,
+        cache_mb: int | None = None,
     ) -> None:
         self.directory = directory
-        self.connection = Connection(directory, mongo)
+        self.connection = Connection(directory, mongo, cache_mb)
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
         self._unavailable: HybridlogError | None = None

@@ -27,7 +27,12 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.settings import EMBEDDED, NAME
+from hybridlog_storage.settings import (
+    EMBEDDED,
+    NAME,
+    cache_mb_from_environment,
+    checked_cache_mb,
+)
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
@@ -56,6 +61,7 @@ def open_store(
     shared: bool = False,
     require_database: bool = False,
     progress: Progress | None = None,
+    cache_mb: int | None = None,
 ) -> Store:
     """Open a store; recover first after a crash.
 
@@ -69,24 +75,31 @@ def open_store(
         shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
+        cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
+            `HYBRIDLOG_CACHE_SIZE`, the store's own setting, or 256. A new store keeps it. A
+            MongoDB that runs already is not changed.
 
     Raises:
+        UsageError: MongoDB does not accept such a cache.
         StoreError: It is not a store, or has another format.
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
     wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
+    if cache_mb is not None:
+        checked_cache_mb(cache_mb, "The size of the cache")
+    cache = cache_mb or cache_mb_from_environment()
     if create:
         own = None if mongo in {None, EMBEDDED} else mongo
         is_new = not os.path.lexists(where / NAME)
-        directory = StoreDirectory.create(where, mongo=own, shared=shared)
+        directory = StoreDirectory.create(where, mongo=own, shared=shared, cache_mb=cache_mb)
         directory.check_writable()
         if is_new and own is not None:
             with suppress(StoreError):  # without a home directory, each command must name it again
                 consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
-    store = Store(directory, mongo=wanted, progress=progress)
+    store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache)
     try:
         if require_database:
             store.connect()
@@ -106,6 +119,8 @@ class Store:
         mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in the
             store's settings.
         progress: Called while an index is brought up to date.
+        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
+            settings.
 
     Attributes:
         session: Its state while it is open.
@@ -119,9 +134,10 @@ class Store:
         *,
         mongo: str | None = None,
         progress: Progress | None = None,
+        cache_mb: int | None = None,
     ) -> None:
         self.directory = directory
-        self.session = Session(directory, mongo, progress)
+        self.session = Session(directory, mongo, progress, cache_mb)
 
     def __enter__(self) -> Self:
         """Return this store."""

@@ -107,6 +107,7 @@ SLOW = frozenset(
         "tables/test_reader.py",
         "tables/test_writer.py",
         "test_benchmarks.py",
+        "test_cache_size.py",
         "test_catalog_by_hand.py",
         "test_consent.py",
         "test_docs.py",

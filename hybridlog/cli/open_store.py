@@ -25,6 +25,7 @@ def opened_store(
     create: bool = False,
     shared: bool = False,
     needs_database: bool = False,
+    cache_mb: int | None = None,
     quiet: bool = False,
 ) -> Iterator[Store]:
     """The open store.
@@ -35,6 +36,7 @@ def opened_store(
         create: Make it if there is none.
         shared: If it is made: for the group of its directory.
         needs_database: Fail when MongoDB is unavailable.
+        cache_mb: Size of the embedded MongoDB's cache in MiB.
         quiet: No progress while the index is brought up to date.
     """
     from hybridlog.store import open_store
@@ -48,6 +50,7 @@ def opened_store(
             shared=shared,
             require_database=needs_database,
             progress=bar,
+            cache_mb=cache_mb,
         )
     finally:
         bar.close()

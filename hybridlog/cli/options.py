@@ -30,6 +30,15 @@ mongo = click.option(
     help="URI of the MongoDB that holds the index, or 'embedded' for our own; without, the one "
     "that the store was made with.",
 )
+cache_size = click.option(
+    "--cache-size",
+    type=int,
+    envvar="HYBRIDLOG_CACHE_SIZE",
+    show_envvar=True,
+    metavar="MB",
+    help="Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
+    "made with, or 256.",
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for scripts.")
 quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
 force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")

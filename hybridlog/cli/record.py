@@ -221,6 +221,7 @@ def _is_file(word: str) -> bool:
     help="If this makes the store: let the group of its directory write it.",
 )
 @options.mongo
+@options.cache_size
 @options.as_json
 @options.quiet
 @click.pass_context

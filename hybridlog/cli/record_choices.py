@@ -57,6 +57,7 @@ class RecordChoices:
     after: str | None
     shared: bool
     mongo: str | None
+    cache_size: int | None
     as_json: bool
     quiet: bool
     live_options: tuple[str, ...]

@@ -51,6 +51,7 @@ def record_live(choices: RecordChoices) -> None:
                 create=True,
                 shared=choices.shared,
                 needs_database=True,
+                cache_mb=choices.cache_size,
                 quiet=quiet,
             )
         )

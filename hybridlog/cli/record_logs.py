@@ -55,6 +55,7 @@ def record_logs(choices: RecordChoices) -> None:
                 create=True,
                 shared=choices.shared,
                 needs_database=True,
+                cache_mb=choices.cache_size,
                 quiet=choices.quiet,
             ) as store,
         ):

@@ -17,6 +17,7 @@ from hybridlog.cli.signals import if_stopped
 @options.recordings
 @options.store
 @options.mongo
+@options.cache_size
 @options.as_json
 @options.quiet
 def command(
@@ -24,6 +25,7 @@ def command(
     recording: tuple[str, ...],
     store: Path | None,
     mongo: str | None,
+    cache_size: int | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -33,7 +35,9 @@ def command(
     that needs the index finishes the recording at which it stopped.
     """
     started = time.monotonic()
-    with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
+    with opened_store(
+        store, mongo, needs_database=True, cache_mb=cache_size, quiet=quiet
+    ) as opened:
         chosen = opened.select(recording or None)
         total = sum(entry.stored_bytes for entry in chosen)
         with (

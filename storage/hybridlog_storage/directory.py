@@ -73,7 +73,12 @@ class StoreDirectory:
 
     @classmethod
     def create(
-        cls, path: Path, *, mongo: str | None = None, shared: bool = False
+        cls,
+        path: Path,
+        *,
+        mongo: str | None = None,
+        shared: bool = False,
+        cache_mb: int | None = None,
     ) -> StoreDirectory:
         """Create a store, or open an existing one.
 
@@ -81,6 +86,7 @@ class StoreDirectory:
             path: The directory.
             mongo: URI of the MongoDB to use instead of the embedded one; without a password.
             shared: Whether a group may write it; for a new store only.
+            cache_mb: Size of the embedded MongoDB's cache in MiB; for a new store only.
 
         Raises:
             StoreError: The directory holds other files, or cannot be written.
@@ -92,7 +98,10 @@ class StoreDirectory:
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
                 with _alone(path, depth=0):
-                    cls._make(path, mongo, shared=shared)
+                    settings = StoreSettings(
+                        secrets.token_hex(16), mongo=mongo, shared=shared, cache_mb=cache_mb
+                    )
+                    cls._make(path, settings)
             store = cls(path)
             try:
                 files.make_folder(path / _RECORDINGS, depth=files.IN_STORE)
@@ -105,7 +114,7 @@ class StoreDirectory:
         return store
 
     @staticmethod
-    def _make(path: Path, mongo: str | None, *, shared: bool) -> None:
+    def _make(path: Path, settings: StoreSettings) -> None:
         names = {entry.name for entry in path.iterdir()}
         if SETTINGS in names:
             return
@@ -115,8 +124,8 @@ class StoreDirectory:
                 f"{path} holds files and is not a hybridlog store. "
                 "Choose an empty or a new directory with --store."
             )
-        write_settings(path, StoreSettings(secrets.token_hex(16), mongo=mongo, shared=shared))
-        if shared:
+        write_settings(path, settings)
+        if settings.shared:
             make_shared(path)
 
     @property

@@ -58,13 +58,12 @@ from hybridlog_storage.errors import (
     UsageError,
     exhausted,
 )
+from hybridlog_storage.settings import MIN_CACHE_MB
 from hybridlog_storage.socket_directory import is_our_socket, is_socket_of, new_socket
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-MIN_CACHE_MB = 256
-"""The smallest cache that WiredTiger accepts, in MiB."""
 DEFAULT_LINGER_S = 5.0
 SILENCE_LIMIT_S = 30.0
 """Seconds in which a starting mongod must answer or write to its log."""

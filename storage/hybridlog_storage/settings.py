@@ -28,6 +28,11 @@ EMBEDDED: Final = "embedded"
 FEATURES: Final[frozenset[str]] = frozenset()
 """Features that a store may require of its reader."""
 
+MIN_CACHE_MB: Final = 256
+"""Smallest cache that MongoDB accepts, in MiB."""
+MAX_CACHE_MB: Final = 10_000 << 10
+"""Largest one, in MiB."""
+
 _LIMIT = 1 << 20  # bytes of hybridlog.toml
 _PASSWORD_LIMIT = 4096  # bytes of a file with a password
 _HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
@@ -49,6 +54,7 @@ class StoreSettings:
         shared: Whether a group shares the store (`hybridlog_storage.sharing`).
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
+        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
     """
 
     store_id: str
@@ -56,6 +62,7 @@ class StoreSettings:
     shared: bool = False
     requires: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
+    cache_mb: int | None = None
 
 
 def read_settings(path: Path) -> StoreSettings:
@@ -98,7 +105,14 @@ def read_settings(path: Path) -> StoreSettings:
     if not isinstance(shared, bool):
         raise StoreError(f"{file}: shared must be true or false.")
     mongo = _stored_uri(file, values.get("mongo"))
-    return StoreSettings(store_id, mongo, shared, requires, _names(file, values, "optional"))
+    cache_mb = values.get("cache_mb")
+    if cache_mb is not None:
+        try:
+            cache_mb = checked_cache_mb(cache_mb, f"{file}: cache_mb")
+        except UsageError as error:
+            raise StoreError(str(error)) from None
+    optional = _names(file, values, "optional")
+    return StoreSettings(store_id, mongo, shared, requires, optional, cache_mb)
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
@@ -117,11 +131,43 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
         lines.append(f"mongo = {_quoted(without_password(settings.mongo))}")
     if settings.shared:
         lines.append("shared = true")
+    if settings.cache_mb is not None:
+        lines.append(f"cache_mb = {settings.cache_mb}")
     for name, features in (("requires", settings.requires), ("optional", settings.optional)):
         if features:
             lines.append(f"{name} = [{', '.join(map(_quoted, features))}]")
     content = ("\n".join(lines) + "\n").encode()
     files.write_file(path / NAME, content, depth=files.IN_STORE)
+
+
+def checked_cache_mb(value: object, name: str) -> int:
+    """A size of the embedded MongoDB's cache in MiB.
+
+    Args:
+        value: The size.
+        name: The setting, for the message.
+
+    Raises:
+        UsageError: It is not an integer, or MongoDB does not accept it.
+    """
+    if type(value) is not int or not MIN_CACHE_MB <= value <= MAX_CACHE_MB:
+        raise UsageError(
+            f"{name} must be a number of MB from {MIN_CACHE_MB} to {MAX_CACHE_MB}, not {value!r}."
+        )
+    return value
+
+
+def cache_mb_from_environment() -> int | None:
+    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one.
+
+    Raises:
+        UsageError: It is not a size.
+    """
+    text = os.environ.get("HYBRIDLOG_CACHE_SIZE")
+    if not text:
+        return None
+    value = int(text) if re.fullmatch(r"[0-9]{1,12}", text) else text
+    return checked_cache_mb(value, "HYBRIDLOG_CACHE_SIZE")
 
 
 def without_password(uri: str) -> str:

@@ -30,6 +30,7 @@ def write(store: Path, text: str | bytes) -> Path:
     [
         StoreSettings("ab12"),
         StoreSettings("ab12", "mongodb://me@h1:1,h2/db?tls=true"),
+        StoreSettings("ab12", cache_mb=300),
         StoreSettings("ab12", shared=True, optional=("colours", "Größe \U0001f600 \x7f\"'\\")),
     ],
 )
