@@ -4,21 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from pymongo import monitoring
 
 _QUIET = frozenset({"hello", "isMaster", "ping", "endSessions"})
 
 
+class Sent(NamedTuple):
+    """A command: its name, the collection that it asks, and the read concern it asks for."""
+
+    name: str
+    collection: str
+    read: str
+
+
 class _Listener(monitoring.CommandListener):
     def __init__(self) -> None:
-        self.heard: list[list[str]] = []
+        self.heard: list[list[Sent]] = []
 
     def started(self, event: monitoring.CommandStartedEvent) -> None:
         if event.command_name not in _QUIET:
-            for names in self.heard:
-                names.append(event.command_name)
+            read = event.command.get("readConcern", {}).get("level", "local")
+            for sent in self.heard:
+                asked = str(event.command.get(event.command_name))
+                sent.append(Sent(event.command_name, asked, read))
 
     def succeeded(self, event: Any) -> None: ...
 
@@ -30,12 +40,12 @@ monitoring.register(_LISTENER)
 
 
 @contextmanager
-def commands() -> Iterator[list[str]]:
-    """Names of the commands that are sent meanwhile, by connections made from now on."""
-    names: list[str] = []
-    _LISTENER.heard.append(names)
+def commands() -> Iterator[list[Sent]]:
+    """The commands that are sent meanwhile, by connections made from now on."""
+    sent: list[Sent] = []
+    _LISTENER.heard.append(sent)
     try:
-        yield names
+        yield sent
     finally:
-        # By identity: lists of equal names are equal.
-        _LISTENER.heard[:] = [other for other in _LISTENER.heard if other is not names]
+        # By identity: lists of equal commands are equal.
+        _LISTENER.heard[:] = [other for other in _LISTENER.heard if other is not sent]

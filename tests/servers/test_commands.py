@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.query.counters import Counters
 from hybridlog.query.engines import mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.planner import Planner
 from tests.faults import logs
-from tests.servers.commands import commands
+from tests.servers.commands import Sent, commands
 
 MESSAGES = 12
 GAP = 1000  # messages that would lie between two recordings
@@ -58,15 +60,27 @@ def add(path: Path, numbers: range) -> None:
             store.record(logs.write(log, logs.content(n * GAP, MESSAGES)), name=f"log {n}")
 
 
-def asked(path: Path) -> tuple[dict[str, list[str]], dict[str, object]]:
+def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
     """What MongoDB gets for each question and for opening, and the answers."""
     heard, answers = {}, {}
-    with commands() as opening, hl.open(path, require_database=True):
-        heard["open"] = [*opening]
+    with commands() as sent, hl.open(path, require_database=True) as store:
+        heard["open"] = [*sent]
+        log = logs.write(path.parent / "more.mcap", logs.content(900 * GAP, MESSAGES))
+        sent.clear()
+        more = store.record(log, name="more")
+        heard["record"] = [*sent]
+        store.connect()
+        sent.clear()
+        store.reindex(["more"])
+        heard["reindex"] = [*sent]
+        store.connect()
+        sent.clear()
+        store.remove(more.entry.id)
+        heard["remove"] = [*sent]
     for name, ask in QUESTIONS.items():
-        with hl.open(path, require_database=True) as store, commands() as names:
+        with hl.open(path, require_database=True) as store, commands() as sent:
             answers[name] = ask(store)
-            heard[name] = [*names]
+            heard[name] = [*sent]
     return heard, answers
 
 
@@ -82,10 +96,8 @@ def test_no_question_asks_once_a_recording(tmp_path: Path, monkeypatch: pytest.M
         assert answers == truth
         add(path, range(10, 40))
         many, _ = asked(path)
-    for k in few:
-        print(k, len(few[k]), len(many[k]), few[k][:9])
-    assert {name: len(names) for name, names in many.items()} == {
-        name: len(names) for name, names in few.items()
+    assert {name: len(sent) for name, sent in many.items()} == {
+        name: len(sent) for name, sent in few.items()
     }
     assert all(few.values())
 
@@ -101,9 +113,14 @@ def test_some_of_many_recordings(
         monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
         monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
         monkeypatch.setattr(mongo, "_MOST_APART", most)
-        for chosen in ([0, 1, 2, 4, 6], [6], [0, 3], range(7)):
+        for chosen, apart in (([0, 1, 2, 4, 6], 3), ([6], 1), ([0, 3], 2), (range(7), 1)):
             query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
             there = [n * GAP + k for n in chosen for k in range(MESSAGES)]
+            parts = Planner(store.session, query.question, Counters()).parts()
+            engine = mongo.Mongo(store.session, Counters())
+            ranges = engine._ranges(parts, [part.recording.span for part in parts])
+            assert len(ranges) == (apart if most == 1 else len(chosen))
+            assert [p for _, own in ranges for p in own] == parts
             assert query.where("n >= 5").count() == len([n for n in there if n >= 5])
             assert [d["n"] for d in query.where("n >= 5").documents()] == [
                 n for n in there if n >= 5

@@ -18,6 +18,7 @@ from hybridlog_storage.database import Database
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.faults import logs
+from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
 
 NUMBERS = count()
@@ -100,6 +101,23 @@ def test_killed_during_a_live_recording(store: hl.Store, killing: list[str]) -> 
     report = recording.close()
     assert report.failure is None
     check(store, written)
+
+
+def test_the_state_of_the_index_cannot_be_rolled_back(
+    members: ReplicaSet, tmp_path: Path, only_mongodb: None
+) -> None:
+    """It is read as a majority has it, after a read that no deposed primary answers."""
+    log = logs.write(tmp_path / "a.mcap", logs.content(0, 10))
+    uri = members.uri(f"store{next(NUMBERS)}", "&readPreference=secondary&w=1")
+    with hl.open(tmp_path / "store", create=True, mongo=uri, require_database=True) as store:
+        store.record(log)
+    with hl.open(tmp_path / "store", mongo=uri) as store, commands() as sent:
+        assert store.topic("/number").where("n > 3").count() == 6
+    states = [one.read for one in sent if one.collection == "hybridlog.recordings"]
+    assert len(states) >= 2
+    assert set(states) == {"majority"}
+    turns = [one.read for one in sent if one.collection == "hybridlog.store"]
+    assert "linearizable" in turns
 
 
 def test_questions_go_on(
