@@ -131,3 +131,18 @@ def test_some_of_many_recordings(
             assert [m.fields["n"] for m in asked] == wanted
             assert [d["n"] for d in asked.reverse().documents()] == wanted[::-1]
             assert len(asked.windows(0, "1ms")) == len(wanted)
+
+
+def test_the_state_of_the_index_is_read_once_a_question(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the messages of recordings are too many to be asked about together."""
+    path = tmp_path / "store"
+    add(path, range(4))
+    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+    monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
+    monkeypatch.setattr(mongo, "_AHEAD", 0)
+    with hl.open(path, require_database=True) as store, commands() as sent:
+        assert len(store.topic("/number").where("n > 3").windows(0, "1ms"))
+        assert [one.collection for one in sent].count("hybridlog.recordings") == 1
+        assert [one.collection for one in sent].count("number") >= 4

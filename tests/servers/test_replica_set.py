@@ -82,10 +82,12 @@ def killing(members: ReplicaSet, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_killed_while_a_log_is_recorded(store: hl.Store, log: Path, killing: list[str]) -> None:
+    database = store.database
     report = store.record(log, settings=SegmentSettings(chunk_size=1 << 12))
     assert len(killing) > KILLED_AT
     assert report.failure is None
     assert report.missed == 0
+    assert store.database is database, "indexing has not gone on, but was begun again"
     check(store, 3 * MESSAGES)
 
 
@@ -136,10 +138,12 @@ def test_questions_go_on(
     # In the middle of an answer.
     monkeypatch.setattr(mongo, "_DOCUMENTS", 500)
     documents = query.documents()
+    database = store.database
     found = [next(documents)["n"] for _ in range(10)]
     members.kill_primary()
     found += [document["n"] for document in documents]
     assert found == list(range(100, MESSAGES))
+    assert store.database is database, "the answer has not gone on, but was asked again"
     members.heal()
     members.kill_primary()
     assert [m.fields["n"] for m in query.limit(300)] == list(range(100, 400))
