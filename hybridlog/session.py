@@ -152,7 +152,7 @@ class Session:
         from hybridlog.maintenance import index
 
         if self.connected is None:
-            self._belief = None
+            self._belief = self._places = None
         repairs = RepairReport()
         has_changed = False
         try:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeVar
 
 from hybridlog import consent, field_indexes
 from hybridlog.entries import text
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.topic_places import TopicPlace
 
 DEFAULT_STORE = "hybridlog-store"
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 def store_path(path: str | Path | None = None) -> Path:
@@ -107,6 +110,22 @@ def open_store(
         store.close()
         raise
     return store
+
+
+def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Do something once more if the connection to MongoDB was lost.
+
+    The new connection has started a MongoDB that had ended, and replaced damaged data files.
+    """
+
+    @wraps(work)
+    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
+        try:
+            return work(*args, **options)
+        except ConnectionLostError:
+            return work(*args, **options)
+
+    return tried
 
 
 class Store:
@@ -340,6 +359,7 @@ class Store:
             report.entry = self.entry(report.entry.id)
             report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
+    @_again_if_lost
     def reindex(
         self,
         recordings: Sequence[str] | None = None,
@@ -380,6 +400,7 @@ class Store:
         done = {entry.id for entry in chosen if entry.label not in left}
         return [entry for entry in self.recordings() if entry.id in done]
 
+    @_again_if_lost
     def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
         """Add a MongoDB index on fields of a topic.
 
@@ -401,6 +422,7 @@ class Store:
         field_indexes.add(database, query.topics, fields)
         return field_indexes.of_topics(database, query.topics)
 
+    @_again_if_lost
     def remove_index(self, topic: str, *fields: str) -> int:
         """Drop the index on exactly these fields; return the number of topics.
 
@@ -411,12 +433,14 @@ class Store:
         database = self.database_for("An index", writes=True)
         return field_indexes.remove(database, query.topics, fields)
 
+    @_again_if_lost
     def indexes(self, *topics: str) -> list[FieldIndex]:
         """The indexes on fields, of these topics or of all."""
         database = self.database_for("Indexes")
         names = self.topic(*topics).topics if topics else self.topics()
         return field_indexes.of_topics(database, names)
 
+    @_again_if_lost
     def topic_place(self, topic: str) -> TopicPlace:
         """The place of a topic's index documents in MongoDB.
 
@@ -433,6 +457,7 @@ class Store:
         (name, *_) = self.topic(topic).topics
         return self.session.places("The place of a topic").of([name])[name]
 
+    @_again_if_lost
     def verify(
         self, recordings: Sequence[str] | None = None, progress: Progress | None = None
     ) -> Verification:
@@ -446,21 +471,14 @@ class Store:
 
         self.refresh()
         labels = None if recordings is None else [r.label for r in self.select(recordings)]
-
-        def check() -> Verification:
-            return verify(
-                self.directory,
-                self.catalog,
-                self.database,
-                self.repairs,
-                labels=labels,
-                progress=progress,
-            )
-
-        try:
-            return check()
-        except ConnectionLostError:  # damaged data files of MongoDB were replaced meanwhile
-            return check()
+        return verify(
+            self.directory,
+            self.catalog,
+            self.database,
+            self.repairs,
+            labels=labels,
+            progress=progress,
+        )
 
     def remove(self, recording: str) -> None:
         """Delete a recording.

@@ -235,6 +235,25 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
             assert len(tried) == 2
 
 
+@pytest.mark.parametrize("name", ["mongod", "mongod/data"])
+def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
+    with hl.open(store, require_database=True) as opened:
+        want = documents(opened)
+        shutil.rmtree(store / name)
+        if name == "mongod/data":
+            kill_mongod(store)
+        assert documents(opened) == want
+        assert sorted(opened.repairs.indexed) == ["one", "two"]
+
+
+@pytest.mark.parametrize("work", ["reindex", "indexes"])
+def test_work_on_an_index_that_ends_is_done_again(store: Path, work: str) -> None:
+    with hl.open(store, require_database=True) as opened:
+        kill_mongod(store)
+        getattr(opened, work)()
+        assert not opened.verify().findings
+
+
 # --- resets, handles, roles ---
 
 

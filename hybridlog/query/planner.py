@@ -372,6 +372,7 @@ class Planner:
         if not isinstance(failure, ConnectionLostError):
             yield from (e for e in self._choose(part, need, fields) if e is not failed)
             return
+        self._mongo.forget()
         files = self._costs(self._files(part, need), part, need, fields)
         yield from (engine for _, engine in files)
         if self._costs([self._mongo], part, need, fields):
@@ -384,6 +385,7 @@ class Planner:
         except ConnectionLostError:
             if all(self._costs([self._scan], part, Need.SELECTION, ()) for part in parts):
                 raise
+            self._mongo.forget()
             return ask()
 
     def _first(

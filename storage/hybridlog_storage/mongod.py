@@ -224,7 +224,6 @@ class EmbeddedMongod:
         """Lock `users.lock`; wait for a mongod that is being ended."""
         try:
             self._directory = _own_directory(self._given)
-            _make_folder(self.data, depth=_IN_HERE)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         descriptor = self._open("users.lock")
@@ -304,6 +303,7 @@ class EmbeddedMongod:
                 self._end_orphan()
                 return None
             program = find_mongod()
+            _make_folder(self.data, depth=_IN_HERE)
             _refuse_odd_files(self._directory)
             for name in _FILES:
                 with contextlib.suppress(FileNotFoundError, NotADirectoryError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import bson
@@ -30,6 +31,34 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
         IndexChangedError: another process changes the index.
         TopicError: a topic was recorded without index documents.
     """
+    seen: Counter[str] = Counter()
+    given = 0
+    for topic, document in _resumed(session, question, counters):
+        if question.limit is not None and given >= question.limit:
+            return
+        seen[topic] += 1
+        if (seen[topic] - 1) % question.every == 0:
+            given += 1
+            yield document
+
+
+def _resumed(
+    session: Session, question: Question, counters: Counters
+) -> Iterator[tuple[str, Document]]:
+    """All matching documents; if the connection is lost, a new one goes on where it was."""
+    done = 0
+    try:
+        for found in _matching(session, question, counters):
+            done += 1
+            yield found
+    except ConnectionLostError:
+        yield from islice(_matching(session, question, counters), done, None)
+
+
+def _matching(
+    session: Session, question: Question, counters: Counters
+) -> Iterator[tuple[str, Document]]:
+    """All matching documents with their topics, in order."""
     session.database_for("Reading index documents")
     planner = Planner(session, question, counters)
     parts = planner.parts()
@@ -49,16 +78,7 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
         for stream in _of_topic(planner, mongo, of_topic, reverse=question.reverse)
     ]
     # Keys are ordered by log time, recording and arrival, over all topics.
-    merged = heapq.merge(*streams, key=_key, reverse=question.reverse)
-    seen: Counter[str] = Counter()
-    given = 0
-    for topic, document in merged:
-        if question.limit is not None and given >= question.limit:
-            return
-        seen[topic] += 1
-        if (seen[topic] - 1) % question.every == 0:
-            given += 1
-            yield document
+    return heapq.merge(*streams, key=_key, reverse=question.reverse)
 
 
 def _key(pair: tuple[str, Document]) -> bytes:
@@ -72,31 +92,13 @@ def _of_topic(
     """Streams of the documents of one topic that match, each in order."""
     matching = _Matching(planner, mongo, parts)
 
-    def decode(stream: Iterator[bytes]) -> Iterator[Document]:
+    def read(stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
         for raw in stream:
             documents = bson.decode_all(raw)
             planner.counters.documents_read += len(documents)
-            yield from documents
+            yield from ((parts[0].topic, d) for d in documents if matching.has(d["_meta"]))
 
-    def read(number: int, stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
-        last: Any = None
-        documents = decode(stream)
-        try:
-            for document in documents:
-                key = document["_id"]
-                if matching.has(document["_meta"]):
-                    yield parts[0].topic, document
-                last = key
-        except ConnectionLostError:  # a new connection goes on behind the last document
-            documents = decode(mongo.documents(parts, reverse=reverse)[number])
-            for document in documents:
-                key = document["_id"]
-                is_new = last is None or (key < last if reverse else key > last)
-                if is_new and matching.has(document["_meta"]):
-                    yield parts[0].topic, document
-
-    streams = mongo.documents(parts, reverse=reverse)
-    return [read(number, stream) for number, stream in enumerate(streams)]
+    return [read(stream) for stream in mongo.documents(parts, reverse=reverse)]
 
 
 class _Matching:

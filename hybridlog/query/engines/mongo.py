@@ -62,6 +62,12 @@ class Mongo:
         self._is_known = False
         self._is_away = False
 
+    def forget(self) -> None:
+        """Forget what the index has said: after a new connection it may be another one."""
+        for found in (self._undecided, self._ahead, self._placed):
+            found.clear()
+        self._is_known = self._is_away = False
+
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
         if need is Need.VALUES or self._is_away or _is_older(part) or not part.is_indexed:
