@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -24,8 +25,21 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
+from hybridlog.query import chunk_scan
+from hybridlog.query.counters import Counters
+from hybridlog.query.engines.base import Outcomes
+from hybridlog.query.engines.mongo import Mongo
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Part
 from hybridlog_storage.database import Database
-from hybridlog_storage.errors import DatabaseError, IndexChangedError, ResourceError
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    DatabaseError,
+    IndexChangedError,
+    ResourceError,
+)
 from hybridlog_storage.mongod import find_mongod
 from tests.cli.running import run
 from tests.damage import WAYS
@@ -233,6 +247,65 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
         with other_mongod(tmp_path, port=port):
             assert sum(documents(opened)) > 0
             assert len(tried) == 2
+
+
+def only_mongo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let MongoDB be chosen first, as for long recordings."""
+    cost = PayloadScan.cost
+    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+    monkeypatch.setattr(PayloadScan, "cost", lambda *asked: cost(*asked) and 1e6)
+
+
+def test_another_engine_goes_on_where_one_fails(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(store, require_database=True) as opened:
+        question = opened.topic(IMU).where(WHERE).question
+        planner = Planner(opened.session, question, Counters())
+        part = planner.parts()[0]
+        want = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
+        only_mongo(monkeypatch)
+
+        def breaking(engine: Mongo, part: Part) -> Iterator[Outcomes]:
+            whole = next(PayloadScan.outcomes(engine, part))  # type: ignore[arg-type]
+            yield Outcomes(*(column[:7] for column in whole))
+            yield Outcomes(*(column[:0] for column in whole))
+            raise ConnectionLostError("gone")
+
+        monkeypatch.setattr(Mongo, "outcomes", breaking)
+        monkeypatch.setattr(Mongo, "plan", PayloadScan.plan, raising=False)
+        monkeypatch.setattr(Mongo, "_scan", PayloadScan._scan, raising=False)
+        planner = Planner(opened.session, question, Counters())
+        got = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
+        assert got == want
+        assert len(want) > 100
+
+
+@pytest.mark.parametrize("where", [WHERE, {"header.seq": {"$mod": [7, 0]}}])
+def test_a_selection_goes_on_without_mongodb_or_with_a_new_one(
+    store: Path, monkeypatch: pytest.MonkeyPatch, where: object
+) -> None:
+    """Messages can decide the first predicate; only MongoDB understands the second."""
+    select = Mongo.select
+    calls: list[int] = []
+
+    def breaking(engine: Mongo, parts: Any, tasks: Any) -> Any:
+        calls.append(len(tasks))
+        if len(calls) == 2:
+            raise ConnectionLostError("gone")
+        return select(engine, parts, tasks)
+
+    with hl.open(store, require_database=True) as opened:
+        asked = opened.topic(IMU).where(where)
+        want = [(m.recording, m.seq) for m in asked]
+        only_mongo(monkeypatch)
+        monkeypatch.setattr(Mongo, "select", breaking)
+        # A group for each chunk.
+        monkeypatch.setattr(chunk_scan, "_groups", lambda tasks: ([task] for task in tasks))
+        assert [(m.recording, m.seq) for m in asked] == want
+        assert len(want) > 20
+        assert len(calls) == (2 if where == WHERE else len(calls))
+        assert len(calls) >= 2
 
 
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])
