@@ -27,6 +27,7 @@ from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
 from hybridlog.query import chunk_scan
 from hybridlog.query.counters import Counters
+from hybridlog.query.engines import mongo as mongo_module
 from hybridlog.query.engines.base import Outcomes
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
@@ -204,18 +205,23 @@ def test_a_killed_mongod_is_started_again(store: Path) -> None:
         want = documents(opened)
         imu = opened.topic(IMU)
         counts = imu.count(), imu.where(WHERE).count()
+        places = opened.session.places("A test")
         kill_mongod(store)
         assert (imu.count(), imu.where(WHERE).count()) == counts
         assert documents(opened) == want
         assert not opened.repairs.damage
         assert not opened.repairs.indexed
+        assert opened.session.places("A test") is not places
 
 
-def test_a_mongod_killed_in_the_middle_of_an_answer(store: Path) -> None:
+def test_a_mongod_killed_in_the_middle_of_an_answer(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mongo_module, "_DOCUMENTS", 5)  # in one batch
     with hl.open(store, require_database=True) as opened:
         want = [d["_id"] for d in opened.topic(*TOPICS).documents()]
         answer = opened.topic(*TOPICS).documents()
-        got = [next(answer)["_id"]]
+        got = [next(answer)["_id"] for _ in range(20)]
         kill_mongod(store)
         got += [d["_id"] for d in answer]
         assert got == want
@@ -369,7 +375,7 @@ class Resetting:
                 target.sendall(data)
 
 
-@pytest.mark.parametrize("resets", [1, 5])
+@pytest.mark.parametrize("resets", [1, 8])
 def test_opening_goes_on_after_resets(
     store: Path, tmp_path: Path, server: str, resets: int
 ) -> None:
@@ -457,7 +463,21 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     assert run("verify", store=store).err == ""
 
 
-def test_a_store_without_handles_is_not_a_damaged_one(store: Path) -> None:
+def test_a_mongod_that_cannot_accept_for_lack_of_handles(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(uri: str, **_: float) -> Database:
+        with (store / "mongod" / "mongod.log").open("a") as log:
+            log.write('{"s":"W","msg":"Error accepting","attr":"Too many open files"}\n')
+        raise ConnectionLostError("connection reset")
+
+    monkeypatch.setattr(Database, "connect", refused)
+    with hl.open(store) as opened, pytest.raises(DatabaseError, match="ran out of file handles"):
+        documents(opened)
+
+
+@pytest.mark.parametrize("has_catalog", [True, False])
+def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalog: bool) -> None:
     def ask() -> tuple[int, int]:
         with hl.open(store, mongo=NOWHERE) as opened:
             return len(opened.recordings()), opened.topic(SCAN).where("ranges < 1").count()
@@ -468,6 +488,8 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     failures = []
     for limit in spare[:10]:
+        if not has_catalog:
+            (store / "catalog.sqlite").unlink(missing_ok=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
         try:
             assert ask() == want
