@@ -820,7 +820,10 @@ so only if that saves sorting."""
 def _together(
     questions: Sequence[tuple[str, Mapping[str, object]]],
 ) -> Iterator[tuple[int, Sequence[tuple[str, Mapping[str, object]]]]]:
-    """Groups of questions that fit into one command, with the number of the first."""
+    """Groups of questions that fit into one command, with the number of the first.
+
+    Pipelines are joined, since MongoDB reads a whole clustered collection for `$or` of ranges.
+    """
     from bson import encode
 
     if not questions:

@@ -130,6 +130,9 @@ class TopicPlaces:
         return found
 
     def _ensure(self, collection: str) -> None:
+        if not self._ensured:
+            # One command, where creating each would be one for each topic.
+            self._ensured.update(self._database.list_collections())
         if collection not in self._ensured:
             self._database.ensure_collection(collection)
             self._ensured.add(collection)

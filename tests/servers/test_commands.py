@@ -100,6 +100,7 @@ def test_no_question_asks_once_a_recording(tmp_path: Path, monkeypatch: pytest.M
         name: len(sent) for name, sent in few.items()
     }
     assert all(few.values())
+    assert "create" not in {one.name for one in few["record"]}, "once a topic, though it exists"
 
 
 @pytest.mark.parametrize("most", [1, 100])
