@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
     from hybridlog.query.times import TimeLike
     from hybridlog.recorder import RecordOptions, RecordReport
@@ -439,6 +440,27 @@ class Store:
         database = self.database_for("Indexes")
         names = self.topic(*topics).topics if topics else self.topics()
         return field_indexes.of_topics(database, names)
+
+    @_again_if_lost
+    def sizes(self, recordings: Sequence[str] | None = None) -> Sizes:
+        """Bytes of recordings and topics in segments, tables and MongoDB.
+
+        Args:
+            recordings: The recordings; None for all.
+
+        Returns:
+            `rows`, `by_recording()`, `by_topic()` and `total`; the share of MongoDB is None if
+            that is unavailable.
+
+        Raises:
+            TopicError: A recording does not exist.
+        """
+        from hybridlog.maintenance.sizes import sizes_of
+
+        entries = self.select(recordings)
+        database = self.database
+        places = None if database is None else self.session.places("Sizes")
+        return sizes_of(self.directory, self.catalog, entries, database, places)
 
     @_again_if_lost
     def topic_place(self, topic: str) -> TopicPlace:

@@ -126,6 +126,7 @@ SLOW = frozenset(
         "test_reader.py",
         "test_real_logs.py",
         "test_second_opinion.py",
+        "test_sizes.py",
         "test_style.py",
     )
 )

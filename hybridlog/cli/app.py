@@ -16,6 +16,7 @@ COMMANDS: Final = (
     "record",
     "ls",
     "info",
+    "du",
     "losses",
     "top",
     "mark",

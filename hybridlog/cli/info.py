@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.cli import coverage, options, output, recording_summary
+from hybridlog.cli import coverage, options, output, recording_summary, sizes_table
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 
 if TYPE_CHECKING:
+    from hybridlog.maintenance.sizes import Size, Sizes
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 
@@ -24,10 +27,15 @@ if TYPE_CHECKING:
     shell_complete=complete_recording,
     help="A recording or a segment file; without, every recording.",
 )
+@click.option(
+    "--sizes", is_flag=True, help="Also the bytes of each topic in segments, tables and MongoDB."
+)
 @options.store
 @options.mongo
 @options.as_json
-def command(*, what: str | None, store: Path | None, mongo: str | None, as_json: bool) -> None:
+def command(
+    *, what: str | None, sizes: bool, store: Path | None, mongo: str | None, as_json: bool
+) -> None:
     """Show topics, types, rates, sizes, times, clock skew, losses."""
     if what is not None and _is_segment(what):
         from hybridlog.cli.segment_info import show_segment
@@ -37,8 +45,12 @@ def command(*, what: str | None, store: Path | None, mongo: str | None, as_json:
     with opened_store(store, mongo, quiet=as_json) as opened:
         chosen = opened.select(None if what is None else [what])
         index = opened.index_place
+        found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
     if as_json:
         full = [_as_dict(entry) for entry in chosen]
+        for about, entry in zip(full, chosen, strict=True):
+            if entry.label in found:
+                about["sizes"] = [sizes_table.as_dict(row) for row in found[entry.label].rows]
         output.print_json(full[0] if what is not None else full)
         return
     if not chosen:
@@ -47,6 +59,18 @@ def command(*, what: str | None, store: Path | None, mongo: str | None, as_json:
         if number:
             output.say()
         _print_recording(entry, index)
+        if entry.label in found:
+            output.say()
+            of_one = found[entry.label]
+            sizes_table.print_sizes(of_one.rows, of_one.total, topics=True)
+
+
+def _sizes(of_all: Sizes) -> dict[str, Sizes]:
+    """Sizes of each recording, by its label."""
+    rows: dict[str, list[Size]] = defaultdict(list)
+    for row in of_all.rows:
+        rows[row.recording].append(row)
+    return {label: replace(of_all, rows=of_one) for label, of_one in rows.items()}
 
 
 def _is_segment(what: str) -> bool:

@@ -1,0 +1,52 @@
+"""`hybridlog du`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from hybridlog.cli import options, output, sizes_table
+from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.open_store import opened_store
+
+
+@click.command()
+@click.argument(
+    "recording",
+    nargs=-1,
+    metavar="[RECORDING]...",
+    shell_complete=complete_recording,
+    help="Only these; without, every recording.",
+)
+@click.option(
+    "--by",
+    type=click.Choice(["recording", "topic", "both"]),
+    default="recording",
+    help="A row for each recording, for each topic, or for each topic of each recording.",
+)
+@options.store
+@options.mongo
+@options.as_json
+def command(
+    *, recording: tuple[str, ...], by: str, store: Path | None, mongo: str | None, as_json: bool
+) -> None:
+    """Show what recordings and topics take on the disk.
+
+    Sizes are those in segments, in tables and in MongoDB; the largest come first. Shares of
+    what topics have in common are estimates.
+    """
+    with opened_store(store, mongo, quiet=as_json) as opened:
+        sizes = opened.sizes(recording or None)
+    rows = sizes.rows
+    if by != "both":
+        rows = sizes.by_recording() if by == "recording" else sizes.by_topic()
+    if as_json:
+        each = [sizes_table.as_dict(row) for row in rows]
+        output.print_json({"rows": each, "total": sizes_table.as_dict(sizes.total)})
+    elif rows:
+        sizes_table.print_sizes(
+            rows, sizes.total, recordings=by != "topic", topics=by != "recording"
+        )
+    else:
+        output.note("The store is empty: `hybridlog record FILE` fills it.")

@@ -1,0 +1,259 @@
+"""Bytes that recordings and topics take on the disk, by tier.
+
+The catalog, the sizes of files and one command for each collection of MongoDB suffice: the
+cost does not depend on the number of messages. Chunks and files that topics share are
+divided by payload and by number of messages.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from stat import S_ISDIR
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from hybridlog.maintenance.opening import put_again
+from hybridlog.tables.layout import (
+    IN_TABLES,
+    SMALL,
+    recording_folder,
+    small_file,
+    table_schema,
+    topic_folder,
+)
+from hybridlog_storage import files
+from hybridlog_storage.errors import CatalogError
+from hybridlog_storage.mcap_content import MESSAGE_HEAD
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.database import Database
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.topic_places import TopicPlaces
+
+
+_Key = TypeVar("_Key")
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Bytes on the disk.
+
+    Attributes:
+        recording: Label of the recording; empty for several.
+        topic: Full name; empty for several, and for what belongs to no topic: definitions,
+            checksums, attachments.
+        messages: Number of messages.
+        payload_bytes: Their payloads, uncompressed.
+        segment_bytes: Their share of the segments.
+        table_bytes: Their share of the tables.
+        index_bytes: Their share of MongoDB, estimated; None if it is unavailable.
+    """
+
+    recording: str
+    topic: str
+    messages: int = 0
+    payload_bytes: int = 0
+    segment_bytes: int = 0
+    table_bytes: int = 0
+    index_bytes: int | None = 0
+
+    @property
+    def total_bytes(self) -> int:
+        """Sum of segments, tables and MongoDB."""
+        return self.segment_bytes + self.table_bytes + (self.index_bytes or 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Sizes of recordings.
+
+    Attributes:
+        rows: Each topic of each recording, largest first.
+    """
+
+    rows: list[Size]
+
+    @property
+    def total(self) -> Size:
+        """The sum."""
+        return _sum("", "", self.rows)
+
+    def by_recording(self) -> list[Size]:
+        """The recordings, largest first."""
+        groups: dict[str, list[Size]] = defaultdict(list)
+        for row in self.rows:
+            groups[row.recording].append(row)
+        return _largest_first(_sum(label, "", rows) for label, rows in groups.items())
+
+    def by_topic(self) -> list[Size]:
+        """The topics in all recordings, largest first."""
+        groups: dict[str, list[Size]] = defaultdict(list)
+        for row in self.rows:
+            groups[row.topic].append(row)
+        return _largest_first(_sum("", topic, rows) for topic, rows in groups.items())
+
+
+def sizes_of(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entries: Sequence[RecordingEntry],
+    database: Database | None,
+    places: TopicPlaces | None,
+) -> Sizes:
+    """Sizes of some recordings.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entries: The recordings.
+        database: The index; None if it is unavailable.
+        places: The places of topics there.
+    """
+    index: dict[tuple[str, str], int] = {}
+    if database is not None and places is not None:
+        index = _index_bytes(entries, database, places)
+    rows: list[Size] = []
+    for entry in entries:
+        segments = _segment_bytes(directory, catalog, entry)
+        tables = _table_bytes(directory.path, entry)
+        messages: Counter[str] = Counter()
+        payload: Counter[str] = Counter()
+        for channel in entry.channels:
+            messages[channel.topic] += channel.stats.messages
+            payload[channel.topic] += channel.stats.payload_bytes
+        rows += [
+            Size(
+                entry.label,
+                topic,
+                messages[topic],
+                payload[topic],
+                segments[topic],
+                tables[topic],
+                None if database is None else index.get((entry.id, topic), 0),
+            )
+            for topic in {"", *messages}
+        ]
+    return Sizes(_largest_first(rows))
+
+
+def _sum(recording: str, topic: str, rows: Sequence[Size]) -> Size:
+    index = [row.index_bytes for row in rows if row.index_bytes is not None]
+    return Size(
+        recording,
+        topic,
+        sum(row.messages for row in rows),
+        sum(row.payload_bytes for row in rows),
+        sum(row.segment_bytes for row in rows),
+        sum(row.table_bytes for row in rows),
+        sum(index) if index or not rows else None,
+    )
+
+
+def _largest_first(rows: Iterable[Size]) -> list[Size]:
+    return sorted(rows, key=lambda row: (-row.total_bytes, row.recording, row.topic))
+
+
+def _segment_bytes(
+    directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry
+) -> Counter[str]:
+    """Bytes of the segments by topic; the rest under the empty name."""
+    by_channel = np.zeros(max((c.id for c in entry.channels), default=0) + 1)
+    for number, _, _ in entry.spans:
+        try:
+            table = catalog.table(entry, number)
+        except CatalogError:
+            put_again(directory, catalog, entry)
+            table = catalog.table(entry, number)
+        found = _chunk_shares(table)
+        by_channel[: len(found)] += found[: len(by_channel)]
+    whole: Counter[str] = Counter()
+    for channel in entry.channels:
+        whole[channel.topic] += round(float(by_channel[channel.id]))
+    whole[""] += max(0, entry.stored_bytes - whole.total())
+    return whole
+
+
+def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
+    """Bytes of the chunks by channel id, divided by the bytes of the messages in each."""
+    if not len(table.chunks):
+        return np.zeros(0)
+    stored = (table.chunks["length"] + table.chunks["trailer"]).astype(np.float64)
+    chunk = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
+    parts = table.parts
+    weight = parts["payload_bytes"].astype(np.float64)
+    weight += parts["messages"] * float(MESSAGE_HEAD.itemsize)
+    in_chunk = np.bincount(chunk, weight)
+    shares = stored[chunk] * weight / in_chunk[chunk]
+    return np.bincount(parts["channel"], shares).astype(np.float64)
+
+
+def _table_bytes(root: Path, entry: RecordingEntry) -> Counter[str]:
+    """Bytes of the tables by topic; the rest under the empty name."""
+    found: Counter[str] = Counter()
+    place = recording_folder(root, entry.id)
+    try:
+        folders = files.names(place, depth=IN_TABLES)
+    except FileNotFoundError:
+        return found
+    own = {topic_folder(c.topic): c.topic for c in entry.channels}
+    small = _small_topics(entry, without={own[name] for name in folders if name in own})
+    for folder, about in folders.items():
+        inside = {folder: about}
+        if S_ISDIR(about.st_mode):
+            inside = files.names(place / folder, depth=IN_TABLES + 1)
+        for name, status in inside.items():
+            if folder == SMALL and name in small:
+                found.update(_divided(status.st_size, small[name]))
+            else:
+                found[own.get(folder, "")] += status.st_size
+    return found
+
+
+def _small_topics(entry: RecordingEntry, without: set[str]) -> dict[str, Counter[str]]:
+    """Messages of the topics that share a file, by the name of the file."""
+    found: dict[str, Counter[str]] = defaultdict(Counter)
+    for c in entry.channels:
+        if c.topic not in without and c.stats.messages:
+            schema = table_schema(c.message_encoding, c.schema, c.metadata)
+            found[small_file(c.type, schema)][c.topic] += c.stats.messages
+    return found
+
+
+def _divided(size: int, weights: Mapping[_Key, int]) -> Counter[_Key]:
+    """A number of bytes divided by weights, without a rest."""
+    names = list(weights)
+    ends = np.cumsum([weights[name] for name in names])
+    bounds = np.round(ends / ends[-1] * size).astype(np.int64)
+    each = np.diff(bounds, prepend=0).tolist()
+    return Counter({name: int(share) for name, share in zip(names, each, strict=True)})
+
+
+def _index_bytes(
+    entries: Sequence[RecordingEntry], database: Database, places: TopicPlaces
+) -> dict[tuple[str, str], int]:
+    """Bytes in MongoDB by recording and topic: the documents' share of their collection."""
+    documents: dict[str, Counter[tuple[str, str]]] = defaultdict(Counter)
+    placed = places.of({c.topic for entry in entries for c in entry.channels})
+    for entry in entries:
+        for channel in entry.channels:
+            if channel.is_indexed and channel.stats.messages:
+                collection = placed[channel.topic].collection
+                documents[collection][entry.id, channel.topic] += channel.stats.messages
+    found: dict[tuple[str, str], int] = {}
+    for collection, counts in documents.items():
+        stats = database.stats(collection)
+        size = stats.storage_bytes + stats.index_bytes
+        # Of other recordings, there may be more. After a crash, the count may be too small.
+        others = max(0, stats.documents - counts.total())
+        shares = _divided(size, {**counts, ("", ""): others})
+        found.update({key: shares[key] for key in counts})
+    return found

@@ -1,0 +1,218 @@
+"""Bytes by recording, topic and tier: their sums are those of the files."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.query.topics import matcher
+from hybridlog_storage import topic_places
+from hybridlog_storage.catalog import CATALOG, Catalog
+from hybridlog_storage.database import CollectionStats, Database
+from hybridlog_storage.topic_places import SHARED
+from tests.cli.running import run
+from tests.many_topics import BASE
+
+LARGE = 20_000
+"""Bytes of a payload of `/large`, which has chunks of its own."""
+
+
+def write(path: Path, small: int, large: int) -> Path:
+    """A log of the topics `/a` and `/b`, each with `small` messages, and `/large`."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1", library="test")
+        number = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
+        text = writer.register_schema("std_msgs/String", "ros1msg", b"string data\n")
+        channels = [writer.register_channel(name, "ros1", number) for name in ("/a", "/b")]
+        of_large = writer.register_channel("/large", "ros1", text)
+        time = BASE
+        for count in range(small):
+            for channel in channels:
+                time += 1000
+                writer.add_message(channel, time, struct.pack("<f", count), time)
+        for count in range(large):
+            time += 1000
+            data = struct.pack("<I", LARGE) + bytes((count * i) % 251 for i in range(LARGE))
+            writer.add_message(of_large, time, data, time)
+        writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sizes")
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        hl.open(folder / "store", create=True, require_database=True) as store,
+    ):
+        patch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+        store.record(write(folder / "one.mcap", 400, 30))
+        store.record(write(folder / "two.mcap", 1200, 0))
+        store.record(write(folder / "mute.mcap", 10, 0), no_index=matcher(["/a", "/b"]))
+    return folder / "store"
+
+
+@pytest.fixture
+def store(place: Path) -> Iterator[hl.Store]:
+    with hl.open(place) as opened:
+        yield opened
+
+
+def bytes_in(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def by_name(rows: list[Any]) -> dict[tuple[str, str], Any]:
+    found = {(row.recording, row.topic): row for row in rows}
+    assert len(found) == len(rows)
+    return found
+
+
+def test_sums_are_those_of_the_files(store: hl.Store) -> None:
+    sizes, root = store.sizes(), store.directory.path
+    for row in sizes.by_recording():
+        entry = store.entry(row.recording)
+        segments = (root / "recordings" / row.recording).glob("*.mcap")
+        assert row.segment_bytes == entry.stored_bytes == sum(p.stat().st_size for p in segments)
+        assert row.table_bytes == bytes_in(root / "tables" / f"recording=r{entry.id}") > 0
+        assert row.messages == entry.messages
+    for groups in (sizes.rows, sizes.by_recording(), sizes.by_topic()):
+        for name in ("messages", "payload_bytes", "segment_bytes", "table_bytes", "index_bytes"):
+            assert sum(getattr(row, name) for row in groups) == getattr(sizes.total, name)
+        totals = [row.total_bytes for row in groups]
+        assert totals == sorted(totals, reverse=True)
+        assert all(
+            row.total_bytes == row.segment_bytes + row.table_bytes + row.index_bytes
+            for row in groups
+        )
+    assert {row.topic for row in sizes.by_topic()} == {"", "/a", "/b", "/large"}
+
+
+def test_shares_of_chunks_and_tables(store: hl.Store) -> None:
+    rows = by_name(store.sizes().rows)
+    (entry,) = store.select(["one"])
+    large = {c.id for c in entry.channels if c.topic == "/large"}
+    alone = 0
+    for number, _, _ in entry.spans:
+        table = store.catalog.table(entry, number)
+        bounds = table.part_bounds().tolist()
+        for chunk, begin, end in zip(table.chunks, bounds, bounds[1:], strict=False):
+            if set(table.parts["channel"][begin:end].tolist()) == large:
+                alone += int(chunk["length"] + chunk["trailer"])
+    assert alone > 0
+    assert abs(rows["one", "/large"].segment_bytes - alone) <= 1
+    assert rows["one", "/large"].payload_bytes == 30 * (LARGE + 4)
+    # Topics of equal messages share equally.
+    for recording in ("one", "two", "mute"):
+        a, b = rows[recording, "/a"], rows[recording, "/b"]
+        assert a.segment_bytes > 0
+        assert abs(a.segment_bytes - b.segment_bytes) <= 1
+    assert abs(rows["one", "/a"].table_bytes - rows["one", "/b"].table_bytes) <= 1
+    # Those of two have tables of their own.
+    tables = store.directory.path / "tables" / f"recording=r{store.entry('two').id}"
+    for topic in ("a", "b"):
+        assert rows["two", f"/{topic}"].table_bytes == bytes_in(tables / f"topic={topic}") > 0
+
+
+def stats_of(documents: int, storage: int, index: int = 0) -> CollectionStats:
+    return CollectionStats(documents, 10 * storage, storage, index)
+
+
+def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: Counter[str] = Counter()
+    answers = {"a": stats_of(1600, 16_000, 1600), SHARED: stats_of(2000, 4000)}
+
+    def stats(_: Database, collection: str) -> CollectionStats:
+        asked[collection] += 1
+        return answers[collection]
+
+    monkeypatch.setattr(Database, "stats", stats)
+    rows = by_name(store.sizes().rows)
+    assert asked == {"a": 1, SHARED: 1}
+    assert (rows["one", "/a"].index_bytes, rows["two", "/a"].index_bytes) == (4400, 13_200)
+    # Of 2000 documents, the store knows 1630; the others belong to nobody.
+    shares = [rows["one", "/b"], rows["two", "/b"], rows["one", "/large"]]
+    assert [row.index_bytes for row in shares] == pytest.approx([800, 2400, 60], abs=1)
+    assert rows["mute", "/a"].index_bytes == rows["one", ""].index_bytes == 0
+    # A recording's share does not depend on what is asked beside it.
+    assert by_name(store.sizes(["one"]).rows)["one", "/a"].index_bytes == 4400
+    answers["a"] = stats_of(0, 16_000)  # after a crash, the count may be too small
+    assert by_name(store.sizes(["one"]).rows)["one", "/a"].index_bytes == 16_000
+
+
+def test_the_cost_does_not_depend_on_the_number_of_messages(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: Counter[str] = Counter()
+    for thing, methods in ((Catalog, ("table",)), (Database, ("stats", "find", "aggregate"))):
+        for method in methods:
+            real = getattr(thing, method)
+
+            def counted(
+                self: Any, *args: Any, of: Any = real, name: str = method, **options: Any
+            ) -> Any:
+                calls[name] += 1
+                return of(self, *args, **options)
+
+            monkeypatch.setattr(thing, method, counted)
+    monkeypatch.setattr(hl.Query, "__iter__", None)
+    store.connect()
+    store.sizes(["mute"])  # knows the places of the topics
+    found = []
+    for recording in ("one", "two"):
+        calls.clear()
+        store.sizes([recording])
+        found.append(dict(calls))
+    assert found == [{"table": 1, "stats": 2, "find": 1}, {"table": 1, "stats": 2}]
+
+
+def test_without_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(store), "database", None)
+    sizes = store.sizes()
+    assert sizes.total.index_bytes is None
+    assert sizes.total.total_bytes == sizes.total.segment_bytes + sizes.total.table_bytes
+
+
+def test_a_lost_row_of_the_catalog_is_made_again(place: Path) -> None:
+    with sqlite3.connect(place / CATALOG) as db:
+        db.execute("delete from segments")
+    with hl.open(place) as store:
+        assert store.sizes(["one"]).total.segment_bytes == store.entry("one").stored_bytes
+
+
+def test_as_commands(place: Path) -> None:
+    rows = run("du", "--json", store=place).json["rows"]
+    assert {row["recording"] for row in rows} == {"one", "two", "mute"}
+    assert rows == sorted(rows, key=lambda row: -row["total_bytes"])
+    assert "topic" not in rows[0]
+    both = run("du", "one", "two", "--by", "both", "--json", store=place).json
+    assert len(both["rows"]) == 7
+    assert both["total"]["messages"] == 830 + 2400
+    lines = run("du", "--by", "topic", store=place).lines
+    headings = ["topic", "messages", "payload", "segments", "tables", "MongoDB", "total"]
+    assert lines[0].split() == headings
+    assert {line.split()[0] for line in lines[1:-1]} == {"/large", "/a", "/b", "(no"}
+    assert lines[-1].startswith("total")
+    assert any(line.startswith("(no topic)") for line in lines)
+    assert run("du", store=place).lines[1].startswith(rows[0]["recording"])
+    shown = run("info", "one", "--sizes", store=place).lines
+    assert "total" in shown[-1]
+    assert len(shown) - len(run("info", "one", store=place).lines) == 7
+    about = run("info", "one", "--sizes", "--json", store=place).json
+    assert {row.get("topic") for row in about["sizes"]} == {None, "/a", "/b", "/large"}
+    assert "sizes" not in run("info", "one", "--json", store=place).json
+
+
+def test_an_empty_store(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        assert store.sizes().total.total_bytes == 0
+    assert run("du", store=tmp_path / "store").out == ""
