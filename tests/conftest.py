@@ -156,8 +156,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--mongo-uri",
         default=os.environ.get("HYBRIDLOG_TESTS_MONGO"),
-        help="MongoDB for the tests' stores, each in a database of its own that is dropped at "
-        "the end; tests about the embedded MongoDB are left out",
+        help="MongoDB for the tests' stores (default: HYBRIDLOG_TESTS_MONGO), each in a database "
+        "of its own that is dropped at the end; tests about the embedded one are left out",
     )
 
 

@@ -21,7 +21,7 @@ from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
 from hybridlog_storage.index_documents import PREFIX_BYTES, key_bound, last_key
 
 if TYPE_CHECKING:
-    from hybridlog_storage.database import Database
+    from hybridlog_storage.database import Database, ReadConcern
 
 TOPICS: Final = f"{CATALOG_PREFIX}topics"
 """Collection that lists the topics."""
@@ -120,7 +120,8 @@ class TopicPlaces:
             DatabaseError: MongoDB fails.
         """
         with self._lock:
-            self._read(topics)
+            # A place that could be rolled back is listed again, which waits for a majority.
+            self._read(topics, "majority")
             new = [topic for topic in topics if topic not in self._known]
             if new:
                 self._list(new)
@@ -152,12 +153,12 @@ class TopicPlaces:
         )
         self._read(topics)
 
-    def _read(self, topics: Collection[str]) -> None:
+    def _read(self, topics: Collection[str], read: ReadConcern = "local") -> None:
         """Read the places of topics that are not known yet."""
         unknown = {collection_of(t): t for t in topics if t not in self._known}
         names = sorted(unknown)
         for first in range(0, len(names), _NAMES_AT_ONCE):
             asked = {"_id": {"$in": names[first : first + _NAMES_AT_ONCE]}}
-            for found in self._database.find(TOPICS, asked, {"shared": 1}):
+            for found in self._database.find(TOPICS, asked, {"shared": 1}, read=read):
                 topic = unknown[found["_id"]]
                 self._known[topic] = TopicPlace(topic, bool(found.get("shared")))

@@ -112,7 +112,10 @@ def test_the_state_of_the_index_cannot_be_rolled_back(
     log = logs.write(tmp_path / "a.mcap", logs.content(0, 10))
     uri = members.uri(f"store{next(NUMBERS)}", "&readPreference=secondary&w=1")
     with hl.open(tmp_path / "store", create=True, mongo=uri, require_database=True) as store:
-        store.record(log)
+        with commands() as sent:
+            store.record(log)
+    places = [one for one in sent if one.collection == "hybridlog.topics"]
+    assert (places[0].name, places[0].read) == ("find", "majority")
     with hl.open(tmp_path / "store", mongo=uri) as store, commands() as sent:
         assert store.topic("/number").where("n > 3").count() == 6
     states = [one.read for one in sent if one.collection == "hybridlog.recordings"]
