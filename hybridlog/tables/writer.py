@@ -697,7 +697,9 @@ class TableWriter:
                 topic.give_up()
             elif topic.finished and topic.pieces:
                 with self._only(topic):
-                    self._write(topic, max(self._cut), topic.take(self._cut))
+                    pieces = topic.take(self._cut)
+                    last = max((piece.segment for piece in pieces), default=0)
+                    self._write(topic, last, pieces)
                     self._finish(topic)
         self._write_small()
         folder = recording_folder(self._root, self._recording)

@@ -16,6 +16,7 @@ from hybridlog.tables.reader import Tables
 from hybridlog_storage import files
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.segment_writer import SegmentSettings
+from tests.faults import logs
 from tests.tables.logs import BASE, channel, varied, write_log
 from tests.tables.test_writer import compare, topics_of
 
@@ -40,6 +41,13 @@ def contents(store: hl.Store) -> dict[str, bytes]:
 
 def unfinished(store: hl.Store) -> list[Path]:
     return list((store.directory.path / PARTS).glob("*"))
+
+
+def test_a_topic_that_ends_before_its_recording(store: hl.Store, tmp_path: Path) -> None:
+    """Its last file has the name of the last segment with its messages."""
+    said = {**logs.content(0, 1700), "/number": logs.content(0, 1500)["/number"]}
+    store.record(logs.write(tmp_path / "a.mcap", said), settings=logs.SETTINGS)
+    assert store.verify().findings == []
 
 
 def test_a_removed_recording_has_no_tables(few: hl.Store) -> None:
