@@ -15,6 +15,7 @@ import numpy as np
 
 from hybridlog_storage.copying import joined
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import MAX_CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,6 +34,11 @@ BATCH_MESSAGES = 16384
 
 MAX_CHUNK = 4 << 30
 """Largest chunk that a source unpacks, in uncompressed bytes; large ones in parts."""
+
+TOO_MANY_CHANNELS = (
+    f"messages of more than {MAX_CHANNELS} channels, as many as a recording can have"
+)
+"""Reason of the damage that counts messages on further channels."""
 
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 

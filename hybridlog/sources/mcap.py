@@ -13,6 +13,7 @@ from hybridlog.sources.base import (
     BATCH_BYTES,
     BATCH_MESSAGES,
     MAX_CHUNK,
+    TOO_MANY_CHANNELS,
     Damage,
     Source,
     cannot_open,
@@ -30,7 +31,7 @@ from hybridlog_storage.mcap_scan import (
     read_summary,
     scan,
 )
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 _UNDEFINED = -1
+_TOO_MANY = -2  # one more than a recording can hold
 _IDS = 1 << 16
 
 
@@ -102,6 +104,7 @@ class McapSource(Source):
         self._pending: _Open | None = None
         self._uncounted: list[_Open] = []
         self._end_is_noted = False
+        self._too_many = 0
         # Channels of the message indexes since the last chunk, None before the first.
         self._indexed: set[int] | None = None
 
@@ -223,29 +226,42 @@ class McapSource(Source):
                 f"(the first at byte {first} of the content)",
                 len(content.invalid),
             )
+        batch = content.batch
+        found = np.empty(len(batch), np.int32)
         row = 0
         for definition in content.definitions:
             if definition.row > row and self._definitions.changes(definition.record):
-                yield from self._rows(content.batch, row, definition.row, offset)
+                self._resolve(batch.channel, found, slice(row, definition.row), offset)
                 row = definition.row
             self._definitions.add(definition.record)
-        yield from self._rows(content.batch, row, len(content.batch), offset)
+        self._resolve(batch.channel, found, slice(row, len(batch)), offset)
+        yield from self._rows(batch, found, offset)
 
-    def _rows(self, batch: Batch, start: int, end: int, offset: int) -> Iterator[Batch]:
-        """Yield rows `[start, end)` in batches of bounded size, with channels resolved."""
-        rows = batch if (start, end) == (0, len(batch)) else batch.take(slice(start, end))
-        for channel in np.flatnonzero(np.bincount(rows.channel)).tolist():
-            reason = self._definitions.use(channel)
+    def _resolve(
+        self, ids: NDArray[np.int32], found: NDArray[np.int32], rows: slice, offset: int
+    ) -> None:
+        """Set the channels of some rows by the definitions so far."""
+        wanted = ids[rows]
+        # Sorting takes longer than a few rows.
+        numbers = set(wanted.tolist()) if len(wanted) < 10 else distinct(wanted).tolist()
+        for number in numbers:
+            reason = self._definitions.use(number)
             if reason:
                 self._note(offset, None, reason, 0)
-        found = self._definitions.table[rows.channel]
-        known = found != _UNDEFINED
+        found[rows] = self._definitions.table[wanted]
+
+    def _rows(self, rows: Batch, found: NDArray[np.int32], offset: int) -> Iterator[Batch]:
+        """Yield rows on the channels `found` in batches of bounded size."""
+        known = found >= 0
         if not known.all():
-            lost = len(found) - int(known.sum())
-            names = ", ".join(map(str, distinct(rows.channel[~known]).tolist()[:5]))
-            self._note(
-                offset, None, f"{lost} messages on channels that are not defined ({names})", lost
-            )
+            many = found == _TOO_MANY
+            self._too_many += int(many.sum())
+            lost = int((found == _UNDEFINED).sum())
+            if lost:
+                undefined = distinct(rows.channel[found == _UNDEFINED]).tolist()
+                names = ", ".join(map(str, undefined[:5]))
+                reason = f"{lost} messages on channels that are not defined ({names})"
+                self._note(offset, None, reason, lost)
             rows, found = rows.take(known), found[known]
         if not len(rows):
             return
@@ -279,6 +295,8 @@ class McapSource(Source):
 
     def _end(self, end: End) -> None:
         self.bytes_read = self.size_bytes
+        if self._too_many:
+            self._note(None, None, TOO_MANY_CHANNELS, self._too_many)
         missing = None
         if self.message_count is not None:
             missing = max(self.message_count - self._given - self._lost, 0)
@@ -317,8 +335,8 @@ class _Definitions:
     """The present meaning of each MCAP channel id.
 
     Attributes:
-        table: int32[65536], index in the source's channels by channel id, -1 if the id is
-            undefined or unused.
+        table: int32[65536], index in the source's channels by channel id, negative if the id
+            is undefined or unused, or one too many.
     """
 
     def __init__(self, channels: list[Channel], summary: Summary | None) -> None:
@@ -327,8 +345,16 @@ class _Definitions:
         # The summary repeats all definitions, also those in unreadable chunks.
         self._schemas: dict[int, records.Schema] = dict(summary.schemas) if summary else {}
         self._records: dict[int, records.Channel] = dict(summary.channels) if summary else {}
-        self._made: dict[int, list[tuple[records.Channel, records.Schema | None, int]]] = {}
+        self._schema_ids = np.zeros(_IDS, np.int32)  # by channel id
+        self._used: set[int] = set()  # schemas that channels have named
+        for record in self._records.values():
+            self._names(record)
+        self._made: dict[tuple[object, ...], int] = {}  # indexes of channels by what they say
         self._shared: dict[tuple[str, str, bytes], Schema] = {}
+
+    def _names(self, record: records.Channel) -> None:
+        self._schema_ids[record.id] = record.schema_id
+        self._used.add(record.schema_id)
 
     def changes(self, record: records.Schema | records.Channel) -> bool:
         """True if this definition changes the meaning of an id."""
@@ -337,16 +363,17 @@ class _Definitions:
 
     def add(self, record: records.Schema | records.Channel) -> None:
         """Apply this definition from now on."""
-        if self._known(record) == record:
+        known = self._known(record)
+        if known is not None and known == record:
             return
         if isinstance(record, records.Channel):
             self._records[record.id] = record
+            self._names(record)
             self.table[record.id] = _UNDEFINED
         elif record.id:  # MCAP: a schema with id 0 is to be ignored
             self._schemas[record.id] = record
-            for channel in self._records.values():
-                if channel.schema_id == record.id:
-                    self.table[channel.id] = _UNDEFINED
+            if record.id in self._used:
+                self.table[self._schema_ids == record.id] = _UNDEFINED
 
     def _known(
         self, record: records.Schema | records.Channel
@@ -364,19 +391,22 @@ class _Definitions:
         record = self._records.get(channel_id)
         if record is None or self.table[channel_id] != _UNDEFINED:
             return ""
-        schema = self._schemas.get(record.schema_id)
-        made = self._made.setdefault(channel_id, [])
-        for known, with_schema, index in made:
-            if (known, with_schema) == (record, schema):
-                self.table[channel_id] = index
-                return ""
-        self.table[channel_id] = len(self._channels)
-        made.append((record, schema, len(self._channels)))
+        schema = self._share(self._schemas.get(record.schema_id))
+        metadata = tuple(sorted(record.metadata.items()))
+        key = (channel_id, record.topic, record.message_encoding, metadata, id(schema))
+        index = self._made.get(key)
+        if index is not None:
+            self.table[channel_id] = index
+            return ""
+        if len(self._channels) >= MAX_CHANNELS:
+            self.table[channel_id] = _TOO_MANY
+            return ""
+        self.table[channel_id] = self._made[key] = len(self._channels)
         self._channels.append(
             Channel(
                 topic=record.topic,
                 message_encoding=record.message_encoding,
-                schema=self._share(schema),
+                schema=schema,
                 metadata=record.metadata,
             )
         )

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
 CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # fields before its map of message indexes,
+_SIZE = struct.Struct("<I")
+_NUMBER = struct.Struct("<H")
+_NUMBERS = struct.Struct("<HH")
 INDEX_PLACE = struct.Struct("<HQ")  # an entry of that map
 
 MESSAGE_HEAD = np.dtype(
@@ -49,6 +52,7 @@ MESSAGE_HEAD = np.dtype(
 """A message record up to its payload: 31 bytes."""
 
 _MESSAGE = int(Opcode.MESSAGE)
+_DEFINITIONS = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIELDS = _PAYLOAD - RECORD_HEAD.size
 _TIME_LIMIT = 1 << 63
@@ -161,6 +165,7 @@ def parse_content(
     *,
     torn: bool = False,
     messages_only: bool = False,
+    loose: bool = False,
     most: int = 1 << 62,
 ) -> ChunkContent:
     """Read the records of an uncompressed chunk.
@@ -171,6 +176,8 @@ def parse_content(
         torn: The end of the records is missing: omit an incomplete record.
         messages_only: Stop, without error, at the first record that is not a whole
             message.
+        loose: Likewise, but include definitions that fill their records exactly; others
+            count as damage.
         most: Most records.
 
     Returns:
@@ -180,11 +187,11 @@ def parse_content(
         SegmentError: A record runs over the end, or has the invalid kind 0; the message
             names its offset. Or there are more than `most`.
     """
-    walk = _Walk(buffer, base, most, messages_only=messages_only)
+    walk = _Walk(buffer, base, most, messages_only=messages_only, loose=loose)
     starts = np.fromiter(walk.messages(), np.int64)
     if walk.records > most:
         raise SegmentError("it holds too many records for its size")
-    if not (torn or messages_only) and walk.end != len(buffer):
+    if not (torn or messages_only or loose) and walk.end != len(buffer):
         problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
         raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
     batch, good = _batch(buffer, starts)
@@ -195,7 +202,9 @@ def parse_content(
     for row, opcode, start, end in walk.others:
         content = memoryview(buffer)[start + RECORD_HEAD.size : end]
         try:
-            record, _ = read_record(opcode, content)
+            record, used = read_record(opcode, content)
+            if loose and used != len(content):
+                raise SegmentError("a definition does not fill its record")
         except SegmentError as error:
             damage.append(ScanDamage(start, end - start, str(error), 0))
             continue
@@ -324,13 +333,16 @@ class _Parts:
 class _Walk:
     """Walks from record to record; collects the other records and the end position."""
 
-    def __init__(self, buffer: Buffer, start: int, most: int, *, messages_only: bool) -> None:
+    def __init__(
+        self, buffer: Buffer, start: int, most: int, *, messages_only: bool, loose: bool
+    ) -> None:
         self.end = start
         self.records = 0
         self.others: list[tuple[int, int, int, int]] = []
         self._buffer = buffer
         self._most = most
         self._messages_only = messages_only
+        self._loose = loose
 
     def messages(self) -> Iterator[int]:
         """Yield the start of each message record. The only loop over single messages."""
@@ -351,8 +363,10 @@ class _Walk:
                 break
             else:
                 skipped += 1
-                if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                if opcode in _DEFINITIONS:
                     others.append((row, opcode, at, end))
+                elif self._loose:
+                    break
             at = end
         self.end, self.records = at, row + skipped
 
@@ -418,7 +432,6 @@ def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
 
 
 def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
-    """Parse a chunk index, five times as fast as the mcap package; a summary has thousands."""
     first, last, start, length, offsets_size = CHUNK_INDEX_HEAD.unpack_from(content)
     at = CHUNK_INDEX_HEAD.size + offsets_size
     offsets = content[CHUNK_INDEX_HEAD.size : at]
@@ -439,11 +452,55 @@ def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
     return record, at + 28 + name_size
 
 
+def _read_schema(content: Buffer) -> tuple[records.Schema, int]:
+    (number,) = _NUMBER.unpack_from(content)
+    name, at = _sized(content, 2)
+    encoding, at = _sized(content, at)
+    data, at = _sized(content, at)
+    text = str(encoding, "utf-8")
+    return records.Schema(id=number, data=bytes(data), encoding=text, name=str(name, "utf-8")), at
+
+
+def _read_channel(content: Buffer) -> tuple[records.Channel, int]:
+    number, schema = _NUMBERS.unpack_from(content)
+    topic, at = _sized(content, 4)
+    encoding, at = _sized(content, at)
+    values, at = _sized(content, at)
+    metadata: dict[str, str] = {}
+    place = 0
+    while place < len(values):
+        key, place = _sized(values, place)
+        value, place = _sized(values, place)
+        metadata[str(key, "utf-8")] = str(value, "utf-8")
+    record = records.Channel(
+        id=number,
+        topic=str(topic, "utf-8"),
+        message_encoding=str(encoding, "utf-8"),
+        metadata=metadata,
+        schema_id=schema,
+    )
+    return record, at
+
+
+def _sized(content: Buffer, at: int) -> tuple[Buffer, int]:
+    """The bytes behind their length, and where they end."""
+    (size,) = _SIZE.unpack_from(content, at)
+    end = at + 4 + size
+    if end > len(content):
+        raise SegmentError("a field runs over the end of the record")
+    return content[at + 4 : end], end
+
+
+# Parsed several times as fast as by the mcap package; a file may have many of them.
+_FREQUENT: dict[int, Callable[[Buffer], tuple[Record, int]]] = {
+    Opcode.SCHEMA: _read_schema,
+    Opcode.CHANNEL: _read_channel,
+    Opcode.MESSAGE_INDEX: _read_message_index,
+    Opcode.CHUNK_INDEX: _read_chunk_index,
+}
 _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.FOOTER: records.Footer.read,
-    Opcode.SCHEMA: records.Schema.read,
-    Opcode.CHANNEL: records.Channel.read,
     Opcode.ATTACHMENT: records.Attachment.read,
     Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
     Opcode.STATISTICS: records.Statistics.read,
@@ -469,10 +526,9 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         SegmentError: Its fields exceed it, are not UTF-8, or its checksum differs.
     """
     try:
-        if opcode == Opcode.MESSAGE_INDEX:
-            return _read_message_index(content)
-        if opcode == Opcode.CHUNK_INDEX:
-            return _read_chunk_index(content)
+        frequent = _FREQUENT.get(opcode)
+        if frequent is not None:
+            return frequent(content)
         reader = _READERS.get(opcode)
         if reader is None:
             return None, 0

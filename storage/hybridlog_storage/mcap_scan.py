@@ -68,7 +68,9 @@ _FOOTER_SIZE = _HEAD + 20
 _DATA_END_SIZE = _HEAD + 4
 _CHUNK_FIELDS = struct.Struct("<QQQII")  # start, end, size, checksum, length of codec name
 _CODECS = frozenset({"", "zstd", "lz4"})
+_LAST_KNOWN = max(Opcode)
 _FIRST_PRIVATE = 0x80
+_DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
 _WINDOW = 1 << 20
 _MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
@@ -197,7 +199,7 @@ class PrivateRecord:
 
 @dataclass(slots=True)
 class Loose:
-    """Consecutive messages outside of chunks.
+    """Consecutive messages outside of chunks, in a file without them with the definitions between.
 
     Attributes:
         content: The messages; payload offsets are into a buffer of their own.
@@ -311,7 +313,7 @@ def _read_footer(file: BinaryIO, size: int) -> records.Footer | None:
 
 
 def _is_in_summary(opcode: int) -> bool:
-    return opcode in _SUMMARY_OPCODES or opcode > max(Opcode)
+    return opcode in _SUMMARY_OPCODES or opcode > _LAST_KNOWN
 
 
 def _add_to_summary(summary: Summary, record: Record | None) -> None:
@@ -527,6 +529,10 @@ class _Scanner:
             yield from self._torn(at, "the file ends in the middle of a record")
             return
         opcode, length = RECORD_HEAD.unpack(head)
+        if opcode in _DEFINITIONS and self._in_data:
+            yield from self._definitions(at)
+            if self._at > at:
+                return
         if self._in_data and self._summary_start is not None and at >= self._summary_start:
             self._in_data = False
             yield at, ScanDamage(at, 0, "the record that ends the data is damaged", 0)
@@ -645,11 +651,35 @@ class _Scanner:
             return
         until = self._places.next(at) if self._places.believed() else None
         run = self._window.rest(at)[: None if until is None else until - at]
-        found = parse_content(run, messages_only=True)
+        found = parse_content(run, loose=not self._chunked, messages_only=self._chunked)
+        if found.damage:
+            found = parse_content(run, messages_only=True)
         self._at = self._behind = at + found.end
         yield at, Loose(found, at)
 
     # Everything else
+
+    def _definitions(self, at: int) -> Iterator[tuple[int, Item]]:
+        """Schemas and channels that fill their records exactly, up to the next chunk."""
+        run = self._window.rest(at)
+        stops = (len(run), (self._summary_start or self._window.size) - at)
+        known = self._places.next(at - 1)
+        stop = min(*stops, len(run) if known is None else known - at)
+        start = 0
+        while start + _HEAD <= stop:
+            opcode, length = RECORD_HEAD.unpack_from(run, start)
+            end = start + _HEAD + length
+            if opcode not in _DEFINITIONS or end > stop:
+                return
+            try:
+                record, used = read_record(opcode, run[start + _HEAD : end])
+            except SegmentError:
+                return
+            if used != length or record is None:
+                return
+            self._at = self._behind = at + end
+            yield at + start, record
+            start = end
 
     def _plain(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
         end = at + _HEAD + length
@@ -658,7 +688,7 @@ class _Scanner:
             yield from self._lost(at, "no record starts here" if opcode == 0 else reason)
             return
         self._at = end
-        known = opcode <= max(Opcode)
+        known = opcode <= _LAST_KNOWN
         if length > (MAX_PAYLOAD if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
             if known:
                 yield at, self._too_large(at, end, opcode)
@@ -831,7 +861,7 @@ class _Scanner:
             return False
         if opcode == Opcode.FOOTER:
             return end + len(MAGIC) >= self._window.size
-        if opcode <= max(Opcode):
+        if opcode <= _LAST_KNOWN:
             return opcode in _DATA_OPCODES or opcode == Opcode.HEADER
         return opcode >= _FIRST_PRIVATE or self._goes_on(end)
 

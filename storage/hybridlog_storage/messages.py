@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 Buffer = bytes | bytearray | memoryview
 """Contiguous bytes. A memoryview has itemsize 1."""
 
+MAX_CHANNELS = 65535
+"""Most channels of a recording; MCAP numbers them with 16 bits, from 1 on."""
+
 MAX_PAYLOAD = (1 << 30) - (1 << 16)
 """Largest payload, bytes: a chunk, with the heads of its records, has to hold it."""
 

@@ -27,7 +27,7 @@ from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
+from hybridlog_storage.messages import MAX_CHANNELS, Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import OnSealing, SegmentFile
 from hybridlog_storage.segment_format import entries_of
 
@@ -44,7 +44,6 @@ PACKERS = 2
 AT_WORK = 8
 """Closed chunks that may be in work before the writer counts as late."""
 _TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
-_MAX_CHANNELS = 65535
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
 _PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
@@ -342,8 +341,8 @@ class RecordingWriter:
 
     def _meet(self, channel: Channel, mean: float) -> _Known:
         """Register a new channel: its ids and, from its mean payload size, its cluster."""
-        if len(self._known) >= _MAX_CHANNELS:
-            raise StoreError(f"more than {_MAX_CHANNELS} channels in one recording")
+        if len(self._known) >= MAX_CHANNELS:
+            raise StoreError(f"more than {MAX_CHANNELS} channels in one recording")
         schema_id = 0
         if channel.schema is not None:
             schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
