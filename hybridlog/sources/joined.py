@@ -167,7 +167,8 @@ class JoinedSource(Source):
         for batch in batches:
             got += len(batch)
             if len(numbers) < len(inner.channels):
-                numbers = np.array([self._number(each) for each in inner.channels], np.int32)
+                more = [self._number(each) for each in inner.channels[len(numbers) :]]
+                numbers = np.append(numbers, np.array(more, np.int32))
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
             self._take_extras(inner)

@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO
 from tempfile import SpooledTemporaryFile
-from typing import IO, TYPE_CHECKING, BinaryIO, Protocol
+from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, Protocol
 
 import lz4.frame
 import numpy as np
 
-from hybridlog.sources.base import Damage, Source, cannot_open, regroup
+from hybridlog.sources.base import TOO_MANY_CHANNELS, Damage, Source, cannot_open, regroup
 from hybridlog.sources.rosbag1_records import (
     MAX_HEADER,
     OP_BAG_HEADER,
@@ -42,13 +42,16 @@ from hybridlog.sources.rosbag1_records import (
 from hybridlog_storage.compression import is_implausible
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap_content import MIN_RECORDS
-from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
+from hybridlog_storage.messages import MAX_CHANNELS, MAX_PAYLOAD, Batch, Channel, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
 MAGIC = b"#ROSBAG V2.0\n"
+
+_UNDEFINED = -1
+_TOO_MANY = -2  # one more channel than a recording can have
 
 _WINDOW = 4 << 20
 _SEARCH = 1 << 20
@@ -163,10 +166,44 @@ class _Unpacked:
         return self.file.read(count)
 
 
+class _Connection(NamedTuple):
+    """The content of a connection record.
+
+    Attributes:
+        conn: Id of the connection.
+        topic: Its topic.
+        fields: Its data.
+    """
+
+    conn: int
+    topic: bytes
+    fields: bytes
+
+    @classmethod
+    def of(cls, data: bytes, header: Header, span: tuple[int, int]) -> _Connection:
+        return cls(header.u32(data, b"conn"), header.raw(data, b"topic"), data[slice(*span)])
+
+    def channel(self) -> Channel:
+        """The channel of its messages."""
+        data = self.fields
+        fields = parse_fields(data, 0, len(data)) or {}
+        values = {
+            name.decode(errors="replace"): data[start:end] for name, (start, end) in fields.items()
+        }
+        definition = values.pop("message_definition", None)
+        name = values.pop("type", b"").decode(errors="replace")
+        values.pop("topic", None)
+        metadata = {key: value.decode(errors="replace") for key, value in values.items()}
+        encoding = "" if definition is None else "ros1msg"
+        schema = Schema(name, encoding, definition or b"") if name else None
+        topic = self.topic.decode(errors="replace")
+        return Channel(topic, "ros1", schema, metadata, has_publish_time=False)
+
+
 class Rosbag1Source(Source):
     """A ROS 1 bag.
 
-    Each connection of the bag becomes a channel of its own.
+    Each connection with messages becomes a channel of its own.
 
     Raises:
         SourceError: It does not exist, is not a bag of version 2.0, or is encrypted.
@@ -180,11 +217,12 @@ class Rosbag1Source(Source):
             raise cannot_open(path, error) from error
         self._space = _Space(self._read, self.size_bytes, packed=False, cut=False)
         self._runs = RunReader()
-        self._channel_of: dict[int, int] = {}
-        self._numbers: dict[tuple[int, str, str, bytes, tuple[tuple[str, str], ...]], int] = {}
-        self._fallback: dict[int, tuple[bytes, Header, tuple[int, int]]] = {}
+        self._meaning: dict[int, _Connection] = {}  # of connection ids, at present
+        self._numbers: dict[_Connection, int] = {}
+        self._fallback: dict[int, _Connection] = {}
         self._undefined: Counter[int] = Counter()
         self._undefined_at: int | None = None
+        self._too_many = 0
         self._chunk_positions: list[int] = []
         self._chunk_counts: list[int] = []
         self._index_pos = 0
@@ -286,7 +324,8 @@ class Rosbag1Source(Source):
         data = self._read(record.start, record.end - record.start)
         raw = record.raw + data
         span = (len(record.raw), len(raw))
-        self._fallback[record.header.u32(record.raw, b"conn")] = (raw, record.header, span)
+        connection = _Connection.of(raw, record.header, span)
+        self._fallback[connection.conn] = connection
 
     # Reading the file.
 
@@ -584,16 +623,15 @@ class Rosbag1Source(Source):
 
     def _batch(self, space: _Space, data: bytes, run: Run, pos: int) -> Batch:
         """Assign channels to the messages of a run; count those without one."""
-        channel = np.full(len(run.offset), -1, np.int32)
+        channel = np.full(len(run.offset), _UNDEFINED, np.int32)
         done = 0
         for before, header, span in run.connections:
-            conn = header.u32(data, b"conn")
-            number = self._define(conn, data, header, span)
-            if self._channel_of.get(conn, number) != number:
+            meaning = _Connection.of(data, header, span)
+            if self._meaning.get(meaning.conn, meaning) != meaning and before > done:
                 # The id now has another meaning; earlier messages keep the old one.
                 channel[done:before] = self._channels(run.connection[done:before])
                 done = before
-            self._channel_of[conn] = number
+            self._meaning[meaning.conn] = meaning
         channel[done:] = self._channels(run.connection[done:])
         if len(run.offset):
             place = self._place if space.packed else self._place_at(pos)
@@ -606,8 +644,10 @@ class Rosbag1Source(Source):
         batch = Batch(data, run.offset, run.length, channel, times, times, zeros)
         known = channel >= 0
         if not known.all():
-            self._undefined.update(run.connection[~known].tolist())
-            if self._undefined_at is None:
+            self._too_many += int((channel == _TOO_MANY).sum())
+            undefined = run.connection[channel == _UNDEFINED]
+            self._undefined.update(undefined.tolist())
+            if self._undefined_at is None and len(undefined):
                 self._undefined_at = self._pos if space.packed else pos
             batch = batch.take(known)
         return batch
@@ -615,33 +655,23 @@ class Rosbag1Source(Source):
     def _channels(
         self, connection: np.ndarray[tuple[int], np.dtype[np.int64]]
     ) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
-        """Channel indexes of connection ids, -1 for undefined ids."""
+        """Channel indexes of connection ids, negative for undefined ids or too many."""
         ids, where = np.unique(connection, return_inverse=True)
         numbers = np.empty(len(ids), np.int32)
         for row, conn in enumerate(ids.tolist()):
-            if conn not in self._channel_of and conn in self._fallback:
-                self._channel_of[conn] = self._define(conn, *self._fallback[conn])
-            numbers[row] = self._channel_of.get(conn, -1)
+            numbers[row] = self._number(self._meaning.get(conn) or self._fallback.get(conn))
         return numbers[where]
 
-    def _define(self, conn: int, data: bytes, header: Header, span: tuple[int, int]) -> int:
-        """Channel index of a connection record; equal records share a channel."""
-        topic = header.raw(data, b"topic").decode(errors="replace")
-        fields = parse_fields(data, *span) or {}
-        values = {
-            name.decode(errors="replace"): data[start:end] for name, (start, end) in fields.items()
-        }
-        definition = values.pop("message_definition", None)
-        name = values.pop("type", b"").decode(errors="replace")
-        values.pop("topic", None)
-        metadata = {key: value.decode(errors="replace") for key, value in values.items()}
-        key = (conn, topic, name, definition or b"", tuple(sorted(metadata.items())))
-        number = self._numbers.get(key)
+    def _number(self, connection: _Connection | None) -> int:
+        """Channel index of a connection with messages; equal ones share a channel."""
+        if connection is None:
+            return _UNDEFINED
+        number = self._numbers.get(connection)
+        if number is None and len(self.channels) >= MAX_CHANNELS:
+            return _TOO_MANY
         if number is None:
-            encoding = "" if definition is None else "ros1msg"
-            schema = Schema(name, encoding, definition or b"") if name else None
-            number = self._numbers[key] = len(self.channels)
-            self.channels.append(Channel(topic, "ros1", schema, metadata, has_publish_time=False))
+            number = self._numbers[connection] = len(self.channels)
+            self.channels.append(connection.channel())
         return number
 
     # Losses.
@@ -682,11 +712,15 @@ class Rosbag1Source(Source):
         stop = bisect_left(self._chunk_positions, max(place.end, place.start + 1))
         return sum(self._chunk_counts[first:stop])
 
-    def _report(self, offset: int, length: int | None, reason: str, lost: int | None) -> None:
+    def _report(
+        self, offset: int | None, length: int | None, reason: str, lost: int | None
+    ) -> None:
         self.damage.append(Damage(self.path, offset, length, reason, lost))
 
     def _report_undefined(self) -> None:
-        """Report messages of undefined connections."""
+        """Report messages of undefined connections, and of too many."""
+        if self._too_many:
+            self._report(None, None, TOO_MANY_CHANNELS, self._too_many)
         if not self._undefined:
             return
         ids = sorted(self._undefined)

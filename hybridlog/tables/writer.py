@@ -501,12 +501,15 @@ class TableWriter:
         """The messages, grouped by topic and encoding."""
         numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
         found = {number: self._topic_of(number) for number in numbers}
-        kinds = list(dict.fromkeys((topic, codec, r) for topic, codec, r in found.values()))
+        place: dict[tuple[_Topic, Codec, bool], int] = {}
+        for kind in found.values():
+            place.setdefault(kind, len(place))
+        kinds = list(place)
         if len(kinds) == 1:
             yield *kinds[0], messages
             return
         table = np.zeros(numbers[-1] + 1, np.int32)
-        table[numbers] = [kinds.index(kind) for kind in found.values()]
+        table[numbers] = [place[kind] for kind in found.values()]
         for number, rows in rows_by_channel(table[messages.channel]):
             if kinds[number][0].is_wanted:
                 yield *kinds[number], messages.take(rows)

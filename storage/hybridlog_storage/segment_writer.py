@@ -201,12 +201,14 @@ class RecordingWriter:
             return
         seq = np.arange(self._next_seq, self._next_seq + len(batch), dtype=np.int64)
         self._next_seq += len(batch)
-        present = np.flatnonzero(np.bincount(batch.channel)).tolist()
+        counts = np.bincount(batch.channel)
+        sizes = np.bincount(batch.channel, batch.length)
+        present = np.flatnonzero(counts).tolist()
         ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
         for index in present:
             channel = channels[index]
             known = self._known.get(channel) or self._meet(
-                channel, float(batch.length[batch.channel == index].mean())
+                channel, float(sizes[index] / counts[index])
             )
             ids[index], cluster[index] = known.channel_id, known.cluster
         own = replace(batch, channel=ids[batch.channel])
