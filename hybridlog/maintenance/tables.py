@@ -55,18 +55,13 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
 
 def together(entry: RecordingEntry, topics: Collection[str]) -> set[str]:
     """Some topics, and those that share a file with one of them."""
-
-    def schemas(topic: str) -> set[str]:
-        if entry.messages_of(topic) >= OWN_FILE_ROWS:
-            return set()
-        return {
-            table_schema(c.message_encoding, c.schema, c.metadata)
-            for c in entry.channels
-            if c.topic == topic
-        }
-
-    shared = {schema for topic in topics for schema in schemas(topic)}
-    return {t for t in topics_of(entry) if t in topics or not shared.isdisjoint(schemas(t))}
+    messages = entry.messages_by_topic()
+    schemas: dict[str, set[str]] = {topic: set() for topic in topics_of(entry)}
+    for c in entry.channels:
+        if c.topic in schemas and messages[c.topic] < OWN_FILE_ROWS:
+            schemas[c.topic].add(table_schema(c.message_encoding, c.schema, c.metadata))
+    shared = {schema for topic in topics for schema in schemas.get(topic, ())}
+    return {t for t in schemas if t in topics or not shared.isdisjoint(schemas[t])}
 
 
 def make(

@@ -35,9 +35,7 @@ BATCH_MESSAGES = 16384
 MAX_CHUNK = 4 << 30
 """Largest chunk that a source unpacks, in uncompressed bytes; large ones in parts."""
 
-TOO_MANY_CHANNELS = (
-    f"messages of more than {MAX_CHANNELS} channels, as many as a recording can have"
-)
+TOO_MANY_CHANNELS = f"messages of further channels; a recording can have {MAX_CHANNELS}"
 """Reason of the damage that counts messages on further channels."""
 
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes

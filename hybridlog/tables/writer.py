@@ -374,6 +374,9 @@ class TableWriter:
         self._held_rows = 0
         self._held_segment = -1
         self._channels: dict[int, Channel] = {}
+        self._met: Mapping[int, Channel] = {}  # the last mapping, and its size
+        self._met_count = 0
+        self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._of_channel: dict[int, tuple[_Topic, Codec, bool]] = {}
         self._has_publish_time: dict[int, bool] = {}
@@ -489,6 +492,7 @@ class TableWriter:
         if data is None:
             assert self._arena is not None
             data = self._arena[: self._filled]
+        self._has_grown = True
         messages = _Messages.joined(self._held)
         self._held.clear()
         self._filled = self._held_rows = 0
@@ -578,8 +582,9 @@ class TableWriter:
 
     def _spill(self) -> None:
         """Write rows of the largest topics if too many are waiting in memory."""
-        if self._pending < _PENDING:
+        if not self._has_grown or self._pending < _PENDING:
             return
+        self._has_grown = False
         self._decode()
         left = self._pending
         opened = sum(len(f) for topic in self._topics.values() for f in topic.files.values())
@@ -721,7 +726,8 @@ class TableWriter:
                 rows[topic.name] += topic.rows
             elif topic.has_failed:
                 failed.add(topic.name)
-        return failed | {name for name in rows if rows[name] != entry.messages_of(name)}
+        messages = entry.messages_by_topic()
+        return failed | {name for name in rows if rows[name] != messages[name]}
 
     def _write_small(self) -> None:
         """Write topics with few rows, those of one type into one file."""

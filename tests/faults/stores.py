@@ -344,8 +344,8 @@ def _check_database(store: hl.Store, database: Database) -> None:
     expected: dict[str, Counter[str]] = defaultdict(Counter)
     for key, entry in entries.items():
         for place in TopicPlaces(database).of({c.topic for c in entry.channels}).values():
-            if entry.messages_of(place.topic):
-                expected[place.collection][key] += entry.messages_of(place.topic)
+            if messages := entry.messages_by_topic()[place.topic]:
+                expected[place.collection][key] += messages
     for collection in IndexState(database).document_collections():
         pipeline = [{"$group": {"_id": "$_meta.rec", "n": {"$sum": 1}}}]
         found = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}

@@ -20,6 +20,7 @@ import pytest
 import zstandard
 
 from hybridlog.live.sources.ros2.overrides import read_overrides
+from hybridlog.sources.detect import open_source
 from hybridlog.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.compression import Compressor, decompress
 from hybridlog_storage.errors import SegmentError, UsageError
@@ -356,3 +357,44 @@ def test_large_chunks_of_bags_are_read_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     path.write_bytes(bags.bag(bags.packed_chunk(data, "lz4", size)))
     assert read(path)[::2] == (200, [])
+
+
+# Channels
+
+FULL = 65535
+
+
+def test_messages_of_too_many_channels_are_counted(tmp_path: Path) -> None:
+    many = [channel(1 + k % FULL, f"/t{k}") + message(1 + k % FULL) for k in range(FULL + 100)]
+    path = write(tmp_path / "a.mcap", *many, channel(5, "/t4"), message(5))
+    reason = f"messages of further channels; a recording can have {FULL}"
+    assert read(path) == (FULL + 1, FULL, [[reason, 100]])
+    rows = [bags.connection(k, topic=f"/t{k}") + bags.message(k, 1, b"") for k in range(FULL + 100)]
+    again = bags.message(4, 2, b"")
+    bag = tmp_path / "a.bag"
+    bag.write_bytes(bags.bag(*rows, again))
+    assert read(bag) == (FULL + 1, FULL, [[reason, 100]])
+
+
+def test_definitions_without_messages_are_no_channels(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", *(channel(9, f"/t{k}") for k in range(70_000)), message())
+    assert read(path) == (1, 1, [])
+    flips = [channel(k) for k in range(1, FULL)] + [schema(1, f"a/T{k % 2}") for k in range(10_000)]
+    assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, 1, [])
+    bag = tmp_path / "a.bag"
+    rows = [bags.connection(k, topic=f"/t{k}") for k in range(1, FULL + 100)]
+    bag.write_bytes(bags.bag(*rows, bags.connection(0), bags.message(0, 1, b"")))
+    assert read(bag) == (1, 1, [])
+
+
+def test_definitions_between_messages(tmp_path: Path) -> None:
+    parts = [channel(1, f"/t{k % 3}") + message(1, bytes([k % 256])) for k in range(300)]
+    path = write(tmp_path / "a.mcap", *parts)
+    with open_source(path) as source:
+        found = [
+            (source.channels[number].topic, bytes(batch.payload(row))[0])
+            for batch in source.batches()
+            for row, number in enumerate(batch.channel.tolist())
+        ]
+        assert source.damage == []
+    assert found == [(f"/t{k % 3}", k % 256) for k in range(300)]

@@ -282,7 +282,7 @@ def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
     )  # fmt: skip
     assert found[other.id][1].span is None
     assert model.entry.messages == sum(c.messages for c in model.chunks())
-    assert model.entry.messages_of("/ä3") == sum(
+    assert model.entry.messages_by_topic()["/ä3"] == sum(
         c.stats[3].messages for c in model.chunks() if 3 in c.stats
     )
     changed = replace(other.entry, status="recovered", tags={})

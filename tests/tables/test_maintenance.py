@@ -254,7 +254,7 @@ def test_killed_at_each_step(few: hl.Store, tmp_path: Path, what: str) -> None:
         tables = Tables(few.directory.path)
         for topic in everything:
             table = tables.of(entry, topic)
-            assert table is None or table.rows == entry.messages_of(topic)
+            assert table is None or table.rows == entry.messages_by_topic()[topic]
         assert making.make(few.directory, entry)
         assert contents(few) == whole
         if not was_killed:
