@@ -126,6 +126,22 @@ def test_a_changed_document_of_a_shared_collection_is_found(store: hl.Store) -> 
     assert store.verify(["one"]).findings == []
 
 
+def test_a_surplus_document_of_a_shared_collection_is_found(store: hl.Store) -> None:
+    """It is of no chunk, so that only its number tells."""
+    database = database_of(store)
+    (entry,) = store.select(["two"])
+    found = database.find_one(SHARED, {"_meta.rec": entry.key, "_meta.topic": topic(8)})
+    assert found is not None
+    found["_id"] = found["_id"][:-1] + bytes([found["_id"][-1] ^ 0xFF])
+    found["_meta"]["ref"]["chunk"] = 99
+    database.replace(SHARED, {"_id": found["_id"]}, found)
+    (finding,) = store.verify(["two"]).findings
+    assert "37 index documents, 36 messages" in finding.problem
+    store.reindex(["two"])
+    assert documents(store) == ALL
+    assert store.verify().findings == []
+
+
 def test_a_removed_recording_leaves_the_others(store: hl.Store) -> None:
     store.remove("one")
     assert documents(store) == {"own two": 12, "shared two": 36}

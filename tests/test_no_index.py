@@ -5,14 +5,17 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from hybridlog.maintenance import index
 from hybridlog.maintenance.index import catch_up
 from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.topics import matcher
+from hybridlog_storage import topic_places
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import TopicError
@@ -94,6 +97,26 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         (entry,) = again.recordings()
         assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
         assert catch_up(again.directory, again.catalog, again.connect(), entry.label) == 0
+
+
+def test_what_has_no_documents_is_not_missing_among_those_of_others(
+    tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+    indexed: list[str] = []
+    real = index.catch_up
+
+    def catch_up(*args: Any) -> int:
+        indexed.append(args[3])
+        return real(*args)
+
+    with hl.open(tmp_path / "shared", create=True, require_database=True) as store:
+        store.record(log, name="whole")
+        store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
+        monkeypatch.setattr(index, "catch_up", catch_up)
+        store.reindex()
+        assert sorted(indexed) == ["part", "whole"]
+        assert store.verify().findings == []
 
 
 def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
