@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -83,6 +83,7 @@ class Session:
         self._progress = progress
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
+        self._indexed: set[str] = set()  # ids of those that it has in any case
         self._recordings: list[RecordingEntry] | None = None
         self._by_id: dict[str, RecordingEntry] = {}
         self._belief: Belief | None = None
@@ -125,8 +126,27 @@ class Session:
                 self.connect()
         return self.connected
 
-    def connect(self) -> Database:
+    def database_about(
+        self, entry: RecordingEntry, others: Callable[[], Iterable[RecordingEntry]]
+    ) -> Database | None:
+        """The index of a recording; None if MongoDB is unavailable.
+
+        Args:
+            entry: The recording.
+            others: Returns other recordings of the question. The rest of the store need not
+                be in the index.
+        """
+        is_ready = self._is_indexed or entry.id in self._indexed
+        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
+            with suppress(HybridlogError):
+                self.connect({entry.id: entry, **{other.id: other for other in others()}}.values())
+        return self.connected
+
+    def connect(self, recordings: Collection[RecordingEntry] | None = None) -> Database:
         """Connect to the index and bring it up to date; try again if the connection breaks.
+
+        Args:
+            recordings: The recordings that the index must have; None for all.
 
         Raises:
             DatabaseError: MongoDB does not answer.
@@ -138,9 +158,9 @@ class Session:
             try:
                 for tried in range(1, _TRIES):
                     with suppress(ConnectionBrokenError):
-                        return self._connect()
+                        return self._connect(recordings)
                     time.sleep(_PAUSE_S * 2 ** (tried - 1))
-                return self._connect()
+                return self._connect(recordings)
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
@@ -148,11 +168,13 @@ class Session:
                     self._rests_until = time.monotonic() + _REST_S
                 raise
 
-    def _connect(self) -> Database:
+    def _connect(self, recordings: Collection[RecordingEntry] | None) -> Database:
         from hybridlog.maintenance import index
 
         if self.connected is None:
             self._belief = self._places = None
+            self._is_indexed = False
+            self._indexed.clear()
         repairs = RepairReport()
         has_changed = False
         try:
@@ -162,7 +184,7 @@ class Session:
                     self.directory,
                     self.catalog,
                     database,
-                    self.recordings(),
+                    self.recordings() if recordings is None else recordings,
                     report=repairs,
                     progress=self._progress,
                 )
@@ -174,9 +196,11 @@ class Session:
             self.repairs.removed += repairs.removed
         self._unavailable = None
         self._rests_until = 0.0
+        known = self._indexed.copy()
         if has_changed:
             self.invalidate()
-        self._is_indexed = True
+        self._is_indexed = recordings is None
+        self._indexed = known.union(entry.id for entry in recordings or ())
         return database
 
     def disconnect(self) -> None:
@@ -228,7 +252,7 @@ class Session:
         """
         from hybridlog.guarded import GuardedIndex
 
-        database = self.database_for(purpose)
+        database = self.connected or self.database_for(purpose)
         try:
             return GuardedIndex(database, recordings, self.belief, self.invalidate)
         except IndexChangedError as error:
@@ -246,7 +270,7 @@ class Session:
         """
         from hybridlog_storage.topic_places import TopicPlaces
 
-        database = self.database_for(purpose)
+        database = self.connected or self.database_for(purpose)
         if self._places is None:
             self._places = TopicPlaces(database)
         return self._places
@@ -525,6 +549,7 @@ class Session:
         self._recordings = None
         self._by_id = {}
         self._is_indexed = False
+        self._indexed.clear()
         self._belief = None
         self._places = None
         self._schemas = {}

@@ -158,6 +158,22 @@ def test_the_running_question_is_answered(store: Path) -> None:
         assert not opened.repairs.damage
 
 
+def test_only_the_recordings_of_the_question_are_indexed_first(store: Path) -> None:
+    shutil.rmtree(store / "mongod")
+    with hl.open(store) as opened:
+        first = opened.query([IMU], ["two"])
+        want = first.count()
+        assert sum(1 for _ in first.documents()) == want
+        assert [*opened.repairs.indexed] == ["two"]
+        assert sum(1 for _ in first.documents()) == want
+        assert [*opened.repairs.indexed] == ["two"]
+        assert sum(1 for _ in opened.topic(IMU).documents()) == opened.topic(IMU).count() > want
+        assert sorted(opened.repairs.indexed) == ["one", "two"]
+    with hl.open(store, require_database=True) as opened:
+        assert not opened.repairs.indexed
+        assert not opened.verify().findings
+
+
 def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> None:
     """A server that is not ours is left alone, whatever it says."""
     with other_mongod(tmp_path) as uri, hl.open(store, mongo=uri) as opened:

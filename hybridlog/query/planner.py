@@ -343,7 +343,7 @@ class Planner:
         costs = self._costs(self._files(part, Need.COUNT), part, Need.COUNT, ())
         if costs and (costs[0][1] is not self._scan or costs[0][0] < _CONNECT_S):
             return False
-        if self.session.database is None or self._costs([self._mongo], part, Need.COUNT, ()):
+        if not self._mongo.reaches(part) or self._costs([self._mongo], part, Need.COUNT, ()):
             return False
         return self._mongo.cost(part, Need.SELECTION) is not None
 

@@ -59,7 +59,6 @@ def _matching(
     session: Session, question: Question, counters: Counters
 ) -> Iterator[tuple[str, Document]]:
     """All matching documents with their topics, in order."""
-    session.database_for("Reading index documents")
     planner = Planner(session, question, counters)
     parts = planner.parts()
     missing = sorted({part.topic for part in parts if not part.is_indexed})
@@ -69,6 +68,8 @@ def _matching(
             "messages or tables."
         )
     mongo = Mongo(session, counters, lambda: parts)
+    if not all(mongo.reaches(part) for part in parts[:1]):
+        session.database_for("Reading index documents")
     by_topic: dict[str, list[Part]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)

@@ -72,7 +72,7 @@ class Mongo:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
         if need is Need.VALUES or self._is_away or _is_older(part) or not part.is_indexed:
             return None
-        if self._session.database is None:
+        if not self.reaches(part):
             return None
         try:
             if need is not Need.SELECTION and self.undecided(part):
@@ -87,6 +87,14 @@ class Mongo:
         return _QUESTION_S * (1 + windows / _WINDOWS_A_QUESTION) + (
             each * part.messages * part.share
         )
+
+    def reaches(self, part: Part) -> bool:
+        """True if MongoDB answers; the index then has the recordings of the question."""
+        others = self._together
+        database = self._session.database_about(
+            part.recording, lambda: (other.recording for other in others())
+        )
+        return database is not None
 
     def filter_of(self, part: Part) -> MongoFilter:
         """The predicate of a part as a MongoDB filter."""
@@ -335,7 +343,7 @@ class Mongo:
         if not self._is_known:
             # The state of all recordings of the question is read at once.
             everything = [*entries, *(part.recording for part in self._together())]
-            database = self._session.database_for("A predicate")
+            database = self._session.connected or self._session.database_for("A predicate")
             self._session.belief(database, {entry.key for entry in everything})
             self._is_known = True
         return self._session.index_for("A predicate", entries)
