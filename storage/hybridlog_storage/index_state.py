@@ -15,6 +15,7 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
 
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
@@ -36,6 +37,8 @@ _DESTROYS: Final = frozenset({"clearing", "removing"})
 _KEY: Final = re.compile("[0-9a-f]{16}")
 _TURN: Final = {"_id": "turn"}
 _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
+_CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
+_MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
 _SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
 """Values of an entry that may change while its segments stay."""
 
@@ -190,8 +193,10 @@ class IndexState:
         if found is None:
             return False
         document = {name: found[name] for name in found if name not in {"_id", "index"}}
+        wanted = replace(entry, label=_label(entry), channels=[])
         try:
-            return RecordingEntry.from_document(document) == replace(entry, label=_label(entry))
+            same = document.pop("channels") == _mirrored(entry)["channels"]
+            return same and RecordingEntry.from_document({**document, "channels": []}) == wanted
         except (AttributeError, KeyError, TypeError, ValueError):
             return False
 
@@ -297,7 +302,15 @@ class IndexState:
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
     """An entry as MongoDB accepts it: a directory's name may not be UTF-8."""
-    return {**entry.to_document(), "label": _label(entry)}
+    document = {**entry.to_document(), "label": _label(entry)}
+    text = (
+        len(part)
+        for channel in entry.channels
+        for part in (channel.topic, channel.reason or "", *chain(*channel.metadata.items()))
+    )
+    if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MOST_CHANNEL_BYTES:
+        document["channels"] = [{"topic": channel.topic} for channel in entry.channels]
+    return document
 
 
 def _label(entry: RecordingEntry) -> str:

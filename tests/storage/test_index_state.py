@@ -387,3 +387,13 @@ def test_a_database_says_whose_it_is(state: IndexState) -> None:
     state.claim({"id": "b"})
     assert state.mark() == {"_id": "store", "id": "b"}
     assert state.turn() == 1
+
+
+def test_the_mirror_of_many_topics_fits_into_a_document(state: IndexState) -> None:
+    entry = recording(topics=tuple(f"/robot/part{number}" for number in range(65_535)))
+    state.put(entry, "complete", turn=1, segments=DIGESTS)
+    assert state.is_mirrored(entry)
+    found = state.of()[entry.key]
+    assert len(found.topics) == 65_535
+    other = replace(entry, channels=[*entry.channels[1:], entry.channels[0]])
+    assert not state.is_mirrored(other)
