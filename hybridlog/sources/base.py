@@ -35,6 +35,9 @@ BATCH_MESSAGES = 16384
 MAX_CHUNK = 4 << 30
 """Largest chunk that a source unpacks, in uncompressed bytes; large ones in parts."""
 
+MAX_PLACES = 10_000
+"""Damaged places of a file that are reported one by one."""
+
 TOO_MANY_CHANNELS = f"messages of further channels; a recording can have {MAX_CHANNELS}"
 """Reason of the damage that counts messages on further channels."""
 
@@ -105,6 +108,22 @@ class Source(ABC):
         self.time_range: tuple[int, int] | None = None
         self.bytes_read: int = 0
         self.packed_messages: bool = False
+        self._more_places = 0
+
+    def note(self, damage: Damage) -> None:
+        """Add a damaged place; above `MAX_PLACES`, the last row counts all further ones."""
+        if len(self.damage) < MAX_PLACES:
+            self.damage.append(damage)
+            return
+        self._more_places += 1
+        lost = damage.messages_lost
+        if self._more_places == 1:
+            self.damage.append(damage)
+        else:
+            before = self.damage[-1].messages_lost
+            lost = None if lost is None or before is None else lost + before
+        reason = f"{self._more_places} more places could not be read"
+        self.damage[-1] = Damage(damage.file, None, None, reason, lost)
 
     @abstractmethod
     def batches(self) -> Iterator[Batch]:

@@ -276,7 +276,7 @@ class McapSource(Source):
         self.bytes_read = max(self.bytes_read, offset)
 
     def _note(self, offset: int | None, length: int | None, reason: str, lost: int | None) -> None:
-        self.damage.append(Damage(self.path, offset, length, reason, lost))
+        self.note(Damage(self.path, offset, length, reason, lost))
         self._lost += lost or 0
 
     def _settle(self) -> None:

@@ -715,7 +715,7 @@ class Rosbag1Source(Source):
     def _report(
         self, offset: int | None, length: int | None, reason: str, lost: int | None
     ) -> None:
-        self.damage.append(Damage(self.path, offset, length, reason, lost))
+        self.note(Damage(self.path, offset, length, reason, lost))
 
     def _report_undefined(self) -> None:
         """Report messages of undefined connections, and of too many."""

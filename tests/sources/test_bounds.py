@@ -398,3 +398,17 @@ def test_definitions_between_messages(tmp_path: Path) -> None:
         ]
         assert source.damage == []
     assert found == [(f"/t{k % 3}", k % 256) for k in range(300)]
+
+
+def test_very_many_damaged_places_are_counted_together(tmp_path: Path) -> None:
+    index = record(7, struct.pack("<HI", 1, 32) + bytes(32))
+    bad = chunk("zstd", b"bad", 100) + index
+    good = chunk("", message(), len(message()))
+    messages, _, damage = read(write(tmp_path / "a.mcap", bad * 10_300, good))
+    assert messages == 1
+    assert len(damage) == 10_001
+    assert damage[9_999][1] == 2
+    assert damage[10_000] == ["300 more places could not be read", 600]
+    unknown = chunk("zstd", b"bad", 100)
+    damage = read(write(tmp_path / "b.mcap", bad * 10_300, unknown, good))[2]
+    assert damage[10_000] == ["301 more places could not be read", None]
