@@ -268,7 +268,7 @@ def _prepare(
     if indexed is not None and indexed.state == "complete" and left == dict(indexed.segments):
         state.put(entry, "indexing", turn=turn, segments=left)
         state.forget_chunks(entry.key)
-        return Indexed(entry.id, "indexing", left, turn, ()), {}
+        return Indexed(entry.id, "indexing", left, turn), {}
     # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn, segments=left)
     if indexed is None:
@@ -277,7 +277,7 @@ def _prepare(
     else:
         state.clear(entry.key, but=[int(n) for n in left])
     state.put(entry, "indexing", turn=turn, segments=left)
-    return Indexed(entry.id, "indexing", left, turn, ()), {}
+    return Indexed(entry.id, "indexing", left, turn), {}
 
 
 def _fits(entry: RecordingEntry, catalog: Catalog, done: Mapping[Place, int]) -> bool:

@@ -159,7 +159,7 @@ class TopicTable:
         self.reduced = sum(file.about.reduced for file in self.files)
         self._cache = cache
         self._runs = list(_runs(parts))
-        self._leaves = {file.number: list(_leaves(file.schema)) for file in self.files}
+        self._leaves = {file.number: cache.leaves(file) for file in self.files}
         self._types: dict[frozenset[str] | None, Any] = {}
 
     def fields(self, paths: Collection[str] | None = None) -> Any:
@@ -312,6 +312,7 @@ class _Cache:
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
         self._columns: OrderedDict[tuple[int, int, str, tuple[int, ...]], Any] = OrderedDict()
+        self._leaves: dict[int, list[_Leaf]] = {}
         self._size = 0
         self._lock = threading.Lock()
 
@@ -333,9 +334,22 @@ class _Cache:
                     self._size -= self._columns.popitem(last=False)[1].nbytes
         return column
 
+    def leaves(self, file: ParquetFileReader) -> list[_Leaf]:
+        """The columns of a file; the tables of several topics may be in one."""
+        with self._lock:
+            found = self._leaves.get(file.number)
+        if found is None:
+            found = list(_leaves(file.schema))
+            with self._lock:
+                if len(self._leaves) >= _OPEN_FILES:
+                    self._leaves.clear()
+                self._leaves[file.number] = found
+        return found
+
     def clear(self) -> None:
         with self._lock:
             self._columns.clear()
+            self._leaves.clear()
             self._size = 0
 
 

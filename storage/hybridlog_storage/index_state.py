@@ -52,7 +52,6 @@ class Indexed:
         state: Progress of the index.
         segments: Digest of each completely indexed segment, by its number as text.
         turn: Counts how often its documents were removed or rebuilt.
-        topics: Topics of its documents, as far as known.
         has_list: Whether the list of its chunks may still exist although it is complete.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
@@ -62,7 +61,6 @@ class Indexed:
     state: State
     segments: Mapping[str, str]
     turn: int
-    topics: tuple[str, ...]
     has_list: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
@@ -108,18 +106,16 @@ class IndexState:
         """The index states of these recordings, or of all, by key."""
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
-        wanted = {"id": 1, "index": 1, "channels.topic": 1, **dict.fromkeys(_SHOWN, 1)}
+        wanted = {"id": 1, "index": 1, **dict.fromkeys(_SHOWN, 1)}
         for document in self._db.find(
             RECORDINGS, asked, wanted, batch_size=_AT_ONCE, read="majority"
         ):
             index = document.get("index") or {}
-            topics = {str(c.get("topic", "")) for c in document.get("channels") or ()}
             found[document["_id"]] = Indexed(
                 str(document.get("id", "")),
                 index.get("state", "indexing"),
                 dict(index.get("segments") or {}),
                 int(index.get("turn", 0)),
-                tuple(sorted(topics)),
                 bool(index.get("has_list")),
                 {name: document.get(name) for name in _SHOWN},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
