@@ -260,6 +260,7 @@ Data = Callable[[], tuple[bytes, int]]
         ("zstd", lambda: zstd(repeat(record(0x90, b""))), None, "too many records for its size"),
         ("zstd", lambda: zstd(repeat(schema(2))), None, "too many records for its size"),
         ("zstd", lambda: zstd(repeat(message())), None, "too many records for its size"),
+        ("zstd", lambda: zstd(repeat(message(), 5 << 19)), None, "too many records for its size"),
         ("zstd", lambda: zstd(private(300 << 20, 5)), None, "too many to be believed"),
         ("zstd", lambda: zstd(noisy(99 << 20)), 100 << 20, "bytes, not 104857600"),
     ],
@@ -302,6 +303,15 @@ def test_large_chunks_are_read_in_little_memory(tmp_path: Path, codec: str, size
     messages, _, damage = read(path)
     assert len(parts) // 3 < messages < len(parts)
     assert f"{messages} messages of its beginning were read" in damage[0][0]
+
+
+def test_messages_before_damage_in_a_large_chunk_are_not_lost(tmp_path: Path) -> None:
+    data, size = zstd([message(payload=os.urandom(PIECE))] * 70 + [bytes(PIECE)])
+    index = record(7, struct.pack("<HI", 1, 16 * 80) + bytes(16 * 80))
+    messages, _, damage = read(write(tmp_path / "a.mcap", chunk("zstd", data, size), index))
+    assert messages == 70
+    assert damage[0][1] == 10
+    assert "has no kind; 70 messages before that were read" in damage[0][0]
 
 
 def test_several_lz4_frames_in_a_chunk(tmp_path: Path) -> None:
