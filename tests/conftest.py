@@ -98,6 +98,7 @@ SLOW = frozenset(
         "servers/test_resets.py",
         "servers/test_tls.py",
         "servers/test_uri.py",
+        "sources/test_bounds.py",
         "sources/test_rosbag1.py",
         "sources/test_rosbag2.py",
         "storage/test_catalog.py",
