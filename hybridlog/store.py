@@ -521,6 +521,9 @@ class Store:
             else:
                 (entry,) = self.select([recording])
                 removal.remove(self.directory, self.catalog, self.session.writable_database, entry)
+        except ConnectionLostError:
+            self.refresh()
+            self.connect()  # a new connection removes the rest
         finally:
             self.refresh()
 

@@ -337,8 +337,18 @@ def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
         shutil.rmtree(store / name)
         if name == "mongod/data":
             kill_mongod(store)
+        else:
+            ended(store)  # its keeper notices
         assert documents(opened) == want
         assert sorted(opened.repairs.indexed) == ["one", "two"]
+
+
+def test_a_recording_is_removed_from_an_index_that_ends(store: Path) -> None:
+    with hl.open(store, require_database=True) as opened:
+        kill_mongod(store)
+        opened.remove("one")
+        assert [r.label for r in opened.recordings()] == ["two"]
+        assert not opened.verify().findings
 
 
 @pytest.mark.parametrize("work", ["reindex", "indexes"])

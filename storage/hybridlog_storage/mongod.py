@@ -270,6 +270,7 @@ class EmbeddedMongod:
                         if self._aside is not None:
                             self._put_back()
                         if damage is not None or not is_damage:
+                            self._clear_files()
                             raise failure
                         damage, patience = str(failure), _Patience(self.log)
                     log_start = self._launch(keeper, damage)
@@ -345,9 +346,20 @@ class EmbeddedMongod:
         """What the last mongod said about damaged data files before it ended by itself."""
         text = _read_from(self.log, 0).rpartition(START_LINE)[2]
         lines = [line for line in text.splitlines() if '"s":"F"' in line]
-        if not any(sign in line for line in lines for sign in _DAMAGE) or _other_cause(text):
+        if _NOT_AT_FAULT in text or _other_cause(text):
+            return None
+        if not any(sign in line for line in lines for sign in _DAMAGE):
             return None
         return "; ".join(_telling_lines(text))
+
+    def _clear_files(self) -> None:
+        """Note in the log that the data files did not end the last mongod."""
+        with contextlib.suppress(OSError):
+            fd = files.open_file(self.log, os.O_WRONLY | os.O_APPEND, depth=_IN_HERE)
+            try:
+                os.write(fd, _NOT_AT_FAULT.encode())
+            finally:
+                os.close(fd)
 
     def _set_aside(self, damage: str) -> None:
         """Replace the data files by an empty directory. Needs all locks but `users.lock`."""
@@ -508,6 +520,7 @@ class EmbeddedMongod:
 
 START_LINE = "hybridlog: starts mongod\n"
 """What the keeper logs before it starts mongod."""
+_NOT_AT_FAULT = "hybridlog: the data files are not at fault\n"
 _DAMAGE = ("wiredtiger", "WT_PANIC", "data corruption")
 """Words in the last lines of a mongod that ended because of its data files."""
 
@@ -527,22 +540,6 @@ def _was_ended(text: str) -> bool:
 
 _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     (
-        ResourceError,
-        ("Too many open files",),
-        "ran out of file handles; the hard limit is {limit}. Raise it (`ulimit -n` as root, "
-        "`LimitNOFILE=` of a service), or keep fewer topics: each takes a handle or two.",
-    ),
-    (
-        ResourceError,
-        ("Cannot allocate memory", "bad_alloc", "ut of memory"),
-        "ran out of memory. End other programs, or raise its limit (`ulimit -v`).",
-    ),
-    (
-        DiskFullError,
-        ("No space left on device", "Disk quota exceeded"),
-        "There is no space left on its file system; free some and try again.",
-    ),
-    (
         DatabaseError,
         (
             "DBPathInUse",
@@ -551,6 +548,23 @@ _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
         ),
         "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
         "use it with --mongo URI.",
+    ),
+    (
+        ResourceError,
+        ("Too many open files",),
+        "ran out of file handles; the hard limit is {limit}. Raise it (`ulimit -n` as root, "
+        "`LimitNOFILE=` of a service), or keep fewer topics: each takes a handle or two.",
+    ),
+    (
+        ResourceError,
+        # mongod gets no memory for another thread.
+        ("Cannot allocate memory", "bad_alloc", "ut of memory", "Resource temporarily unavailable"),
+        "ran out of memory. End other programs, or raise its limits (`ulimit -v`, `ulimit -u`).",
+    ),
+    (
+        DiskFullError,
+        ("No space left on device", "Disk quota exceeded"),
+        "There is no space left on its file system; free some and try again.",
     ),
     (
         DatabaseError,

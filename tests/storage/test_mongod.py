@@ -524,6 +524,26 @@ echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
     assert inside(directory) == ["data", "mongod.log"]
 
 
+def test_a_mongod_that_cannot_start_at_all_is_no_damage(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later, when it can, what it said before is not held against the data files."""
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        with MongoClient(user.start()) as client:
+            client.test.kept.insert_one({"_id": 1})
+        processes = pids(directory)
+    gone(*processes)
+    script = """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$"""
+    with monkeypatch.context() as patch:
+        patch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+        with pytest.raises(DatabaseError, match="WT_PANIC"):
+            EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        assert user.damage is None
+        with MongoClient(user.start()) as client:
+            assert client.test.kept.count_documents({}) == 1
+
+
 def test_damaged_data_files_are_removed_at_once_if_room_is_short(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -552,6 +572,7 @@ def test_what_an_interrupted_replacement_has_left_is_removed(directory: Path) ->
     [
         ("24: Too many open files", "exit 14", ResourceError, r"file handles; .*ulimit -n"),
         ("std::bad_alloc", "kill -6 $$", ResourceError, "out of memory"),
+        ("11: Resource temporarily unavailable", "kill -6 $$", ResourceError, "out of memory"),
         ("No space left on device", "exit 14", DiskFullError, "free some"),
         ("16: already being managed by another process", "exit 14", DatabaseError, "has .* open"),
         ("Permission denied", "exit 100", DatabaseError, "somebody else"),
