@@ -158,6 +158,21 @@ def test_a_lost_database_is_made_again(store: hl.Store, only_mongo: Callable[[],
         assert again.topic(topic(FEW - 1)).where("data >= 3").count() == 3
 
 
+def test_a_lost_list_of_topics_makes_no_wrong_answer(store: hl.Store) -> None:
+    database = database_of(store)
+    store.connect()
+    question = store.topic(topic(FEW - 1)).where("data >= 3")
+    database.drop(TOPICS)
+    store.refresh()
+    assert question.count() == 3
+    assert len(list(question)) == 3
+    assert len(store.verify().findings) > 0
+    store.reindex()
+    assert store.verify().findings == []
+    assert documents(store).total() == sum(ALL.values())
+    assert question.count() == 3
+
+
 def test_an_interrupted_recording_is_indexed_where_it_was_begun(
     store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

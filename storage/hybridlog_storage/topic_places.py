@@ -42,10 +42,13 @@ class TopicPlace:
     Attributes:
         topic: The topic.
         is_shared: Whether other topics lie in the same collection.
+        is_listed: Whether the topic is listed. Otherwise it has no documents yet, or the list
+            is damaged.
     """
 
     topic: str
     is_shared: bool = False
+    is_listed: bool = True
 
     @property
     def collection(self) -> str:
@@ -103,13 +106,15 @@ class TopicPlaces:
         self._lock = threading.Lock()
 
     def of(self, topics: Collection[str]) -> dict[str, TopicPlace]:
-        """The places of topics; one that is not listed has no documents yet.
+        """The places of topics.
 
         Raises:
             DatabaseError: MongoDB fails.
         """
         self._read(topics)
-        return {topic: self._known.get(topic) or TopicPlace(topic) for topic in topics}
+        return {
+            topic: self._known.get(topic) or TopicPlace(topic, is_listed=False) for topic in topics
+        }
 
     def assigned(self, topics: Collection[str]) -> dict[str, TopicPlace]:
         """The places of topics whose documents are about to be written.

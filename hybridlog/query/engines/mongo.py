@@ -75,7 +75,8 @@ class Mongo:
         if not self.reaches(part):
             return None
         try:
-            if need is not Need.SELECTION and self.undecided(part):
+            is_listed = self._place(part).is_listed
+            if not is_listed or (need is not Need.SELECTION and self.undecided(part)):
                 return None
         except IndexChangedError:
             return None
