@@ -326,7 +326,8 @@ def bench_plan_first(store: Any, benchmark: Any) -> None:
 
 
 def _plan(store: Any, question: Callable[[Any], Any]) -> Any:
-    return Planner(store.session, question(store).question, Counters()).scan_plan()
+    planner = Planner(store.session, question(store).question, Counters())
+    return planner.plan(planner.parts())
 
 
 FETCHES: dict[str, tuple[Callable[[Any], Any], int]] = {

@@ -30,6 +30,8 @@ class Connection:
     Attributes:
         may_write: False if the user of MongoDB may only read.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
+        index: Id of the index, which another index in its place would not have; empty without
+            a connection, or if the user of MongoDB may only read a new one.
     """
 
     def __init__(
@@ -37,6 +39,7 @@ class Connection:
     ) -> None:
         self.may_write = True
         self.damage: list[str] = []
+        self.index = ""
         self._database: Database | None = None
         self._directory = directory
         self._wanted = mongo
@@ -67,9 +70,11 @@ class Connection:
             state = IndexState(database)
             place = lease.place_of(self._directory)
             self.may_write = database.may_write()
-            is_new = lease.check(state.mark(), place, database, embedded=self._uri == EMBEDDED)
-            if is_new and self.may_write:
-                state.claim(place)
+            mark = state.mark()
+            is_new = lease.check(mark, place, database, embedded=self._uri == EMBEDDED)
+            if (is_new or mark is None or "index" not in mark) and self.may_write:
+                mark = state.claim(place)
+            self.index = "" if mark is None else str(mark.get("index", ""))
         return database
 
     def another(self) -> Database:
@@ -126,6 +131,7 @@ class Connection:
         if self._database is not None:
             self._database.close()
         self._database = None
+        self.index = ""
         if self._mongod is not None:
             self._mongod.stop()
         self._mongod = None

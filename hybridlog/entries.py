@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from hybridlog.losses import Cause, joined
+from hybridlog.losses import Cause, extent_of, joined, topics_of
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
     ChannelStats,
@@ -28,6 +28,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
+from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -233,7 +234,50 @@ def describe(
     ]
     _fill_stats(entry, inventory, stamps)
     tables = {number: summary.table for number, summary in inventory.summaries.items()}
-    return Described(entry, inventory.listing.print, tables, channels)
+    return Described(
+        entry,
+        summary_of(entry, inventory.listing.look),
+        topic_types(entry),
+        inventory.listing.print,
+        tables,
+        channels,
+    )
+
+
+def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
+    """The summary of a recording.
+
+    Args:
+        entry: Its entry.
+        look: State of its directory; empty if that does not matter.
+    """
+    losses = entry.end.get("losses", ())
+    return RecordingSummary(
+        id=entry.id,
+        label=entry.label,
+        name=entry.name,
+        tags=entry.tags,
+        source=entry.source,
+        created=entry.created,
+        status=entry.status,
+        span=entry.span,
+        extent=extent_of(entry),
+        topics=hash_of(topics_to_json(topic_types(entry))),
+        topic_count=len({channel.topic for channel in entry.channels}),
+        messages=entry.messages,
+        stored_bytes=entry.stored_bytes,
+        segments=entry.segments,
+        has_losses=bool(losses),
+        has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
+        look=look,
+    )
+
+
+def topic_types(entry: RecordingEntry) -> set[TopicType]:
+    """Topics of a recording and their types; includes those that have lost all messages."""
+    found = {TopicType(c.topic, c.message_encoding, c.schema or "") for c in entry.channels}
+    lost = topics_of(entry) - {topic.topic for topic in found}
+    return found | {TopicType(topic, "", "") for topic in lost}
 
 
 def _base(inventory: Inventory) -> RecordingEntry:

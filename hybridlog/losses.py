@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
+_LAST = 2**63 - 1  # ns
 _JOINED_NS = 12_000_000_000
 _SLOW_NS = 10_000_000_000  # interval between rows for losses that the user wants
 
@@ -142,6 +143,22 @@ def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
     for row in _lost_from_store(entry):
         if row["from"] is not None:
             yield row["from"], row["to"]
+
+
+def extent_of(entry: RecordingEntry) -> tuple[int, int]:
+    """Log time `[begin, end)` of a recording, ns; empty at 0 without messages.
+
+    Stored messages that are lost count, which preserves the meaning of relative times.
+    The span ends at the last nanosecond of 64 bits at the latest: a message of exactly that
+    time is in no interval.
+    """
+    spans = [*lost_spans(entry)]
+    if entry.span is not None:
+        spans.append(entry.span)
+    if not spans:
+        return 0, 0
+    first, last = min(first for first, _ in spans), max(last for _, last in spans)
+    return first, min(last + 1, _LAST)
 
 
 def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:

@@ -163,9 +163,9 @@ class Documents:
                 self._bodies[row] = body.tobytes()
 
 
-def messages_in(channels: Sequence[RecordedChannel], run: MessageRun) -> Iterator[Message]:
-    """The messages of a run, in its order; `run.batch.channel` indexes the channels."""
-    batch = run.batch
+def messages_in(run: MessageRun) -> Iterator[Message]:
+    """The messages of a run, in its order."""
+    batch, channels = run.batch, run.channels
     documents = Documents(channels, batch)
     view = memoryview(batch.buffer)
     # Columns are converted to lists at once: access to single numbers of arrays is slow.

@@ -230,14 +230,14 @@ def _end_of(source: Source) -> dict[str, Any]:
 
 
 def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:
-    for _, known in catalog.recordings().values():
-        if known.source.get("fingerprint") == fingerprint:
-            state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
-            raise AlreadyRecordedError(
-                f"{source.path} is in the store already, as {known.label!r}"
-                f"{state.get(known.status, '')}. "
-                "Use --again to record it once more."
-            )
+    known = catalog.with_fingerprint(fingerprint)
+    if known is not None:
+        state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
+        raise AlreadyRecordedError(
+            f"{source.path} is in the store already, as {known.label!r}"
+            f"{state.get(known.status, '')}. "
+            "Use --again to record it once more."
+        )
 
 
 def _name_of(path: Path) -> str:

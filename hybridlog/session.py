@@ -9,10 +9,16 @@ from contextlib import suppress
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hybridlog.connection import Connection
 from hybridlog.entries import channels_of, take_inventory
-from hybridlog.losses import topics_of
-from hybridlog.maintenance.opening import open_catalog, put_again, repair_on_open
+from hybridlog.maintenance.opening import (
+    current_entry,
+    open_catalog,
+    put_again,
+    repair_on_open,
+)
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
@@ -32,12 +38,17 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hybridlog.guarded import Belief, GuardedIndex
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.query.question import Question
+    from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.summary import RecordingSummary
     from hybridlog_storage.topic_places import TopicPlaces
 
 _MAX_OPEN_SEGMENTS = 256
@@ -84,8 +95,9 @@ class Session:
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
         self._indexed: set[str] = set()  # ids of those that it has in any case
-        self._recordings: list[RecordingEntry] | None = None
-        self._by_id: dict[str, RecordingEntry] = {}
+        self._doubted: set[str] = set()  # recordings that the index may lack
+        self._snapshot: Snapshot | None = None
+        self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
         self._belief: Belief | None = None
         self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
@@ -97,7 +109,7 @@ class Session:
         self.catalog = open_catalog(directory)
         self._remember_meanings()
         try:
-            self.recordings()
+            self.snapshot()
         except BaseException:
             self.catalog.close()
             raise
@@ -177,6 +189,7 @@ class Session:
             self._indexed.clear()
         repairs = RepairReport()
         has_changed = False
+        wanted = None if recordings is None else {entry.id: entry for entry in recordings}
         try:
             database = self.connection.open()
             if self.connection.may_write:
@@ -184,7 +197,11 @@ class Session:
                     self.directory,
                     self.catalog,
                     database,
-                    self.recordings() if recordings is None else recordings,
+                    self.snapshot(),
+                    self.entry_of,
+                    index=self.connection.index,
+                    doubted=self._doubted,
+                    wanted=None if wanted is None else wanted.keys(),
                     report=repairs,
                     progress=self._progress,
                 )
@@ -196,6 +213,7 @@ class Session:
             self.repairs.removed += repairs.removed
         self._unavailable = None
         self._rests_until = 0.0
+        self._doubted -= self._doubted if wanted is None else wanted.keys()
         known = self._indexed.copy()
         if has_changed:
             self.invalidate()
@@ -243,6 +261,16 @@ class Session:
         database = self.database
         return database if self.connection.may_write else None
 
+    def database_to_record(self, purpose: str) -> Database:
+        """The index, for a new recording; it may lack other recordings.
+
+        Raises:
+            DatabaseError: as for `database_for`.
+        """
+        if self.connected is not None and self.connection.may_write:
+            return self.connected
+        return self.database_for(purpose, writes=True)
+
     def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
         """The index, for queries about some recordings.
 
@@ -254,13 +282,18 @@ class Session:
 
         database = self.connected or self.database_for(purpose)
         try:
-            return GuardedIndex(database, recordings, self.belief, self.invalidate)
+            return GuardedIndex(database, recordings, self.belief, partial(self._doubt, recordings))
         except IndexChangedError as error:
             if self.connection.may_write:
                 raise
             raise IndexChangedError(
                 f"{error} This MongoDB user may only read: ask once as a user who may write."
             ) from error
+
+    def _doubt(self, recordings: Sequence[RecordingEntry]) -> None:
+        """Look again at what the index has of some recordings, when it is next connected."""
+        self._doubted.update(entry.id for entry in recordings)
+        self.invalidate()
 
     def places(self, purpose: str) -> TopicPlaces:
         """The places of topics in the index.
@@ -290,9 +323,9 @@ class Session:
 
     # The catalog.
 
-    def recordings(self) -> list[RecordingEntry]:
-        """All recordings, oldest first."""
-        if self._recordings is None:
+    def snapshot(self) -> Snapshot:
+        """All recordings in short."""
+        if self._snapshot is None:
             try:
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
             except DiskFullError as error:
@@ -301,9 +334,52 @@ class Session:
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
-            self._by_id = {entry.id: entry for entry in found}
-            self._recordings = found
-        return self._recordings
+            self._snapshot = found
+        return self._snapshot
+
+    def recordings(self) -> list[RecordingEntry]:
+        """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
+        found = (self._entry_of(summary) for summary in self.snapshot().summaries)
+        return [entry for entry in found if entry is not None]
+
+    def entry_of(self, summary: RecordingSummary) -> RecordingEntry:
+        """The entry of a recording of the snapshot, compared with its files once.
+
+        Raises:
+            TopicError: it was removed.
+            StoreError: its files cannot be read.
+        """
+        found = self._entry_of(summary)
+        if found is None:
+            raise _gone(summary.label)
+        return found
+
+    def _entry_of(self, summary: RecordingSummary) -> RecordingEntry | None:
+        found = self._entries.get(summary.id)
+        if found is None:
+            entry = self._current(summary)
+            if entry is None or entry.id != summary.id:
+                # Another process may have renamed it.
+                now = repair_on_open(self.directory, self.catalog, self.repairs)
+                place = now.by_id.get(summary.id)
+                entry = None if place is None else self._current(now.summaries[place])
+            if entry is None:
+                return None
+            found = self._entries.setdefault(summary.id, entry)
+        return found
+
+    def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
+        try:
+            entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
+        except CatalogError:
+            self.catalog.rebuild()
+            entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
+        if entry is not None and is_new:
+            # The index may have what the files had before.
+            self._doubted.add(entry.id)
+            self._indexed.discard(entry.id)
+            self._is_indexed = False
+        return entry
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its label.
@@ -311,18 +387,43 @@ class Session:
         Raises:
             TopicError: it does not exist.
         """
-        everything = self.recordings()
-        found = self._by_id.get(recording)
-        if found is None:
-            found = next((entry for entry in everything if entry.label == recording), None)
-        if found is None:
-            raise TopicError(f"Recording {recording!r} is no longer in the store.")
-        return found
+        snapshot = self.snapshot()
+        place = snapshot.by_id.get(recording, snapshot.by_label.get(recording))
+        if place is None:
+            raise _gone(recording)
+        return self.entry_of(snapshot.summaries[place])
 
-    def chosen(self, ids: Collection[str]) -> list[RecordingEntry]:
-        """The recordings with these ids, oldest first; missing ones are left out."""
-        wanted = set(ids)
-        return [entry for entry in self.recordings() if entry.id in wanted]
+    def chosen(self, question: Question) -> NDArray[np.intp]:
+        """Positions in the snapshot of the recordings of a question, oldest first.
+
+        Raises:
+            TopicError: a recording does not exist any more.
+        """
+        snapshot = self.snapshot()
+        if question.recordings is None:
+            return snapshot.having(question.topics)
+        places = [snapshot.by_id.get(recording, -1) for recording in question.recordings]
+        gone = places.count(-1)
+        if gone:
+            raise TopicError(
+                f"{gone} of the recordings asked about were removed from the store. Make the "
+                "query again."
+            )
+        return np.array(sorted(places), np.intp)
+
+    def doubtful(self, question: Question) -> list[RecordingEntry]:
+        """The recordings of a question that may lack messages, oldest first."""
+        summaries = self.snapshot().summaries
+        found = []
+        for place in self.chosen(question).tolist():
+            summary = summaries[place]
+            entry = self._entries.get(summary.id)
+            if entry is None and not summary.has_losses and summary.status == "complete":
+                continue
+            entry = entry or self.entry_of(summary)
+            if entry.status != "complete" or entry.end.get("losses"):
+                found.append(entry)
+        return found
 
     def select(self, names: Sequence[str] | None) -> list[RecordingEntry]:
         """Recordings by label, name, id, or the beginning of one of these; None for all.
@@ -330,29 +431,29 @@ class Session:
         Raises:
             TopicError: no recording matches, or several do.
         """
-        everything = self.recordings()
         if names is None:
-            return everything
-        chosen: list[RecordingEntry] = []
+            return self.recordings()
+        snapshot = self.snapshot()
+        return [self.entry_of(snapshot.summaries[place]) for place in self._named(names)]
+
+    def _named(self, names: Sequence[str]) -> list[int]:
+        """Positions of recordings by name, each once, in the order of the names."""
+        snapshot = self.snapshot()
+        chosen: dict[int, None] = {}
         for given in names:
             name = self.repairs.copies.get(given, given)
-            found = (
-                [r for r in everything if name in {r.label, r.id}]
-                or [r for r in everything if r.name == name]
-                or [r for r in everything if r.label.startswith(name)]
-                or [r for r in everything if len(name) >= 4 and r.id.startswith(name)]
-            )
+            found = snapshot.named(name)
             if len(found) != 1:
-                candidates = ", ".join(r.label for r in (found or everything)[:10]) or "none"
+                shown = found[:10] or range(min(len(snapshot), 10))
+                candidates = ", ".join(snapshot.summaries[n].label for n in shown) or "none"
                 problem = "is ambiguous" if found else "is not in the store"
                 raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
-            if found[0] not in chosen:
-                chosen.append(found[0])
-        return chosen
+            chosen[found[0]] = None
+        return list(chosen)
 
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
-        return sorted({topic for r in self.recordings() for topic in topics_of(r)})
+        return self.snapshot().topics
 
     def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
         """The channels of a recording, with their codecs."""
@@ -368,42 +469,55 @@ class Session:
         return found
 
     def field_types(
-        self, topics: Collection[str], recordings: Collection[str]
+        self, topics: Collection[str], recordings: Collection[str] | None
     ) -> dict[str, str] | None:
-        """Types of the fields of some topics, by path; None where no definition fixes them."""
+        """Types of the fields of some topics, by path; None where no definition fixes them.
+
+        Args:
+            topics: Full names.
+            recordings: Ids; None for all.
+        """
+        snapshot = self.snapshot()
+        places = snapshot.having(topics)
+        if recordings is not None:
+            own = (snapshot.by_id.get(recording, -1) for recording in recordings)
+            places = np.intersect1d(places, np.array([*own], np.intp))
+        # Recordings with equal topics and types have equal fields.
         return field_types(
             tuple(
                 channel
-                for entry in self.chosen(recordings)
-                for channel in self.channels(entry)
+                for summary in snapshot.differing(places)
+                for channel in self.channels(self.entry_of(summary))
                 if channel.channel.topic in topics
             )
         )
 
     def having(
         self, topics: Sequence[str], recordings: Collection[str] | None = None
-    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    ) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         """Topics, and the ids of the recordings that have any of them.
 
         Args:
             topics: Full names.
             recordings: Ids, labels or names; None for all.
 
+        Returns:
+            The topics, and the ids; None for every recording that has a topic.
+
         Raises:
             TopicError: no recording has any of the topics.
         """
-        wanted = set(topics)
-        named = None if recordings is None else {r.id for r in self.select([*recordings])}
-        chosen = tuple(
-            r.id
-            for r in self.recordings()
-            if (named is None or r.id in named) and not wanted.isdisjoint(topics_of(r))
-        )
-        if wanted and not chosen:
-            raise TopicError(f"No recording chosen has {', '.join(sorted(wanted))}.")
-        return tuple(topics), chosen
+        snapshot = self.snapshot()
+        places = snapshot.having(topics)
+        if recordings is not None:
+            places = np.intersect1d(places, np.array(self._named([*recordings]), np.intp))
+        if topics and not len(places):
+            raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
+        if recordings is None:
+            return tuple(topics), None
+        return tuple(topics), tuple(snapshot.summaries[place].id for place in places.tolist())
 
-    def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         """The topics that patterns match, and the recordings that have them.
 
         Raises:
@@ -411,7 +525,7 @@ class Session:
         """
         return self._resolved(names)
 
-    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         known = self.topics()
         if not names:
             listed = "There are: " + ", ".join(known[:20]) if known else "The store is empty."
@@ -419,7 +533,7 @@ class Session:
         return self.having(resolve(names, known))
 
     def predicate(
-        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
     ) -> Predicate:
         """A predicate on some topics of some recordings.
 
@@ -428,7 +542,9 @@ class Session:
         """
         return self._parsed(text, topics, recordings)
 
-    def _parse(self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...]) -> Predicate:
+    def _parse(
+        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
+    ) -> Predicate:
         from hybridlog.query.predicate.parser import parse
         from hybridlog.query.predicate.types import check
 
@@ -444,11 +560,8 @@ class Session:
     def _read_channels(self, recording: RecordingEntry) -> Mapping[int, Channel]:
         wanted = {c.schema for c in recording.channels if c.schema is not None}
         if not wanted <= self._schemas.keys():
-            # Recordings share most of their schemas.
-            entries = (*self.recordings(), recording)
-            used = {c.schema for r in entries for c in r.channels if c.schema is not None}
             with suppress(CatalogError):
-                self._schemas = self.catalog.schemas(used)
+                self._schemas |= self.catalog.schemas(wanted - self._schemas.keys())
         if not wanted <= self._schemas.keys():
             # The catalog has lost a schema.
             return channels_of(take_inventory(self.directory, recording.label).summaries.values())
@@ -546,8 +659,8 @@ class Session:
 
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
-        self._recordings = None
-        self._by_id = {}
+        self._snapshot = None
+        self._entries = {}
         self._is_indexed = False
         self._indexed.clear()
         self._belief = None
@@ -575,6 +688,10 @@ class Session:
             self.tables.invalidate()
         self.disconnect()
         self.catalog.close()
+
+
+def _gone(recording: str) -> TopicError:
+    return TopicError(f"Recording {recording!r} is no longer in the store.")
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

@@ -352,7 +352,7 @@ FORMAT_2 = [
         "hybridlog/maintenance/removal.py",
         (
             "documents-of-a-removed-recording-stay",
-            "    forget(state, entry.key)\n",
+            "    forget(database, entry.key, indexed)\n",
             "",
             STEPS,
         ),
@@ -479,8 +479,20 @@ FORMAT_2 = [
         "storage/hybridlog_storage/catalog.py",
         (
             "rows-of-recordings-are-believed",
-            "                if _crc(*row) == crc:\n",
-            "                if True:\n",
+            "        if row is None or _crc(*row[:3]) != row[3]:\n            return None\n",
+            "        if row is None:\n            return None\n",
+            f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "summaries-are-believed",
+            "for text, crc, index in rows if _text_crc(text) == crc]",
+            "for text, crc, index in rows]",
+            f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "topics-of-recordings-are-believed",
+            "type(row[0]) is not str or hash_of(row[0]) != digest:",
+            "type(row[0]) is not str:",
             f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
         ),
         (

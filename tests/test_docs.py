@@ -988,6 +988,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
     """By the section "State of the index"."""
     mark = database["hybridlog.store"].find_one({"_id": "store"})
     assert mark.pop("host")
+    assert mark.pop("index")
     path = os.path.realpath(second.store)
     assert mark == {"_id": "store", "id": second.store_id, "path": path}
     assert database["hybridlog.chunks"].count_documents({}) == 0

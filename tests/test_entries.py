@@ -28,7 +28,7 @@ from hybridlog.entries import (
     take_inventory,
     text,
 )
-from hybridlog.maintenance.opening import describe_now, repair_on_open
+from hybridlog.maintenance.opening import current_entry, describe_now, repair_on_open
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -594,7 +594,9 @@ def test_names_are_text(made: Made) -> None:
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
     with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
-        return repair_on_open(directory, catalog, report), report
+        found = repair_on_open(directory, catalog, report).summaries
+        entries = [current_entry(directory, catalog, summary, report)[0] for summary in found]
+        return [entry for entry in entries if entry is not None], report
 
 
 @pytest.mark.parametrize("number", range(4))

@@ -10,7 +10,6 @@ from hybridlog.cli.coverage import gaps
 if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
-    from hybridlog.store import Store
 
 
 def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
@@ -32,16 +31,14 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
     )
 
 
-def print_gaps(store: Store, query: Query, between: tuple[str, str] | None) -> None:
+def print_gaps(query: Query, between: tuple[str, str] | None) -> None:
     """Print what an answer may lack, a line a recording.
 
     Args:
-        store: The store.
         query: The query that was answered.
         between: Its time range as typed, by the log clock; None for all times.
     """
-    recordings = [entry for entry in store.recordings() if entry.id in query.recordings]
-    for line in gaps(recordings, query.topics, between):
+    for line in gaps(query.doubtful(), query.topics, between):
         output.note(line)
 
 

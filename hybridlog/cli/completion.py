@@ -1,6 +1,6 @@
 """Completion of recordings and topics, and the scripts that teach it to a shell.
 
-The names come from the segments: no MongoDB is started.
+The names come from directories and the catalog: nothing is repaired, no MongoDB is started.
 """
 
 from __future__ import annotations
@@ -64,12 +64,8 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
     topics of those recordings are offered.
     """
     with _nothing_on_error():
-        directory = _store(context)
         given = context.params.get("recording") or ()
-        wanted = (given,) if isinstance(given, str) else tuple(given)
-        labels = directory.labels()
-        # A recording may also be given by its name, which is not looked up here.
-        topics = _topics(directory, [i for i in labels if i.startswith(wanted)] or labels)
+        topics = _topics(_store(context), (given,) if isinstance(given, str) else tuple(given))
         found = {topic for topic in topics if topic.startswith(incomplete)}
         if incomplete and not incomplete.startswith("/"):
             found.update(n for n in _short_names(topics) if n.startswith(incomplete))
@@ -86,15 +82,18 @@ def _store(context: click.Context) -> StoreDirectory:
     return StoreDirectory(store_path(None if value is None else os.path.expanduser(value)))  # noqa: PTH111
 
 
-def _topics(directory: StoreDirectory, labels: Sequence[str]) -> set[str]:
-    from hybridlog.entries import read_summary
+def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
+    """Topics in the catalog, of some recordings or of all; nothing is repaired for it."""
+    from contextlib import closing
 
-    return {
-        channel.topic
-        for label in labels
-        for number, path in directory.segments(label)
-        for channel in read_summary(path, number).channels.values()
-    }
+    from hybridlog.maintenance.opening import open_catalog, snapshot_of
+
+    with closing(open_catalog(directory)) as catalog:
+        snapshot = snapshot_of(catalog, catalog.summaries())
+    named = [place for name in recordings for place in snapshot.named(name)]
+    if not named:
+        return set(snapshot.topics)
+    return {topic for place in named for topic in snapshot.topics_of(snapshot.summaries[place])}
 
 
 def _short_names(topics: set[str]) -> Iterator[str]:

@@ -135,12 +135,12 @@ def gaps(
 
 def _touches(entry: RecordingEntry, between: tuple[str, str]) -> bool:
     """True when a time range may contain losses; they may lie after the last message."""
-    from hybridlog.query.intervals import span_of
+    from hybridlog.losses import extent_of
     from hybridlog.query.times import parse_range
 
     if entry.span is None:
         return True
-    start, end = span_of(entry)
+    start, end = extent_of(entry)
     try:
         low, high = parse_range(*between, start=start, end=end)
     except TimeError:  # empty in this recording: nothing of the answer is from there

@@ -69,7 +69,7 @@ def command(
         write = _write_file if form in _EXACT else _write_directory
         write(query, form, target, force=force, quiet=quiet)
         if not quiet:
-            print_gaps(opened, query, between)
+            print_gaps(query, between)
 
 
 def _form(target: Path) -> str:

@@ -143,7 +143,7 @@ def command(**parameters: Any) -> None:
         sys.stdout.flush()
         if not choices.quiet:
             print_cost(query.counters, time.monotonic() - started, count=choices.count)
-            print_gaps(store, query, choices.between if choices.clock == "log" else None)
+            print_gaps(query, choices.between if choices.clock == "log" else None)
 
 
 def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:

@@ -80,8 +80,10 @@ def _is_segment(what: str) -> bool:
 
 
 def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
+    from hybridlog.entries import summary_of
+
     return {
-        **recording_summary.as_dict(entry),
+        **recording_summary.as_dict(summary_of(entry)),
         "chunks": entry.chunks,
         "coverage": coverage.describe(entry, coverage.losses_of(entry)),
         "losses": coverage.losses_of(entry),
@@ -128,13 +130,15 @@ def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
 
 
 def _print_recording(entry: RecordingEntry, index: str | None) -> None:
+    from hybridlog.entries import summary_of
     from hybridlog.query.times import format_duration, format_time
 
     span = entry.span
     losses = coverage.losses_of(entry)
     source = entry.source
-    has_content = recording_summary.has_content(entry)
-    status = recording_summary.status(entry)
+    summary = summary_of(entry)
+    has_content = recording_summary.has_content(summary)
+    status = recording_summary.status(summary)
     if entry.status == "open":
         status += f"; `hybridlog top {entry.label}` shows it"
     held = (

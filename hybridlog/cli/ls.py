@@ -11,7 +11,7 @@ from hybridlog.cli import options, output, recording_summary
 from hybridlog.cli.open_store import opened_store
 
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 
 @click.command()
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def command(*, store: Path | None, mongo: str | None, as_json: bool) -> None:
     """List the recordings."""
     with opened_store(store, mongo, quiet=as_json) as opened:
-        recordings = opened.recordings()
+        recordings = opened.summaries()
     if as_json:
         output.print_json([recording_summary.as_dict(entry) for entry in recordings])
     elif recordings:
@@ -30,7 +30,7 @@ def command(*, store: Path | None, mongo: str | None, as_json: bool) -> None:
         output.note("The store is empty: `hybridlog record FILE` fills it.")
 
 
-def _print(recordings: list[RecordingEntry]) -> None:
+def _print(recordings: list[RecordingSummary]) -> None:
     narrow = output.is_narrow()
     columns: list[output.Column] = [
         ("recording", "left"),
@@ -42,10 +42,10 @@ def _print(recordings: list[RecordingEntry]) -> None:
     if not narrow:
         columns.insert(3, ("topics", "right"))
         columns.insert(5, ("stored", "right"))
-    output.print_table(columns, [_row(entry, narrow=narrow) for entry in recordings])
+    output.print_pages(columns, [_row(entry, narrow=narrow) for entry in recordings])
 
 
-def _row(entry: RecordingEntry, *, narrow: bool) -> list[str]:
+def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [recording_summary.status(entry)]
     if entry.name != entry.label:
@@ -61,6 +61,6 @@ def _row(entry: RecordingEntry, *, narrow: bool) -> list[str]:
         ", ".join(notes),
     ]
     if not narrow:
-        cells.insert(3, str(len({c.topic for c in entry.channels})) if known else "-")
+        cells.insert(3, str(entry.topic_count) if known else "-")
         cells.insert(5, output.size(entry.stored_bytes) if known else "-")
     return cells

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -39,7 +39,19 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     if sys.stdout.isatty():
         _print_on_screen(columns, shown)
     else:
-        _print_in_columns(columns, shown)
+        for line in _lines_of([(printable(heading), side) for heading, side in columns], shown):
+            say(line)
+
+
+def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    """As `print_table`, but in the user's pager on a terminal that has too few lines."""
+    if not sys.stdout.isatty() or len(rows) < console().height:
+        print_table(columns, rows)
+        return
+    import click
+
+    shown = [[printable(cell) for cell in row] for row in rows]
+    click.echo_via_pager(f"{line}\n" for line in _lines_of(columns, shown))
 
 
 def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
@@ -59,16 +71,16 @@ def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -
     console().print(table)
 
 
-def _print_in_columns(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
-    """Print full width for files and pipes: nothing is folded or left out."""
-    headings = [printable(heading) for heading, _ in columns]
+def _lines_of(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Headings and rows at full width: nothing is folded or left out."""
+    headings = [heading for heading, _ in columns]
     widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]
     for row in (headings, *rows):
         line = "  ".join(
             cell.rjust(width) if side == "right" else cell.ljust(width)
             for cell, width, (_, side) in zip(row, widths, columns, strict=True)
         )
-        say(line.rstrip())
+        yield line.rstrip()
 
 
 def is_narrow() -> bool:

@@ -51,7 +51,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
         for predicate in choices.where:
             query = query.where(predicate)
         found = answer(query)
-        labels = {entry.id: entry.label for entry in store.recordings()}
+        labels = {recording.id: recording.label for recording in store.summaries()}
         if choices.count:
             output.say(str(len(found)))
         elif choices.as_json:
@@ -64,7 +64,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
         if not len(found) and not choices.count:
             output.note("No interval.")
         print_cost(query.counters, time.monotonic() - started, count=True)
-        print_gaps(store, query, choices.between)
+        print_gaps(query, choices.between)
 
 
 def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:

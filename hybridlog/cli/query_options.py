@@ -11,7 +11,7 @@ from hybridlog_storage.errors import TopicError, UsageError
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 
 def query_of(store: Store, topics: Sequence[str] | None, recordings: Sequence[str] | None) -> Query:
@@ -31,20 +31,23 @@ def query_of(store: Store, topics: Sequence[str] | None, recordings: Sequence[st
     if not recordings:
         if not topics:
             return store.all_topics()
-        with _name_open_recordings(store.recordings):
+        with _name_open_recordings(store.summaries):
             return store.topic(*topics)
+    from hybridlog.entries import summary_of
     from hybridlog.losses import topics_of
     from hybridlog.query.topics import resolve
 
     chosen = store.select(recordings)
     known = {topic for entry in chosen for topic in topics_of(entry)}
-    with _name_open_recordings(lambda: chosen):
+    with _name_open_recordings(lambda: [summary_of(entry) for entry in chosen]):
         names = resolve(topics, known) if topics else sorted(known)
     return store.query(names, [entry.id for entry in chosen])
 
 
 @contextmanager
-def _name_open_recordings(recordings: Callable[[], Sequence[RecordingEntry]]) -> Iterator[None]:
+def _name_open_recordings(
+    recordings: Callable[[], Sequence[RecordingSummary]],
+) -> Iterator[None]:
     """Add the recordings in progress to the error about a topic: they may have it."""
     try:
         yield

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.losses import Cause
-
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 _STATUS = {
     "open": "being recorded",
@@ -18,34 +16,33 @@ _STATUS = {
 }
 
 
-def status(entry: RecordingEntry) -> str:
+def status(recording: RecordingSummary) -> str:
     """The status of a recording, for people."""
-    losses = entry.end.get("losses", ())
-    if entry.status == "damaged" and any(loss["cause"] == Cause.SEGMENT for loss in losses):
+    if recording.status == "damaged" and recording.has_lost_segments:
         return "stored data lost"
-    return _STATUS.get(entry.status, entry.status)
+    return _STATUS.get(recording.status, recording.status)
 
 
-def has_content(entry: RecordingEntry) -> bool:
+def has_content(recording: RecordingSummary) -> bool:
     """True when the catalog knows the content, which it does once a segment is sealed."""
-    return entry.status != "open" or bool(entry.channels)
+    return recording.status != "open" or recording.topic_count > 0
 
 
-def as_dict(entry: RecordingEntry) -> dict[str, Any]:
+def as_dict(recording: RecordingSummary) -> dict[str, Any]:
     """A recording in short, for JSON."""
-    span = entry.span
+    span = recording.span
     return {
-        "recording": entry.label,
-        "id": entry.id,
-        "name": entry.name,
-        "tags": entry.tags,
-        "status": entry.status,
+        "recording": recording.label,
+        "id": recording.id,
+        "name": recording.name,
+        "tags": recording.tags,
+        "status": recording.status,
         "start_ns": span[0] if span else None,
         "last_ns": span[1] if span else None,
-        "topics": len({c.topic for c in entry.channels}),
-        "messages": entry.messages,
-        "stored_bytes": entry.stored_bytes,
-        "segments": entry.segments,
-        "source": entry.source,
-        "created_ns": entry.created,
+        "topics": recording.topic_count,
+        "messages": recording.messages,
+        "stored_bytes": recording.stored_bytes,
+        "segments": recording.segments,
+        "source": recording.source,
+        "created_ns": recording.created,
     }

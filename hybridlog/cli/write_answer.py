@@ -81,5 +81,5 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
 
 
 def _profile(query: Query) -> str:
-    encodings = {c.channel.message_encoding for c in query.channels()}
+    encodings = query.encodings()
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""

@@ -56,7 +56,8 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
 def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
     builder = TableBuilder(question.fields)
-    for block in Decoder(planner, planner.channels()).empty():
+    decoder = Decoder(planner)
+    for block in decoder.empty():
         builder.append(block)
     parts = planner.parts()
     if _come_from_tables(planner, parts):
@@ -64,9 +65,7 @@ def _collected(planner: Planner) -> TableBuilder:
             for block in _table_blocks(planner, part):
                 builder.append(block)
         return builder
-    plan = planner.scan_plan()
-    decoder = Decoder(planner, plan.channels)
-    for run in planner.unordered(plan) if question.returns_all else planner.runs(plan):
+    for run in planner.unordered() if question.returns_all else planner.runs():
         for block in decoder.blocks(run):
             builder.append(block)
     return builder
@@ -79,14 +78,13 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
     """
     question = planner.question
     groups: Iterator[Iterable[Block]]
+    decoder = Decoder(planner)
     parts = planner.parts()
     if len(parts) == 1 and not question.reverse and _come_from_tables(planner, parts):
         groups = ([block] for block in _table_blocks(planner, parts[0]))
     else:
-        plan = planner.scan_plan()
-        decoder = Decoder(planner, plan.channels)
-        groups = (decoder.blocks(run) for run in planner.runs(plan))
-    groups = chain([Decoder(planner, planner.channels()).empty()], groups)
+        groups = (decoder.blocks(run) for run in planner.runs())
+    groups = chain([decoder.empty()], groups)
     builder, size = TableBuilder(question.fields), 0
     given = False
     for group in groups:
@@ -124,7 +122,7 @@ def _fields_of(planner: Planner) -> list[str] | None:
 
 def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
     """The messages of a part from its table, in order."""
-    (rank,) = _ranks(planner.channels(), part.channels[:1])
+    rank = planner.ranks[part.recording.key] << _SEQ_BITS
     none = np.empty(0, np.int64)
     # Tables have lists where a definition fixes the length.
     kind = part.channels[0].codec.arrow(b"", none, none, _fields_of(planner)).records.type
@@ -141,7 +139,7 @@ def schema_of(planner: Planner) -> pa.Schema | None:
 
     Messages whose fields no definition fixes are read for this.
     """
-    if not any(_is_open(channel) for channel in planner.channels()):
+    if not any(_is_open(channel) for channel in planner.examples):
         return None
     return common_schema(stream(planner))
 
@@ -166,27 +164,33 @@ class Decoder:
 
     Args:
         planner: Planner of the question.
-        channels: The channels of the messages.
 
     Attributes:
-        channels: The channels of the messages.
+        channels: The channels of the messages that are read now; at first examples of all.
 
     Raises:
         DefinitionError: a channel has no definition to derive columns from.
     """
 
-    def __init__(self, planner: Planner, channels: Sequence[RecordedChannel]) -> None:
-        _check(channels)
-        self.channels = channels
+    def __init__(self, planner: Planner) -> None:
+        _check(planner.examples)
+        self.channels: Sequence[RecordedChannel] = ()
         self._counters = planner.counters
         self._chosen = planner.question.fields
         self._own = _own(planner)
         self._takes_reduced = _are_single(planner)
-        self._ranks = _ranks(planner.channels(), channels)
-        self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
+        self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
+        self._fields: list[frozenset[str] | None] = []
+        self.read(planner.examples)
+
+    def read(self, channels: Sequence[RecordedChannel]) -> None:
+        """Continue with messages of these channels."""
+        if channels is not self.channels:
+            self.channels = channels
+            self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
 
     def empty(self) -> Iterator[Block]:
-        """A block without rows for each channel: columns exist even without messages."""
+        """A block without rows for each example: columns exist even without messages."""
         none = np.empty(0, np.int64)
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
         for number, channel in enumerate(self.channels):
@@ -195,6 +199,7 @@ class Decoder:
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
+        self.read(run.channels)
         for number, rows in rows_by_channel(run.batch.channel):
             if self.channels[number].is_reduced and not self._takes_reduced:
                 self._counters.reduced += len(rows)
@@ -218,7 +223,7 @@ class Decoder:
             self._counters.unreadable += len(batch) - len(good)
             batch, seq = batch.take(good), seq[good]
         own = self.own_columns(number, batch, seq, stamps)
-        order = seq + self._ranks[number]
+        order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
         return Block(topic, batch.log_time, order, own, records, batch.payload_bytes), good
 
@@ -245,13 +250,13 @@ def _are_single(planner: Planner) -> bool:
 
 def _own(planner: Planner) -> list[str]:
     """Built-in columns of a table, without the log time."""
-    question, channels = planner.question, planner.channels()
+    question, channels = planner.question, planner.examples
     defined = {path.path for c in channels if not c.is_reduced for path in c.codec.paths()}
     asked = own_columns(question.fields, defined)
     unasked = []
     if len(question.topics) > 1:
         unasked.append("topic")
-    if len({channel.recording.key for channel in channels}) > 1:
+    if len(planner.session.chosen(question)) > 1:
         unasked.append("recording")
     return [name for name in dict.fromkeys([*unasked, *asked]) if name != "log_time"]
 
@@ -310,13 +315,6 @@ def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.
     inner.pop("stamp", None)
     children["header"] = structs(inner, len(records))
     return structs(children, len(records))
-
-
-def _ranks(every: Sequence[RecordedChannel], channels: Sequence[RecordedChannel]) -> list[int]:
-    """Numbers that order the messages of each recording after those of earlier ones."""
-    keys = sorted({channel.recording.key for channel in every})
-    order = {key: rank for rank, key in enumerate(keys)}
-    return [order[channel.recording.key] << _SEQ_BITS for channel in channels]
 
 
 def _check(channels: Sequence[RecordedChannel]) -> None:

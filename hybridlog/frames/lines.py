@@ -39,9 +39,9 @@ def lines(planner: Planner) -> Iterator[list[str]]:
     Raises:
         DefinitionError: a topic has no definition to read its messages with.
     """
-    plan = planner.scan_plan()
-    decoder = Decoder(planner, plan.channels)
-    for run in planner.runs(plan):
+    decoder = Decoder(planner)
+    for run in planner.runs():
+        decoder.read(run.channels)
         yield _lines_of(run, decoder, planner)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.entries import Inventory
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.summary import RecordingSummary
     from hybridlog_storage.topic_places import TopicPlace
 
 Place = tuple[int, int]
@@ -43,18 +45,30 @@ def bring_up_to_date(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database,
-    entries: Iterable[RecordingEntry],
+    snapshot: Snapshot,
+    entry_of: Callable[[RecordingSummary], RecordingEntry],
     *,
+    index: str,
+    doubted: Collection[str],
+    wanted: Collection[str] | None = None,
     report: RepairReport,
     progress: Progress | None = None,
 ) -> bool:
     """Index missing chunks, and remove documents of removed recordings.
 
+    Recordings that the catalog knows to be in this index are not looked at, unless the
+    index has another number of recordings than the store. Documents of removed recordings
+    are removed only if all recordings are wanted.
+
     Args:
         directory: The store.
         catalog: Its catalog.
         database: The index.
-        entries: All recordings.
+        snapshot: All recordings.
+        entry_of: Returns the entry of a recording.
+        index: Id of the index.
+        doubted: Ids of recordings to look at in any case.
+        wanted: Ids of the recordings that the index must have; None for all.
         report: Collects the actions.
         progress: Called while a recording is indexed.
 
@@ -64,30 +78,64 @@ def bring_up_to_date(
     Raises:
         DatabaseError: MongoDB fails.
     """
+    tables.remove_unfinished(directory, snapshot)
     state = IndexState(database)
-    known = state.of()
+    is_other = state.count() != len(snapshot)
+    behind = [
+        one
+        for one in snapshot.summaries
+        if wanted is None or one.id in wanted
+        if is_other or one.indexed_by != index or one.id in doubted
+    ]
+    has_strangers = is_other and wanted is None
+    if not behind and not has_strangers:
+        return False
+    known = state.of(None if has_strangers else [one.key for one in behind])
     has_changed = False
-    entries = list(entries)
-    for entry in entries:
+    settled = []
+    for summary in behind:
+        entry = entry_of(summary)
         indexed = known.get(entry.key)
         is_whole = indexed is not None and indexed.is_whole(entry)
         if indexed is not None and is_whole and _recall(catalog, entry, indexed):
             has_changed = True
-            entry = put_entry(directory, catalog, entry.label)  # noqa: PLW2901
-        if not directory.is_writable or (is_whole and _is_settled(indexed, entry)):
-            continue  # without an index, the segments of a read-only store answer
-        with directory.writing(entry.label) as mine:
-            if not mine:
-                continue  # the process that holds the lock indexes it
-            try:
-                chunks = _tend(directory, catalog, database, entry, progress)
-            except SegmentError as error:
-                report.unreadable[entry.label] = str(error)
-            else:
-                if chunks is not None:
-                    report.indexed[entry.label] = chunks
-    _remove_strangers(directory, state, known, entries, report)
+            entry = put_entry(directory, catalog, entry.label)
+        if is_whole and _is_settled(indexed, entry):
+            settled.append(entry.id)
+        elif directory.is_writable:  # else the segments answer, without an index
+            _bring_one(directory, catalog, database, entry, report=report, progress=progress)
+    if settled:
+        catalog.put_indexed(settled, index)
+    if has_strangers:
+        _remove_strangers(directory, database, known, report)
     return has_changed or bool(report.indexed)
+
+
+def _bring_one(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database,
+    entry: RecordingEntry,
+    *,
+    report: RepairReport,
+    progress: Progress | None,
+) -> None:
+    """Bring one recording up to date, unless another process is writing it."""
+    if not directory.is_writable:
+        raise StoreError(
+            f"The index of recording {entry.label!r} is not complete, and the store "
+            f"{directory.path} is read-only. Open it once with write permission."
+        )
+    with directory.writing(entry.label) as mine:
+        if not mine:
+            return  # the process that holds the lock indexes it
+        try:
+            chunks = _tend(directory, catalog, database, entry, progress)
+        except SegmentError as error:
+            report.unreadable[entry.label] = str(error)
+        else:
+            if chunks is not None:
+                report.indexed[entry.label] = chunks
 
 
 def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
@@ -133,9 +181,8 @@ def _tend(
 
 def _remove_strangers(
     directory: StoreDirectory,
-    state: IndexState,
+    database: Database,
     known: Mapping[str, Indexed],
-    entries: Iterable[RecordingEntry],
     report: RepairReport,
 ) -> None:
     """Remove recordings without a directory from the index and the tables.
@@ -148,10 +195,10 @@ def _remove_strangers(
         return
     for key, indexed in known.items():
         if key not in present:
-            forget(state, key)
+            forget(database, key, indexed)
             report.removed.append(indexed.id or key)
     if directory.is_writable:
-        tables.sweep(directory, entries, present)
+        tables.remove_strangers(directory, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
@@ -187,10 +234,47 @@ def _ids_of(directory: StoreDirectory, labels: Iterable[str]) -> set[str] | None
     return found
 
 
-def forget(state: IndexState, key: str) -> None:
-    """Remove all documents of a recording, and its mirror last."""
-    state.clear(key)
-    state.remove(key)
+def forget(database: Database, key: str, indexed: Indexed | None) -> None:
+    """Remove all documents of a recording, and its mirror last.
+
+    Args:
+        database: The index.
+        key: Key of the recording.
+        indexed: The state of its index before the removal; None if nothing is known.
+    """
+    _clear_documents(database, key, indexed)
+    IndexState(database).remove(key)
+
+
+def _clear_documents(
+    database: Database,
+    key: str,
+    indexed: Indexed | None,
+    entry: RecordingEntry | None = None,
+    *,
+    but: Collection[int] = (),
+) -> None:
+    """Remove the documents of a recording.
+
+    They are where the mirror of a complete index says, or where its entry says; at any time
+    if the mirror has none. Without a complete mirror, all documents are looked through.
+
+    Args:
+        database: The index.
+        key: Key of the recording.
+        indexed: The state of its index; None if nothing is known.
+        entry: Its entry; None if it has no files any more.
+        but: Segments whose documents stay.
+    """
+    if indexed is None or indexed.state != "complete":
+        IndexState(database).clear(key, but=but)
+        return
+    topics, span = set(indexed.topics), indexed.span
+    if entry is not None:
+        topics |= {channel.topic for channel in entry.channels}
+        if span is not None and entry.span is not None:
+            span = min(span[0], entry.span[0]), max(span[1], entry.span[1])
+    IndexState(database).clear(key, TopicPlaces(database).of(topics).values(), span, but)
 
 
 def catch_up(
@@ -275,7 +359,7 @@ def _prepare(
         # No documents are known. Unknown ones are within the same times.
         state.clear(entry.key, _places(database, [entry]).values(), entry.span)
     else:
-        state.clear(entry.key, but=[int(n) for n in left])
+        _clear_documents(database, entry.key, indexed, entry, but=[int(n) for n in left])
     state.put(entry, "indexing", turn=turn, segments=left)
     return Indexed(entry.id, "indexing", left, turn), {}
 
@@ -417,8 +501,6 @@ def reindex(
     database: Database,
     labels: Iterable[str],
     progress: Progress | None = None,
-    *,
-    everything: bool = False,
 ) -> list[str]:
     """Rebuild the index of recordings from their segments, one after the other.
 
@@ -431,7 +513,6 @@ def reindex(
         database: The index.
         labels: The recordings.
         progress: Called after each chunk.
-        everything: Whether these are all recordings, and `remove_rest` follows.
 
     Returns:
         Labels of those that are being written, which are unchanged.
@@ -446,29 +527,25 @@ def reindex(
                 left.append(label)
                 continue
             entry = put_entry(directory, catalog, label)
-            # Finding documents outside of its times would read every document.
-            _clear(database, entry, in_its_times=everything)
+            _clear(database, entry)
             catch_up(directory, catalog, database, label, progress)
     return left
 
 
-def _clear(database: Database, entry: RecordingEntry, *, in_its_times: bool = False) -> None:
+def _clear(database: Database, entry: RecordingEntry, *, everywhere: bool = False) -> None:
     """Remove the documents of a recording before it is indexed from the beginning.
 
     Args:
         database: The index.
         entry: The recording.
-        in_its_times: Whether to remove only documents of its topics, at its times.
+        everywhere: True to look for them among all documents.
     """
     state = IndexState(database)
     indexed = state.one(entry.key)
     turn = 1 if indexed is None else indexed.turn + 1
     # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn)
-    if in_its_times:
-        state.clear(entry.key, _places(database, [entry]).values(), entry.span)
-    else:
-        state.clear(entry.key)
+    _clear_documents(database, entry.key, None if everywhere else indexed, entry)
     state.put(entry, "indexing", turn=turn)
 
 
@@ -520,7 +597,7 @@ def remove_rest(
         entry = known[key]
         with directory.writing(entry.label) as mine:
             if mine:
-                _clear(database, entry)
+                _clear(database, entry, everywhere=True)
                 catch_up(directory, catalog, database, entry.label, progress)
 
 
@@ -545,6 +622,6 @@ def mirror(catalog: Catalog, database: Database, recording: str) -> None:
         DatabaseError: MongoDB fails; the next connection repeats it.
     """
     state = IndexState(database)
-    known = catalog.recordings().get(recording)
+    known = catalog.recording(recording)
     if known is not None:
         state.show(known[1])

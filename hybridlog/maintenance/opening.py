@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from hybridlog.entries import (
     sealed_event,
     take_inventory,
 )
+from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.directory import LOCK, REMOVED
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.journal import JournalState
     from hybridlog_storage.recovery import Recovered
     from hybridlog_storage.segment_file import Sealed
+    from hybridlog_storage.summary import RecordingSummary
 
 _OURS = frozenset({LOCK})
 """Names in a recording's directory that hold nothing that could be lost."""
@@ -59,10 +61,11 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
         return Catalog(None, store_id)
 
 
-def repair_on_open(
-    directory: StoreDirectory, catalog: Catalog, report: RepairReport
-) -> list[RecordingEntry]:
-    """Repair files and catalog; return all recordings, oldest log time first.
+def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
+    """Repair files and catalog; return all recordings.
+
+    The files of a recording are read if it is new, or looks different from outside. All
+    others are compared with their files before they first answer, see `current_entry`.
 
     Args:
         directory: The store.
@@ -76,62 +79,122 @@ def repair_on_open(
         return _repair_on_open(directory, catalog, report)
 
 
-def _repair_on_open(
-    directory: StoreDirectory, catalog: Catalog, report: RepairReport
-) -> list[RecordingEntry]:
+def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
     if not catalog.is_in_memory:
         for name in directory.hidden(REMOVED):
             directory.sweep(name)
-    known = {entry.label: (looks, entry) for looks, entry in catalog.recordings().values()}
+    rows = catalog.summaries()
+    known = {summary.label: summary for summary in rows}
     for _ in range(_TRIES):
-        labels = directory.labels()
+        looks = directory.looks()
         report.unreadable.clear()
-        found = _find(directory, catalog, labels, known, report)
+        found = _find(directory, catalog, looks, known, report)
         # A recording that was renamed meanwhile must not be missed.
-        if directory.labels() == labels:
+        if directory.labels() == list(looks):
             break
     report.copies.clear()
-    entries = [_one_of(directory, copies, known, report) for copies in found.values()]
-    for recording, (_, entry) in catalog.recordings().items():
+    for recording, copies in found.items():
+        if len(copies) > 1:
+            found[recording] = [_one_of(directory, catalog, copies, known, report)]
+    for summary in rows:
         # The row of a recording that is unreadable now may be valid again later.
-        if recording not in found and entry.label not in report.unreadable:
-            catalog.remove(recording)
-    for entry in entries:
-        if len(found[entry.id]) > 1:  # the row may be that of the copy
-            put_entry(directory, catalog, entry.label)
-    return in_order(entries)
+        if summary.id not in found and summary.label not in report.unreadable:
+            catalog.remove(summary.id)
+    return snapshot_of(catalog, [summary for (summary,) in found.values()])
+
+
+def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
+    """Some recordings with their topics.
+
+    Raises:
+        CatalogError: The catalog has lost topics.
+    """
+    hashes = {summary.topics for summary in summaries}
+    return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
 
 
 def _find(
     directory: StoreDirectory,
     catalog: Catalog,
-    labels: Iterable[str],
-    known: Mapping[str, tuple[str, RecordingEntry]],
+    looks: Mapping[str, str],
+    known: Mapping[str, RecordingSummary],
     report: RepairReport,
-) -> dict[str, list[RecordingEntry]]:
-    """Recover the recordings with these labels; return their entries by id."""
-    found: dict[str, list[RecordingEntry]] = {}
-    for label in labels:
-        looks, kept = known.get(label, ("", None))
-        try:
-            listing = directory.listing(label)
-            entry = kept
-            if kept is None or not _is_current(directory, kept, looks, listing):
-                entry = _refresh(directory, catalog, label, report)
-        except DiskFullError:
-            raise
-        except StoreError as error:
-            if directory.has(label):  # another process may have removed or renamed it
-                report.unreadable[label] = str(error)
-            continue
-        if entry is not None:
-            found.setdefault(entry.id, []).append(entry)
+) -> dict[str, list[RecordingSummary]]:
+    """Recover recordings; return their summaries by id.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        looks: The look of each directory, by label.
+        known: Summaries in the catalog, by label.
+        report: Collects problems and repairs.
+    """
+    found: dict[str, list[RecordingSummary]] = {}
+    for label, look in looks.items():
+        summary = known.get(label)
+        if summary is None or summary.look != look or summary.status in UNFINISHED:
+            try:
+                summary = _look_again(directory, catalog, label, summary, report)
+            except DiskFullError:
+                raise
+            except StoreError as error:
+                if directory.has(label):  # another process may have removed or renamed it
+                    report.unreadable[label] = str(error)
+                continue
+        if summary is not None:
+            found.setdefault(summary.id, []).append(summary)
     return found
 
 
-def in_order(entries: list[RecordingEntry]) -> list[RecordingEntry]:
-    """Recordings, oldest log time first, empty ones last."""
-    return sorted(entries, key=lambda r: (r.span is None, r.span or (0, 0), r.label))
+def _look_again(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    label: str,
+    summary: RecordingSummary | None,
+    report: RepairReport,
+) -> RecordingSummary | None:
+    """The summary of a recording as its files are now; None if it is gone."""
+    if summary is not None:
+        listing = directory.listing(label)
+        row = catalog.recording(summary.id)
+        if row is not None and _is_current(directory, row[1], row[0], listing):
+            if summary.look != listing.look:
+                summary = summary._replace(look=listing.look)
+                catalog.put_look(summary)
+            return summary
+    described = _refresh(directory, catalog, label, report)
+    return described.summary if described is not None else None
+
+
+def current_entry(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    summary: RecordingSummary,
+    report: RepairReport,
+) -> tuple[RecordingEntry | None, bool]:
+    """The entry of a recording, compared with its files.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        summary: Its summary at the opening of the store.
+        report: Collects problems and repairs.
+
+    Returns:
+        The entry, None if the recording is gone; and whether the files were read again.
+
+    Raises:
+        StoreError: Its files cannot be read.
+    """
+    row = catalog.recording(summary.id)
+    if row is not None and row[1].label == summary.label:
+        listing = directory.listing(summary.label)
+        if _is_current(directory, row[1], row[0], listing):
+            return row[1], False
+    if not directory.has(summary.label):
+        return None, True
+    described = _refresh(directory, catalog, summary.label, report)
+    return (described.entry if described is not None else None), True
 
 
 def _is_current(
@@ -150,7 +213,7 @@ def _refresh(
     catalog: Catalog,
     label: str,
     report: RepairReport,
-) -> RecordingEntry | None:
+) -> Described | None:
     """Recover a recording after a crash and update its catalog row; None if it is gone."""
     may_write = not catalog.is_in_memory
     listing = directory.listing(label)
@@ -160,12 +223,12 @@ def _refresh(
     if is_empty and (not may_write or directory.is_beginning(label)):
         return None
     if not may_write:
-        return put_entry(directory, catalog, label, is_open=directory.is_held(label))
+        return put_described(directory, catalog, label, is_open=directory.is_held(label))
     with directory.writing(label) as mine:
         if not mine and not _has_begun(directory, label):
             return None  # a process is about to begin it
         now = recover(directory, label, report) if mine else label
-        return put_entry(directory, catalog, now, is_open=not mine) if now else None
+        return put_described(directory, catalog, now, is_open=not mine) if now else None
 
 
 def _has_begun(directory: StoreDirectory, label: str) -> bool:
@@ -179,33 +242,33 @@ def _has_begun(directory: StoreDirectory, label: str) -> bool:
 
 def _one_of(
     directory: StoreDirectory,
-    copies: list[RecordingEntry],
-    known: Mapping[str, tuple[str, RecordingEntry]],
+    catalog: Catalog,
+    copies: list[RecordingSummary],
+    known: Mapping[str, RecordingSummary],
     report: RepairReport,
-) -> RecordingEntry:
-    """Choose one of several directories with the same recording.
+) -> RecordingSummary:
+    """Choose one of several directories with the same recording, and put it in the catalog.
 
     The most complete one; of equals the one in the catalog, then the one with the older
     journal.
     """
-    if len(copies) == 1:
-        return copies[0]
     whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
 
-    def rank(entry: RecordingEntry) -> tuple[int, int, bool, int, str]:
-        place = whole.index(entry.status) if entry.status in whole else 0
-        was_known = entry.label in known and known[entry.label][1].id == entry.id
+    def rank(one: RecordingSummary) -> tuple[int, int, bool, int, str]:
+        place = whole.index(one.status) if one.status in whole else 0
+        was_known = one.label in known and known[one.label].id == one.id
         try:
-            path = directory.recording(entry.label) / journal.JOURNAL
+            path = directory.recording(one.label) / journal.JOURNAL
             written = files.status(path).st_ctime_ns
         except OSError:
             written = time.time_ns()
-        return -entry.messages, place, not was_known, written, entry.label
+        return -one.messages, place, not was_known, written, one.label
 
     chosen, *others = sorted(copies, key=rank)
     for other in others:
         report.copies[other.label] = chosen.label
-    return chosen
+    # The row may be that of the copy.
+    return put_described(directory, catalog, chosen.label).summary
 
 
 def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
@@ -403,20 +466,27 @@ def put_entry(
     Raises:
         SegmentError: The recording cannot be identified.
     """
+    return put_described(directory, catalog, label, is_open=is_open).entry
+
+
+def put_described(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+) -> Described:
+    """As `put_entry`, and return all that was read."""
     try:
-        return _put_entry(directory, catalog, label, is_open=is_open)
+        return _put_described(directory, catalog, label, is_open=is_open)
     except CatalogError:
         catalog.rebuild()
-        return _put_entry(directory, catalog, label, is_open=is_open)
+        return _put_described(directory, catalog, label, is_open=is_open)
 
 
-def _put_entry(
+def _put_described(
     directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool
-) -> RecordingEntry:
+) -> Described:
     described = describe_now(directory, catalog, label, is_open=is_open)
     if directory.is_writable or catalog.is_in_memory:
         catalog.put(described)
-    return described.entry
+    return described
 
 
 def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:

@@ -48,18 +48,19 @@ def remove(
             with suppress(OSError):  # the next connection removes them
                 tables.remove(directory, entry.id)
             if database is not None:
-                _clear(IndexState(database), entry)
+                _clear(database, entry)
         finally:
             # On a full disk, the space of these files is needed first.
             directory.sweep(hidden)
 
 
-def _clear(state: IndexState, entry: RecordingEntry) -> None:
+def _clear(database: Database, entry: RecordingEntry) -> None:
     """Remove a recording from the index."""
+    state = IndexState(database)
     indexed = state.one(entry.key)
     if indexed is not None:
         state.put(entry, "removing", turn=indexed.turn + 1)
-    forget(state, entry.key)
+    forget(database, entry.key, indexed)
 
 
 def remove_copy(directory: StoreDirectory, label: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -174,23 +174,21 @@ def repair_index(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database,
-    entries: Iterable[RecordingEntry],
+    entries: Sequence[RecordingEntry],
     *,
-    labels: Iterable[str] | None,
     progress: Progress | None = None,
 ) -> list[Repaired]:
-    """Index incompletely indexed recordings.
+    """Index those of some recordings that are not completely indexed.
 
     Raises:
         DatabaseError: MongoDB fails.
     """
     state = IndexState(database)
-    known = state.of()
-    wanted = None if labels is None else set(labels)
+    known = state.of([entry.key for entry in entries])
     done = []
     for entry in entries:
         indexed = known.get(entry.key)
-        if (wanted is not None and entry.label not in wanted) or entry.status == "open":
+        if entry.status == "open":
             continue
         if _is_restored(directory, catalog, entry):
             if not reindex(directory, catalog, database, [entry.label], progress):

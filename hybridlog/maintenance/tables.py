@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+import os
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hybridlog.maintenance.report import RepairReport
+    from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -211,30 +213,36 @@ def remove(directory: StoreDirectory, recording: str) -> None:
             files.remove_tree(parts, depth=files.IN_FOLDER)
 
 
-def sweep(
-    directory: StoreDirectory, entries: Iterable[RecordingEntry], present: Collection[str]
-) -> None:
-    """Remove tables of removed recordings, and unfinished files after a crash.
+def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
+    """Remove unfinished files that a crash has left."""
+    for name in _names(directory, PARTS):
+        place = snapshot.by_id.get(name.removeprefix("r"))
+        if place is None:
+            continue
+        label = snapshot.summaries[place].label
+        with suppress(OSError, StoreError), directory.writing(label) as mine:
+            if mine:
+                files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
+
+
+def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> None:
+    """Remove tables of removed recordings.
 
     Args:
         directory: The store.
-        entries: All known recordings.
         present: Keys of all recordings with a directory.
     """
-    for entry in entries:
-        parts = parts_folder(directory.path, entry.id)
-        with suppress(OSError, StoreError):
-            files.status(parts, depth=files.IN_FOLDER)  # most recordings have none
-            with directory.writing(entry.label) as mine:
-                if mine:
-                    files.remove_tree(parts, depth=files.IN_FOLDER)
     for top, beginning in ((TABLES, "recording=r"), (PARTS, "r")):
-        try:
-            names = files.names(directory.path / top, depth=files.IN_STORE)
-        except OSError:
-            continue
-        for name in names:
+        for name in _names(directory, top):
             recording = name.removeprefix(beginning)
             if recording != name and recording[:16] not in present:
                 with suppress(OSError):
                     remove(directory, recording)
+
+
+def _names(directory: StoreDirectory, top: str) -> list[str]:
+    try:
+        with files.folder(directory.path / top, files.IN_STORE) as fd:
+            return os.listdir(fd)  # noqa: PTH208 - of a handle
+    except OSError:
+        return []

@@ -17,7 +17,7 @@ from hybridlog_storage.index_documents import recording_key, with_prefix
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.segment_check import SegmentCheck
 from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.topic_places import SHARED, TopicPlaces
+from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segment_reader import ChunkPlace
-    from hybridlog_storage.topic_places import Filter, TopicPlace
+    from hybridlog_storage.topic_places import TopicPlace
 
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
@@ -100,14 +100,59 @@ def verify(
     result = Verification(index=database is not None)
     if not catalog.is_sound():
         result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
+    index = None if database is None else _Index(database, count_all=labels is None)
     for label in directory.labels() if labels is None else labels:
         result.recordings += 1
         try:
-            _Check(directory, catalog, database, label, result).run(repairs, progress)
+            _Check(directory, catalog, index, label, result).run(repairs, progress)
         except StoreError as error:
             cure = "restore its files, or remove its directory"
             result.findings.append(Finding(label, "recording", str(error), cure))
     return result
+
+
+class _Index:
+    """Counts the documents of recordings.
+
+    Args:
+        database: The index.
+        count_all: True to read each collection once, and find documents at any time. Otherwise
+            only those of the topics and the times of a recording are counted.
+
+    Attributes:
+        database: The index.
+        places: The places of topics.
+        count_all: See there.
+    """
+
+    def __init__(self, database: Database, *, count_all: bool) -> None:
+        self.database = database
+        self.places = TopicPlaces(database)
+        self.count_all = count_all
+        self._counts: dict[str, Counter[str]] = defaultdict(Counter)
+        if count_all:
+            pipeline = [{"$group": {"_id": "$_meta.rec", "count": {"$sum": 1}}}]
+            for collection in IndexState(database).document_collections():
+                for found in database.aggregate(collection, pipeline):
+                    if isinstance(found["_id"], str):
+                        self._counts[found["_id"]][collection] = found["count"]
+
+    def documents_of(self, entry: RecordingEntry) -> Counter[str]:
+        """Numbers of documents of a recording, by collection."""
+        if self.count_all:
+            return self._counts[entry.key]
+        found: Counter[str] = Counter()
+        if entry.span is None:
+            return found
+        first, last = entry.span
+        places = [*self.places.of({channel.topic for channel in entry.channels}).values()]
+        asked = [
+            (place.collection, {**place.documents(first, last + 1), "_meta.rec": entry.key})
+            for place in places
+        ]
+        for place, count in zip(places, self.database.count_each(asked), strict=True):
+            found[place.collection] += count
+        return found
 
 
 class _Check:
@@ -117,17 +162,16 @@ class _Check:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        database: Database | None,
+        index: _Index | None,
         label: str,
         result: Verification,
     ) -> None:
         self._directory = directory
         self._catalog = catalog
-        self._database = database
+        self._in_index = index
         self._label = label
         self._result = result
         self._path = directory.recording(label)
-        self._places = None if database is None else TopicPlaces(database)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
         self._is_damaged = False
@@ -244,32 +288,17 @@ class _Check:
             return
         self._result.chunks += 1
         self._result.messages += len(chunk.batch)
-        if self._database is None or not self._has_index:
+        if self._in_index is None or not self._has_index:
             return
         documents, _ = self._indexer.documents_of([chunk], channels)
         key = self._indexer.recording[:16]
-        for collection, (places, want) in self._by_collection(documents).items():
+        found = _by_collection(self._in_index.places, documents)
+        for collection, (places, want) in found.items():
             self._expected[collection] += len(want)
-            problem = _compare(self._database, key, chunk, places, want)
+            problem = _compare(self._in_index.database, key, chunk, places, want)
             if problem:
                 where = f"{name} byte {chunk.offset}, collection {collection}"
                 self.found(where, problem, self._reindex)
-
-    def _by_collection(
-        self, documents: Iterable[Documents]
-    ) -> dict[str, tuple[list[TopicPlace], list[bytes]]]:
-        """Places and documents by collection; several channels of a chunk may share a topic."""
-        assert self._places is not None
-        by_topic: dict[str, list[Documents]] = defaultdict(list)
-        for part in documents:
-            by_topic[part.topic].append(part)
-        found: dict[str, tuple[list[TopicPlace], list[bytes]]] = {}
-        for place in self._places.of(by_topic.keys()).values():
-            places, rows = found.setdefault(place.collection, ([], []))
-            places.append(place)
-            for table in (table for part in by_topic[place.topic] for table in part.tables):
-                rows += [row.tobytes() for row in with_prefix(table, place.prefix)]
-        return found
 
     @property
     def _reindex(self) -> str:
@@ -277,7 +306,7 @@ class _Check:
 
     def _row(self, entry: RecordingEntry) -> None:
         """Check the catalog's row and its chunk tables."""
-        known = self._catalog.recordings().get(entry.id)
+        known = self._catalog.recording(entry.id)
         if known is None:
             self.found("catalog", "the recording is missing", _REPAIR)
         elif known[1] != entry:
@@ -290,35 +319,45 @@ class _Check:
 
     def _index(self, entry: RecordingEntry) -> None:
         """Find documents that are not in the segments."""
-        if self._database is None or self._places is None:
+        if self._in_index is None:
             return
-        state = IndexState(self._database)
+        state = IndexState(self._in_index.database)
         indexed = state.of([entry.key]).get(entry.key)
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._reindex)
         elif not state.is_mirrored(entry):
             self.found("index", "its entry of the recording differs", self._reindex)
-        asked: Filter = {"_meta.rec": entry.key}
-        have = {
-            collection: self._database.count(collection, asked)
-            for collection in state.document_collections()
-            if collection != SHARED
-        }
-        shared = [
-            p for p in self._places.of({c.topic for c in entry.channels}).values() if p.is_shared
-        ]
-        if shared:
-            each = [(SHARED, {**place.documents(), **asked}) for place in shared]
-            have[SHARED] = sum(self._database.count_each(each))
-        for collection, found in have.items():
-            want = self._expected[collection]
+        have = self._in_index.documents_of(entry)
+        if self._in_index.count_all and +have != +self._expected:
+            # The recording may have ended since all documents were counted.
+            have = _Index(self._in_index.database, count_all=True).documents_of(entry)
+        for collection in sorted(have.keys() | self._expected.keys()):
+            found, want = have[collection], self._expected[collection]
             if found != want:
                 problem = f"{found} index documents, {want} messages in the segments"
-                self.found(f"collection {collection}", problem, self._reindex)
+                # Surplus documents may have any time.
+                cure = self._reindex if found < want else "run `hybridlog reindex`"
+                self.found(f"collection {collection}", problem, cure)
 
     def _tables(self, entry: RecordingEntry) -> None:
         for topic, problem in tables.damage(self._directory, entry).items():
             self.found(f"table of {topic}", problem, _REPAIR)
+
+
+def _by_collection(
+    known: TopicPlaces, documents: Iterable[Documents]
+) -> dict[str, tuple[list[TopicPlace], list[bytes]]]:
+    """Places and documents by collection; several channels of a chunk may share a topic."""
+    by_topic: dict[str, list[Documents]] = defaultdict(list)
+    for part in documents:
+        by_topic[part.topic].append(part)
+    found: dict[str, tuple[list[TopicPlace], list[bytes]]] = {}
+    for place in known.of(by_topic.keys()).values():
+        places, rows = found.setdefault(place.collection, ([], []))
+        places.append(place)
+        for table in (table for part in by_topic[place.topic] for table in part.tables):
+            rows += [row.tobytes() for row in with_prefix(table, place.prefix)]
+    return found
 
 
 def _compare(

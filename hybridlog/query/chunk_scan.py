@@ -113,16 +113,18 @@ class MessageRun:
     """Messages in order.
 
     Attributes:
-        batch: The messages; `channel` is the index of each message's channel in the plan.
+        batch: The messages; `channel` is the index of each message's channel in `channels`.
         seq: int64[n], arrival numbers in their recordings.
+        channels: The channels of the plan that they were read by.
     """
 
     batch: Batch
     seq: NDArray[np.int64]
+    channels: Sequence[RecordedChannel]
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> MessageRun:
         """The chosen rows."""
-        return MessageRun(self.batch.take(rows), self.seq[rows])
+        return MessageRun(self.batch.take(rows), self.seq[rows], self.channels)
 
 
 @dataclass(slots=True)
@@ -298,11 +300,11 @@ class ChunkScan:
             mask &= begins[place] <= batch.log_time
         if mask.all():
             batch.channel = channel
-            return MessageRun(batch, seq)
+            return MessageRun(batch, seq, self._plan.channels)
         rows = np.flatnonzero(mask)
         own = batch.take(rows)
         own.channel = channel[rows]
-        return MessageRun(own, seq[rows])
+        return MessageRun(own, seq[rows], self._plan.channels)
 
     def _filtered(self, run: MessageRun) -> tuple[MessageRun, int]:
         """The messages that satisfy the predicate, and the number of unreadable ones."""
@@ -395,7 +397,8 @@ def _is_selected(
 
 def _merged(runs: list[MessageRun]) -> MessageRun:
     """Several runs as one: decoding each separately costs more than copying it."""
-    return MessageRun(joined([r.batch for r in runs]), np.concatenate([r.seq for r in runs]))
+    seq = np.concatenate([run.seq for run in runs])
+    return MessageRun(joined([run.batch for run in runs]), seq, runs[0].channels)
 
 
 def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
@@ -411,7 +414,7 @@ def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
         order = order[::-1]
     if len(runs) == 1:
         return runs[0].take(order)
-    return MessageRun(interleave([r.batch for r in runs], order), seq[order])
+    return MessageRun(interleave([r.batch for r in runs], order), seq[order], plan.channels)
 
 
 def _is_in_order(run: MessageRun) -> bool:

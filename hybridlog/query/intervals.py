@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from hybridlog.losses import lost_spans
 from hybridlog.query.times import (
-    TIME_LIMIT,
     DurationLike,
     format_duration,
     format_time,
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from hybridlog_storage.catalog import RecordingEntry
 
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
@@ -84,7 +81,7 @@ class Intervals:
         messages: int64[n], number of messages of each interval.
     """
 
-    __slots__ = ("_begin", "_end", "_messages", "_recording", "_recordings")
+    __slots__ = ("_begin", "_end", "_messages", "_places", "_recording", "_recordings")
 
     def __init__(
         self,
@@ -96,6 +93,7 @@ class Intervals:
     ) -> None:
         order = np.lexsort((end, recording, begin))
         self._recordings = recordings
+        self._places: dict[str, NDArray[np.intp]] | None = None
         self._recording: NDArray[np.int32] = recording[order]
         self._begin: NDArray[np.int64] = begin[order]
         self._end: NDArray[np.int64] = end[order]
@@ -117,6 +115,11 @@ class Intervals:
             codes.append(np.full(len(part), ids.setdefault(name, len(ids)), np.int32))
         begin, end, messages = np.ascontiguousarray(np.concatenate(rows).T)
         return cls(tuple(ids), np.concatenate(codes), begin, end, messages)
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Ids of the recordings that have intervals, or had some."""
+        return self._recordings
 
     def __len__(self) -> int:
         """Number of intervals."""
@@ -204,15 +207,15 @@ class Intervals:
 
     def merged(self) -> Intervals:
         """Overlapping or touching intervals of a recording joined; empty ones dropped."""
-        return Intervals.of(
-            (name, joined(self._rows_of(code))) for code, name in enumerate(self._recordings)
-        )
+        return Intervals.of((name, joined(self._rows_of(name))) for name in self._recordings)
 
     def common(self, other: Intervals) -> Intervals:
         """The intersection: times of a recording that intervals of both cover.
 
         `messages` is 0, since no messages belong to the new intervals.
         """
+        if len(other.recordings) < len(self._recordings):
+            return other.common(self)
         parts = []
         for name in self._recordings:
             mine, theirs = self.of_recording(name), other.of_recording(name)
@@ -239,8 +242,8 @@ class Intervals:
             UsageError: it has `limit` or `every`.
         """
         found = np.zeros(len(self), np.bool_)
-        for code, name in enumerate(self._recordings):
-            rows = np.flatnonzero(self._recording == code)
+        for name in self._recordings:
+            rows = self._rows(name)
             spans = np.stack([self._begin[rows], self._end[rows]], axis=1)
             found[rows] = events.any_within(name, spans)
         return self._take(found)
@@ -274,9 +277,7 @@ class Intervals:
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
-        if recording not in self._recordings:
-            return np.empty((0, 2), np.int64)
-        return joined(self._rows_of(self._recordings.index(recording)))[:, :2]
+        return joined(self._rows_of(recording))[:, :2]
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
@@ -286,8 +287,19 @@ class Intervals:
             self._recordings, self._recording, self._begin, self._end, self._messages
         )
 
-    def _rows_of(self, code: int) -> NDArray[np.int64]:
-        rows = np.flatnonzero(self._recording == code)
+    def _rows(self, recording: str) -> NDArray[np.intp]:
+        """Places of the intervals of a recording, in order."""
+        if self._places is None:
+            order = np.argsort(self._recording, kind="stable")
+            edges = np.searchsorted(self._recording[order], np.arange(len(self._recordings) + 1))
+            self._places = {
+                name: order[begin:end]
+                for name, begin, end in zip(self._recordings, edges, edges[1:], strict=False)
+            }
+        return self._places.get(recording, np.empty(0, np.intp))
+
+    def _rows_of(self, recording: str) -> NDArray[np.int64]:
+        rows = self._rows(recording)
         return np.stack([self._begin[rows], self._end[rows], self._messages[rows]], axis=1)
 
     def _take(self, rows: NDArray[np.bool_]) -> Intervals:
@@ -298,22 +310,6 @@ class Intervals:
             self._end[rows],
             self._messages[rows],
         )
-
-
-def span_of(recording: RecordingEntry) -> Span:
-    """Log time of a recording; empty at 0 without messages.
-
-    Stored messages that are lost count, which preserves the meaning of relative times.
-    The span ends at the last nanosecond of 64 bits at the latest: a message of exactly that
-    time is in no interval.
-    """
-    spans = [*lost_spans(recording)]
-    if recording.span is not None:
-        spans.append(recording.span)
-    if not spans:
-        return 0, 0
-    first, last = min(first for first, _ in spans), max(last for _, last in spans)
-    return first, min(last + 1, TIME_LIMIT - 1)
 
 
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:

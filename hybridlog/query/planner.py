@@ -8,7 +8,7 @@ of its answer; the cheapest one answers, and if it fails, the next one.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -44,10 +44,13 @@ if TYPE_CHECKING:
     from hybridlog.query.engines.tables import TablesEngine
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.query.question import Question, RecordedChannel
+    from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
 
 _CONNECT_S = 0.3  # seconds to start and reach the embedded MongoDB
+_MORE_TOGETHER = 64  # so many times more recordings are planned after each group
+_MOST_TOGETHER = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "Outcomes", "Values")
@@ -106,43 +109,68 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
-        gone = set(self.question.recordings) - {e.id for e in self.session.recordings()}
-        if gone:
-            raise TopicError(
-                f"{len(gone)} of the recordings asked about were removed from the store. Make the "
-                "query again."
-            )
+        return [part for resolved in self._ranges.resolve() for part in self.parts_in(*resolved)]
+
+    def parts_in(
+        self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
+    ) -> Iterator[Part]:
+        """The parts of the question in one recording.
+
+        Args:
+            summary: The recording.
+            bounds: See `Part`.
+            windows: See `Part`.
+
+        Raises:
+            TopicError: a topic does not have the requested clock, or the recording is gone.
+        """
+        recording = self.session.entry_of(summary)
         wanted = set(self.question.topics)
-        found: list[Part] = []
-        for recording, bounds, windows in self._ranges.resolve():
-            by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-            for channel in self.session.channels(recording):
-                if channel.channel.topic in wanted:
-                    self._check_clock(channel)
-                    by_topic[channel.channel.topic].append(channel)
-            found.extend(
-                Part(
-                    recording,
-                    topic,
-                    tuple(channels),
-                    bounds,
-                    self.question.clock,
-                    windows,
-                    self.question.predicate,
-                )
-                for topic, channels in by_topic.items()
+        by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
+        for channel in self.session.channels(recording):
+            if channel.channel.topic in wanted:
+                self._check_clock(channel)
+                by_topic[channel.channel.topic].append(channel)
+        for topic, channels in by_topic.items():
+            yield Part(
+                recording,
+                topic,
+                tuple(channels),
+                bounds,
+                self.question.clock,
+                windows,
+                self.question.predicate,
             )
-        return found
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
+        summaries = self.session.snapshot().summaries
+        places = self.session.chosen(self.question).tolist()
+        return self._channels_of(summaries[place] for place in places)
+
+    @cached_property
+    def examples(self) -> list[RecordedChannel]:
+        """Channels of the question, of one recording for each set of topics and types.
+
+        The others have the same types, so these say what columns an answer has.
+        """
+        places = self.session.chosen(self.question)
+        return self._channels_of(self.session.snapshot().differing(places))
+
+    def _channels_of(self, summaries: Iterable[RecordingSummary]) -> list[RecordedChannel]:
         wanted = set(self.question.topics)
         return [
             channel
-            for entry in self.session.chosen(self.question.recordings)
-            for channel in self.session.channels(entry)
+            for summary in summaries
+            for channel in self.session.channels(self.session.entry_of(summary))
             if channel.channel.topic in wanted
         ]
+
+    @cached_property
+    def ranks(self) -> dict[str, int]:
+        """The place of each recording among those asked, by its key; ties are in this order."""
+        keys = sorted(resolved.summary.key for resolved in self._ranges.resolve())
+        return {key: rank for rank, key in enumerate(keys)}
 
     # Answers.
 
@@ -183,36 +211,64 @@ class Planner:
         """Fields of the matching messages of a part, in order."""
         if not self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields):
             # Only MongoDB finds the messages; the fields are those of the messages.
-            return self._scan.values_of(self._plan_of([part]), fields)
+            return self._scan.values_of(self.plan([part]), fields)
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
-    def runs(self, plan: ScanPlan | None = None) -> Iterator[MessageRun]:
-        """The messages of the answer, in order.
-
-        Args:
-            plan: The result of `scan_plan`, for a caller that needs its channels.
-        """
+    def runs(self) -> Iterator[MessageRun]:
+        """The messages of the answer, in order."""
         question = self.question
         if question.limit == 0:
             return
-        plan = plan or self.scan_plan()
-        ahead = question.limit is None or question.limit > _READ_AHEAD_FROM
-        runs = ChunkScan(plan, self.session.segment, ahead=ahead).runs()
-        for run in runs if question.returns_all else _thinned(runs, plan, question):
+        runs = self._runs()
+        for run in runs if question.returns_all else _thinned(runs, question):
             self.counters.add_messages(run.batch)
             yield run
 
-    def unordered(self, plan: ScanPlan) -> Iterator[MessageRun]:
+    def _runs(self) -> Iterator[MessageRun]:
+        """All messages that match, in order; recordings are read when their turn comes."""
+        limit = self.question.limit
+        ahead = limit is None or limit > _READ_AHEAD_FROM
+        for group in self._groups():
+            plan = self.plan(group)
+            yield from ChunkScan(plan, self.session.segment, ahead=ahead).runs()
+
+    def unordered(self) -> Iterator[MessageRun]:
         """The messages of an answer without `limit` and `every`, unordered."""
-        for run in ChunkScan(plan, self.session.segment).unordered():
-            self.counters.add_messages(run.batch)
-            yield run
+        for group in self._groups():
+            plan = self.plan(group)
+            for run in ChunkScan(plan, self.session.segment).unordered():
+                self.counters.add_messages(run.batch)
+                yield run
 
-    def scan_plan(self) -> ScanPlan:
-        """The plan for reading the messages of the answer."""
-        return self._plan_of(self.parts())
+    def _groups(self) -> Iterator[list[Part]]:
+        """The parts in groups, those that overlap in time together, in the answer's order.
 
-    def _plan_of(self, parts: Sequence[Part]) -> ScanPlan:
+        The first group is small, so that the first message needs few recordings; there are few
+        groups, since a server is asked once for each.
+        """
+        found = self._ranges.resolve()
+        # In the order of the answer; going back, a recording begins with its last message.
+        first, last = (
+            (-found.last, -found.first)
+            if self.question.reverse
+            else (
+                found.first,
+                found.last,
+            )
+        )
+        order = np.argsort(first, kind="stable")
+        reached = np.maximum.accumulate(last[order]) if len(order) else last
+        edges = np.flatnonzero(first[order][1:] > reached[:-1]) + 1
+        begin, most = 0, 1
+        while begin < len(order):
+            row = int(np.searchsorted(edges, begin + most))
+            end = int(edges[row]) if row < len(edges) else len(order)
+            rows = order[begin:end].tolist()
+            yield [part for row in rows for part in self.parts_in(*found[row])]
+            begin, most = end, min(most * _MORE_TOGETHER, _MOST_TOGETHER)
+
+    def plan(self, parts: Sequence[Part]) -> ScanPlan:
+        """The plan for reading the matching messages of some parts."""
         plan = self._scan.plan(parts, filtered=False)
         plan.reverse = self.question.reverse
         if self.question.predicate is None or not parts:
@@ -332,7 +388,7 @@ class Planner:
             except _RETRIED as error:
                 total += sum(self._count_otherwise(part, engine, error) for part in group)
         if narrowed:
-            scan = ChunkScan(self._plan_of(narrowed), self.session.segment)
+            scan = ChunkScan(self.plan(narrowed), self.session.segment)
             total += sum(len(run.batch) for run in scan.unordered())
         return total
 
@@ -446,18 +502,16 @@ def _after(item: _Rows, key: _Key) -> _Rows | None:
     return item._replace(**columns)
 
 
-def _thinned(
-    runs: Iterator[MessageRun], plan: ScanPlan, question: Question
-) -> Iterator[MessageRun]:
+def _thinned(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
     number = {topic: n for n, topic in enumerate(question.topics)}
-    topic_of = np.array([number[c.channel.topic] for c in plan.channels], np.intp)
     seen = np.zeros(len(number), np.int64)
     given = 0
     for run in runs:
         keep = np.ones(len(run.batch), np.bool_)
         if question.every > 1:
-            topics = topic_of[run.batch.channel]
+            of = np.array([number[c.channel.topic] for c in run.channels], np.intp)
+            topics = of[run.batch.channel]
             for topic in np.unique(topics).tolist():
                 rows = np.flatnonzero(topics == topic)
                 keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0

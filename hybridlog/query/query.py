@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
 
 _MAX_STEP = 2**62  # longer than any topic, and an int64
@@ -61,7 +62,7 @@ class Query:
 
     def __repr__(self) -> str:
         names = ", ".join(self.topics[:3]) + (", …" if len(self.topics) > 3 else "")
-        parts = [names, f"{len(self.question.recordings)} recordings"]
+        parts = [names, f"{len(self._session.chosen(self.question))} recordings"]
         if self.question.bounds is not None:
             parts.append(f"between {self.question.bounds[0]} and {self.question.bounds[1]}")
         if self.question.predicate is not None:
@@ -85,8 +86,9 @@ class Query:
 
     @property
     def recordings(self) -> tuple[str, ...]:
-        """Ids of the recordings."""
-        return self.question.recordings
+        """Ids of the recordings, oldest first."""
+        summaries = self._session.snapshot().summaries
+        return tuple(summaries[n].id for n in self._session.chosen(self.question).tolist())
 
     # Steps.
 
@@ -130,7 +132,7 @@ class Query:
             WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
         """
         if isinstance(predicate, str):
-            checked = self._session.predicate(predicate, self.topics, self.recordings)
+            checked = self._session.predicate(predicate, self.topics, self.question.recordings)
         else:
             from hybridlog.query.predicate.from_mongo import from_mongo
 
@@ -193,7 +195,7 @@ class Query:
 
     def with_topic(self, topic: str) -> Query:
         """The same question about one of its topics."""
-        return self._on([topic], self.recordings)
+        return self._on([topic], self.question.recordings)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
@@ -207,8 +209,8 @@ class Query:
         Raises:
             TopicError: an interval is of a recording that is not in the store.
         """
-        known = self._session.recordings()
-        ids = {entry.label: entry.id for entry in known} | {entry.id: entry.id for entry in known}
+        known = self._session.snapshot().summaries
+        ids = {one.label: one.id for one in known} | {one.id: one.id for one in known}
         intervals = intervals.by_id(ids)
         if self.question.during is not None:
             intervals = self.question.during.common(intervals)
@@ -261,10 +263,8 @@ class Query:
         """The messages, ordered by log time, recording and arrival."""
         from hybridlog.message import messages_in
 
-        planner = self._planner()
-        plan = planner.scan_plan()
-        for run in planner.runs(plan):
-            yield from messages_in(plan.channels, run)
+        for run in self._planner().runs():
+            yield from messages_in(run)
 
     def first(self) -> Message | None:
         """The first message; None if the answer is empty."""
@@ -295,14 +295,12 @@ class Query:
 
         Messages without payload are left out; `counters.reduced` counts them.
         """
-        planner = self._planner()
-        plan = planner.scan_plan()
-        whole = np.array([not channel.is_reduced for channel in plan.channels], np.bool_)
-        for run in planner.runs(plan):
+        for run in self._planner().runs():
+            whole = np.array([not channel.is_reduced for channel in run.channels], np.bool_)
             batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
             self.counters.reduced += len(run.batch) - len(batch)
             if len(batch):
-                yield batch, plan.channels
+                yield batch, run.channels
 
     def latched(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """Latched messages from before the time range that are in force when it begins."""
@@ -317,8 +315,8 @@ class Query:
                 found = Planner(self._session, self.question, self.counters).count()
             except IndexChangedError:
                 # Another process has changed the index: query its new state once.
-                there = {entry.id for entry in self._session.recordings()}
-                if not there.issuperset(self.recordings):
+                asked = self.question.recordings
+                if asked is not None and not self._session.snapshot().by_id.keys() >= set(asked):
                     raise
                 found = Planner(self._session, self.question, self.counters).count()
             self.counters.messages = found
@@ -480,9 +478,18 @@ class Query:
         """Every channel of the question."""
         return Planner(self._session, self.question, self.counters).channels()
 
+    def encodings(self) -> set[str]:
+        """The encodings of the messages."""
+        examples = Planner(self._session, self.question, self.counters).examples
+        return {channel.channel.message_encoding for channel in examples}
+
+    def doubtful(self) -> list[RecordingEntry]:
+        """The recordings that have losses, have not ended, or are not proved to be whole."""
+        return self._session.doubtful(self.question)
+
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
-        return self._session.field_types(self.topics, self.recordings)
+        return self._session.field_types(self.topics, self.question.recordings)
 
     def check_range(self) -> None:
         """Check that the time range overlaps a recording.
@@ -502,7 +509,7 @@ class Query:
     def _with(self, **changes: Any) -> Query:
         return Query(self._session, replace(self.question, **changes))
 
-    def _on(self, topics: Sequence[str], recordings: Sequence[str]) -> Query:
+    def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Query:
         """The same conditions on other topics and recordings."""
         topics, chosen = self._session.having(topics, recordings)
         return self._with(topics=topics, recordings=chosen)

@@ -32,7 +32,7 @@ class Question:
 
     Attributes:
         topics: Full names of topics.
-        recordings: Ids of recordings.
+        recordings: Ids of recordings; None for every recording that has a topic.
         bounds: Time range `[begin, end)` as given; None for all times.
         clock: The clock that `bounds` refers to.
         predicate: Condition on the fields of a message; None for no condition.
@@ -44,7 +44,7 @@ class Question:
     """
 
     topics: tuple[str, ...]
-    recordings: tuple[str, ...]
+    recordings: tuple[str, ...] | None = None
     bounds: tuple[TimeLike | None, TimeLike | None] | None = None
     clock: Clock = "log"
     predicate: Predicate | None = None

@@ -3,19 +3,87 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from hybridlog.query.intervals import span_of
-from hybridlog.query.times import TIME_LIMIT, format_time, parse_range, parse_time
+import numpy as np
+
+from hybridlog.query.times import (
+    TIME_LIMIT,
+    format_time,
+    is_relative,
+    parse_range,
+    parse_time,
+)
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
+    from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import Clock, Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog.snapshot import Snapshot
+    from hybridlog_storage.summary import RecordingSummary
+
+_SHOWN = 5  # recordings in a message
+
+
+class Resolved(NamedTuple):
+    """The share of a question that one recording has.
+
+    Attributes:
+        summary: The recording.
+        bounds: `[begin, end)` on the question's clock, ns; None for all times.
+        windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
+    """
+
+    summary: RecordingSummary
+    bounds: Span | None
+    windows: NDArray[np.int64] | None
+
+
+class Ranges(Sequence[Resolved]):
+    """The recordings that a question asks, oldest first; each is made when it is needed.
+
+    Args:
+        snapshot: All recordings.
+        places: Positions of the recordings.
+        shared: Bounds of all of them, as of `Resolved`.
+        each: Bounds of each of them, if they differ.
+        during: Intervals of the question; None without.
+
+    Attributes:
+        first: int64[n], log time from which on each recording may have messages, ns.
+        last: int64[n], log time after which it has none, ns.
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        places: NDArray[np.intp],
+        shared: Span | None,
+        each: Sequence[Span] | None,
+        during: Intervals | None,
+    ) -> None:
+        self._summaries = snapshot.summaries
+        self._places = places
+        self._shared = shared
+        self._each = each
+        self._during = during
+        self.first: NDArray[np.int64] = snapshot.begin[places]
+        self.last: NDArray[np.int64] = np.where(
+            snapshot.is_open[places], TIME_LIMIT - 1, snapshot.end[places]
+        )
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, row: int) -> Resolved:  # type: ignore[override]
+        """The recording in a row."""
+        summary = self._summaries[self._places[row]]
+        bounds = self._shared if self._each is None else self._each[row]
+        windows = None if self._during is None else self._during.of_recording(summary.id)
+        return Resolved(summary, bounds, windows)
 
 
 class RangeResolver:
@@ -30,31 +98,53 @@ class RangeResolver:
         self._session = session
         self._question = question
 
-    def resolve(self) -> list[tuple[RecordingEntry, Span | None, NDArray[np.int64] | None]]:
-        """Each recording with its bounds on the question's clock and its windows of log time.
+    def resolve(self) -> Ranges:
+        """The recordings to ask, oldest first; without reading their entries.
 
         Raises:
             TimeError: the range is empty, or outside all recordings.
         """
-        question = self._question
-        found = []
-        outside: list[tuple[RecordingEntry, Span]] = []
-        for recording in self._session.chosen(question.recordings):
-            bounds = self.bounds_in(recording)
-            if bounds is not None and self._is_outside(bounds, recording):
-                outside.append((recording, bounds))
-                continue
-            windows = None
-            if question.during is not None:
-                windows = question.during.of_recording(recording.id)
-                if not len(windows):
-                    continue
-            found.append((recording, bounds, windows))
-        if outside and not found and question.during is None:
-            self._refuse(outside)
-        return found
+        question, snapshot = self._question, self._session.snapshot()
+        places = self._session.chosen(question)
+        if question.during is not None:
+            places = self._in_intervals(places, question.during)
+        shared, each = None, None
+        if question.bounds is not None:
+            shared = self._shared_bounds()
+            if shared is not None:
+                inside = snapshot.between(places, *shared)
+            else:
+                each, inside = self._bounds_of(places)
+            if len(places) and not len(inside) and question.during is None:
+                self._refuse(places)
+            places = inside
+        return Ranges(snapshot, places, shared, each, question.during)
 
-    def spans(self) -> list[tuple[RecordingEntry, Span]]:
+    def _in_intervals(self, places: NDArray[np.intp], during: Intervals) -> NDArray[np.intp]:
+        """The recordings that have any of some intervals."""
+        by_id = self._session.snapshot().by_id
+        own = [by_id.get(name, -1) for name in during.recordings]
+        return np.intersect1d(places, np.array(own, np.intp))
+
+    def _bounds_of(self, places: NDArray[np.intp]) -> tuple[list[Span], NDArray[np.intp]]:
+        """A range that is relative to each recording, and the recordings that it overlaps."""
+        summaries = self._session.snapshot().summaries
+        found = [(place, self._bounds_in(summaries[place])) for place in places.tolist()]
+        inside = [(p, span) for p, span in found if not self._is_outside(span, summaries[p])]
+        return [span for _, span in inside], np.array([p for p, _ in inside], np.intp)
+
+    def _shared_bounds(self) -> Span | None:
+        """The range by the log clock if it is the same in each recording, ns."""
+        assert self._question.bounds is not None
+        begin, stop = self._question.bounds
+        if self._question.clock != "log" or is_relative(begin) or is_relative(stop):
+            return None
+        return (
+            0 if begin is None else parse_time(begin, start=None, end=None),
+            TIME_LIMIT - 1 if stop is None else parse_time(stop, start=None, end=None),
+        )
+
+    def spans(self) -> list[tuple[RecordingSummary, Span]]:
         """The log time `[begin, end)`, ns, of each recording of the question.
 
         Raises:
@@ -66,11 +156,11 @@ class RangeResolver:
             raise UsageError(
                 f"Intervals use log time; a range cannot use the {question.clock} clock."
             )
-        found: list[tuple[RecordingEntry, Span]] = []
+        found: list[tuple[RecordingSummary, Span]] = []
         for recording, bounds, windows in self.resolve():
             if recording.span is None:
                 continue
-            start, end = span_of(recording)
+            start, end = recording.extent
             if bounds is not None:
                 start, end = max(start, bounds[0]), min(end, bounds[1])
             if windows is None:
@@ -84,23 +174,22 @@ class RangeResolver:
             )
         return found
 
-    def beginnings(self) -> Iterator[tuple[RecordingEntry, int]]:
+    def beginnings(self) -> Iterator[tuple[RecordingSummary, int]]:
         """Recordings that begin before the range does, and the beginning of the range, ns."""
         if self._question.clock != "log" and self._question.bounds is not None:
             return
         seen: set[str] = set()
         for recording, (begin, _) in self.spans():
-            if recording.id not in seen and span_of(recording)[0] < begin:
+            if recording.id not in seen and recording.extent[0] < begin:
                 yield recording, begin
             seen.add(recording.id)
 
-    def bounds_in(self, recording: RecordingEntry) -> Span | None:
-        """The range in one recording, ns; None for all times.
+    def _bounds_in(self, recording: RecordingSummary) -> Span:
+        """The range in one recording, ns.
 
         It may be empty: for example `2025-01-01` to `end`, in a recording of 2024.
         """
-        if self._question.bounds is None:
-            return None
+        assert self._question.bounds is not None
         start, end = self._clock_span(recording)
         begin, stop = self._question.bounds
         return (
@@ -108,11 +197,12 @@ class RangeResolver:
             TIME_LIMIT - 1 if stop is None else parse_time(stop, start=start, end=end),
         )
 
-    def _clock_span(self, recording: RecordingEntry) -> Span:
+    def _clock_span(self, summary: RecordingSummary) -> Span:
         """`[first, end)` of the question's topics, on the question's clock."""
         clock: Clock = self._question.clock
         if clock == "log":
-            return span_of(recording)
+            return summary.extent
+        recording = self._session.entry_of(summary)
         stats = [c.stats for c in recording.channels if c.topic in self._question.topics]
         pairs = [
             (s.first_publish, s.last_publish)
@@ -122,17 +212,17 @@ class RangeResolver:
         ]
         known = [(first, last) for first, last in pairs if first is not None and last is not None]
         if not known:
-            return span_of(recording)
+            return summary.extent
         first, last = min(low for low, _ in known), max(high for _, high in known)
         return max(first, 0), min(last + 1, TIME_LIMIT - 1)
 
-    def _is_outside(self, bounds: Span, recording: RecordingEntry) -> bool:
+    def _is_outside(self, bounds: Span, recording: RecordingSummary) -> bool:
         """True if a range is empty, or does not overlap the recording on the log clock."""
-        start, end = span_of(recording)
+        start, end = recording.extent
         beside = self._question.clock == "log" and (bounds[0] >= end or bounds[1] <= start)
         return beside or bounds[0] >= bounds[1]
 
-    def _refuse(self, outside: Sequence[tuple[RecordingEntry, Span]]) -> None:
+    def _refuse(self, places: NDArray[np.intp]) -> None:
         """Refuse a range that overlaps no recording.
 
         Raises:
@@ -140,13 +230,18 @@ class RangeResolver:
         """
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
-        spans = []
-        for recording, (low, high) in outside:
-            start, end = self._clock_span(recording)
+        summaries = self._session.snapshot().summaries
+        spans: list[str] = []
+        for place in places.tolist():
+            start, end = self._clock_span(summaries[place])
+            low, high = self._bounds_in(summaries[place])
             # `2025-01-01` to `end` is no mistake: the recording simply ends before.
             if low < high or low == start or high == end:
-                spans.append(f"{recording.label} spans {format_time(start)} to {format_time(end)}")
+                label = summaries[place].label
+                spans.append(f"{label} spans {format_time(start)} to {format_time(end)}")
+            if len(spans) == _SHOWN:
+                break
         if not spans:
-            start, end = self._clock_span(outside[0][0])
+            start, end = self._clock_span(summaries[places[0]])
             parse_range(begin, stop, start=start, end=end)
-        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans[:5])}.")
+        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")

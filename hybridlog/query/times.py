@@ -128,6 +128,14 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     return _checked(_from_datetime64(text), text)
 
 
+def is_relative(time: TimeLike | None) -> bool:
+    """True if a time depends on the recording: `+5s`, `-10s`, `500ms`, `start`, `end`."""
+    if not isinstance(time, str):
+        return False
+    word = time.strip()
+    return word.lower() != "now" and _absolute(word) is None
+
+
 def parse_range(
     begin: TimeLike | None, stop: TimeLike | None, *, start: int | None, end: int | None
 ) -> tuple[int, int]:

@@ -40,6 +40,13 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import ChunkPlace
+from hybridlog_storage.summary import (
+    RecordingSummary,
+    TopicType,
+    hash_of,
+    topics_from_json,
+    topics_to_json,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +54,7 @@ if TYPE_CHECKING:
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
 _JOURNAL: Final = f"{CATALOG}-journal"
-_VERSION: Final = 2
+_VERSION: Final = 3
 _BUSY_S: Final = 20.0
 _NO_DAMAGE: Final = frozenset(
     {
@@ -83,6 +90,12 @@ create table meta (key text primary key, value text not null) without rowid;
 create table recordings (
     id text primary key, files text not null, entry text not null,
     crc integer not null) without rowid;
+create table summaries (
+    id text primary key, summary text not null, crc integer not null,
+    indexed text not null default '') without rowid;
+create table topics (hash text primary key, topics text not null) without rowid;
+create table fingerprints (
+    fingerprint text not null, id text not null, primary key (fingerprint, id)) without rowid;
 create table segments (
     id text not null, number integer not null, digest text not null, chunks blob not null,
     crc integer not null, primary key (id, number));
@@ -94,6 +107,15 @@ create table damage (
 create table schemas (
     hash text primary key, name text not null, encoding text not null, data blob not null);
 """
+_BY_RECORDING: Final = (
+    "recordings",
+    "summaries",
+    "fingerprints",
+    "segments",
+    "stamps",
+    "damage",
+)
+"""Tables with rows of recordings, by their `id`."""
 
 
 @dataclass(slots=True)
@@ -315,6 +337,18 @@ class ChunkEntry:
         return (min(firsts), max(lasts)) if firsts and lasts else None
 
 
+def _put_summary(db: sqlite3.Connection, described: Described) -> None:
+    entry, text = described.entry, described.summary.to_json()
+    topics = topics_to_json(described.topics)
+    db.execute("insert or replace into topics values (?, ?)", (hash_of(topics), topics))
+    row = entry.id, text, _text_crc(text)
+    db.execute("insert or replace into summaries values (?, ?, ?, '')", row)
+    fingerprint = entry.source.get("fingerprint")
+    db.execute("delete from fingerprints where id = ?", (entry.id,))
+    if isinstance(fingerprint, str):
+        db.execute("insert into fingerprints values (?, ?)", (fingerprint, entry.id))
+
+
 def channel_totals(
     table: ChunkTable, stamps: NDArray[np.void] | None, silent: Container[int] = ()
 ) -> dict[int, ChannelStats]:
@@ -396,12 +430,16 @@ class Described:
 
     Attributes:
         entry: Its entry.
+        summary: Its summary.
+        topics: Its topics and their types.
         files: State of the files; the row is used while it is unchanged.
         tables: Chunks of each valid segment, by number.
         channels: By id.
     """
 
     entry: RecordingEntry
+    summary: RecordingSummary
+    topics: Collection[TopicType]
     files: str
     tables: Mapping[int, ChunkTable]
     channels: Mapping[int, Channel]
@@ -657,6 +695,16 @@ class Catalog:
             with self._changing() as db:
                 work(db)
 
+    def _note(self, work: Callable[[sqlite3.Connection], None]) -> None:
+        """A transaction that saves work later; left out if another process writes just now."""
+        with self._lock, suppress(sqlite3.Error):
+            try:
+                self._db.execute("pragma busy_timeout = 0")
+                with self._writing() as db:
+                    work(db)
+            finally:
+                self._db.execute(f"pragma busy_timeout = {int(_BUSY_S * 1000)}")
+
     @contextmanager
     def _changing(self) -> Iterator[sqlite3.Connection]:
         """A transaction.
@@ -715,34 +763,96 @@ class Catalog:
                 ],
             )
             db.execute("insert or replace into recordings values (?, ?, ?, ?)", (*row, _crc(*row)))
+            _put_summary(db, described)
 
         self._change(work)
 
-    def recordings(self) -> dict[str, tuple[str, RecordingEntry]]:
-        """State of the files and entry of each recording, by id; without damaged rows.
+    def summaries(self) -> list[RecordingSummary]:
+        """The summaries of all recordings, unordered; without damaged ones.
 
         Raises:
             CatalogError: More than single rows is damaged.
         """
-        found: dict[str, tuple[str, RecordingEntry]] = {}
         with self._reading():
             self._follow()
-            asked = "select id, files, entry, crc from recordings"
-            rows = self._db.execute(asked).fetchall()
-            for *row, crc in rows:
-                if _crc(*row) == crc:
-                    with suppress(KeyError, TypeError, ValueError):
-                        found[row[0]] = row[1], RecordingEntry.from_document(json.loads(row[2]))
-            if len(found) < len(rows) and not self._is_sound():
+            rows = self._db.execute("select summary, crc, indexed from summaries").fetchall()
+            good = [(text, index) for text, crc, index in rows if _text_crc(text) == crc]
+            if len(good) < len(rows) and not self._is_sound():
                 raise CatalogError(f"The catalog {self._path} is damaged.")
-        return found
+        values = json.loads(f"[{','.join(text for text, _ in good)}]")
+        return [
+            RecordingSummary.from_values(row, index)
+            for row, (_, index) in zip(values, good, strict=True)
+        ]
+
+    def topics(self, digest: str) -> tuple[TopicType, ...]:
+        """A set of topics and their types, by its hash.
+
+        Raises:
+            CatalogError: The catalog has lost it.
+        """
+        with self._reading() as db:
+            row = db.execute("select topics from topics where hash = ?", (digest,)).fetchone()
+        if row is None or type(row[0]) is not str or hash_of(row[0]) != digest:
+            raise CatalogError(
+                f"The catalog {self._path} has lost the topics of recordings. "
+                "`hybridlog reindex` rebuilds it."
+            )
+        return topics_from_json(row[0])
+
+    def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
+        """State of the files and entry of a recording; None if it is missing or damaged."""
+        with self._reading() as db:
+            asked = "select id, files, entry, crc from recordings where id = ?"
+            row = db.execute(asked, (recording,)).fetchone()
+        if row is None or _crc(*row[:3]) != row[3]:
+            return None
+        with suppress(KeyError, TypeError, ValueError):
+            return row[1], RecordingEntry.from_document(json.loads(row[2]))
+        return None
+
+    def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
+        """A recording of a log with this content."""
+        with self._reading():
+            self._follow()
+            asked = "select id from fingerprints where fingerprint = ?"
+            rows = self._db.execute(asked, (fingerprint,)).fetchall()
+        for (recording,) in rows:
+            found = self.recording(recording)
+            if found is not None and found[1].source.get("fingerprint") == fingerprint:
+                return found[1]
+        return None
+
+    def put_look(self, summary: RecordingSummary) -> None:
+        """Note that a recording is unchanged although its directory looks different."""
+        text = summary.to_json()
+
+        def work(db: sqlite3.Connection) -> None:
+            asked = "update summaries set summary = ?, crc = ? where id = ?"
+            db.execute(asked, (text, _text_crc(text), summary.id))
+
+        self._note(work)
+
+    def put_indexed(self, recordings: Iterable[str], index: str) -> None:
+        """Note which index is complete for recordings.
+
+        Args:
+            recordings: Their ids.
+            index: The id of the index; empty if none is.
+        """
+
+        def work(db: sqlite3.Connection) -> None:
+            asked = "update summaries set indexed = ? where id = ?"
+            db.executemany(asked, [(index, recording) for recording in recordings])
+
+        self._note(work)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
 
         def work(db: sqlite3.Connection) -> None:
             self._forget(recording)
-            for table in ("recordings", "segments", "stamps", "damage"):
+            for table in _BY_RECORDING:
                 db.execute(f"delete from {table} where id = ?", (recording,))  # noqa: S608
 
         self._change(work)
@@ -865,7 +975,8 @@ class Catalog:
             if cached[1] is None and entry.is_decoded and len(table.parts):
                 # Without its row the next opening reads the recording's files again.
                 with suppress(sqlite3.Error):
-                    db.execute("delete from recordings where id = ?", (entry.id,))
+                    for name in ("recordings", "summaries"):
+                        db.execute(f"delete from {name} where id = ?", (entry.id,))  # noqa: S608
             self._tables[key] = cached
             self._cached += _size(table)
             while self._cached > _CACHED_BYTES and len(self._tables) > 1:
@@ -1031,6 +1142,11 @@ def _crc(*values: object) -> int:
         data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
         crc = crc32(data, crc32(kind + len(data).to_bytes(8, "little"), crc))
     return crc
+
+
+def _text_crc(text: object) -> int:
+    """Checksum of the text of a summary; -1 for a value of another type."""
+    return crc32(text.encode("utf-8", "surrogateescape")) if isinstance(text, str) else -1
 
 
 def _size(table: ChunkTable) -> int:

@@ -20,7 +20,7 @@ import re
 import secrets
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -50,6 +50,7 @@ class Listing:
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
+        look: As of `StoreDirectory.looks`, before the names were read.
         print: A value that changes whenever a relevant file changes.
     """
 
@@ -57,6 +58,7 @@ class Listing:
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
+    look: str
     print: str
 
 
@@ -160,6 +162,28 @@ class StoreDirectory:
         """Labels of all recordings that have a directory, sorted."""
         return [name for name in self._folders() if not name.startswith(".")]
 
+    def looks(self) -> dict[str, str]:
+        """The look of each recording's directory, by label, sorted.
+
+        It changes whenever a file gets or loses its name, and when the journal grows. A
+        change inside a segment shows only in `Listing.print`.
+        """
+        found: dict[str, str] = {}
+        try:
+            with files.folder(self.recordings, files.IN_STORE) as fd:
+                names = sorted(os.listdir(fd))  # noqa: PTH208 - of a handle
+                for name in names:
+                    if not name.startswith("."):
+                        with suppress(OSError):
+                            about = os.stat(name, dir_fd=fd, follow_symlinks=False)
+                            if stat.S_ISDIR(about.st_mode):
+                                found[name] = _look(about, f"{name}/{JOURNAL}", fd)
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+        return found
+
     def has(self, label: str) -> bool:
         """True if this name exists below `recordings`."""
         try:
@@ -191,10 +215,13 @@ class StoreDirectory:
             StoreError: It cannot be read.
         """
         path = self.recording(label)
+        look, found = "", {}
         try:
-            found = files.names(path, depth=files.IN_FOLDER)
+            with files.folder(path, files.IN_FOLDER) as fd:
+                look = _look(os.fstat(fd), JOURNAL, fd)
+                found = files.names_in(fd)
         except FileNotFoundError:
-            found = {}
+            pass
         except OSError as error:
             problem = f"{path} cannot be read: {error.strerror}."
             raise (exhausted(error.errno, f"reading {path}") or StoreError(problem)) from error
@@ -222,6 +249,7 @@ class StoreDirectory:
             dict(sorted(sealed.items())),
             dict(sorted(opened.items())),
             tuple(others),
+            look,
             looks.hexdigest(),
         )
 
@@ -245,16 +273,29 @@ class StoreDirectory:
         base = label_of(name)
         number = 1
         while True:
-            label = base if number == 1 else f"{base}-{number}"
+            label = _numbered_label(base, number)
             try:
                 files.make_folder(self.recording(label), depth=files.IN_FOLDER)
             except FileExistsError:
-                number += 1
+                number = self._free_number(base, number)
             except OSError as error:
                 raise durability.explain(error, self.path, "starting a recording in") from error
             else:
                 self._sync()
                 return label
+
+    def _free_number(self, base: str, taken: int) -> int:
+        """A free number after a taken one; a thousand recordings of one name cost ten looks."""
+        free = taken + 1
+        while self.has(_numbered_label(base, free)):
+            taken, free = free, free * 2
+        while free - taken > 1:
+            middle = (taken + free) // 2
+            if self.has(_numbered_label(base, middle)):
+                taken = middle
+            else:
+                free = middle
+        return free
 
     def is_beginning(self, label: str) -> bool:
         """True if a process may be about to lock this empty recording.
@@ -273,7 +314,7 @@ class StoreDirectory:
         base = label_of(name)
         taken = set(self._folders()) - {but}
         number = 1
-        while (label := base if number == 1 else f"{base}-{number}") in taken:
+        while (label := _numbered_label(base, number)) in taken:
             number += 1
         return label
 
@@ -355,6 +396,26 @@ def _alone(directory: Path, *, depth: int, wait: bool = True) -> Iterator[None]:
     with files.folder(directory, depth) as fd:
         fcntl.flock(fd, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
+
+
+def _numbered_label(base: str, number: int) -> str:
+    return base if number == 1 else f"{base}-{number}"
+
+
+def _look(about: os.stat_result, journal: str, fd: int) -> str:
+    """The look of a recording.
+
+    Args:
+        about: The status of its directory.
+        journal: Path of its journal.
+        fd: Handle of the folder that the path begins in.
+    """
+    look = f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
+    try:
+        lines = os.stat(journal, dir_fd=fd, follow_symlinks=False)
+    except OSError:
+        return look
+    return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
 
 
 def label_of(name: str) -> str:

@@ -204,8 +204,18 @@ def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
     Raises:
         OSError: It cannot be read.
     """
+    with folder(path, depth) as fd:
+        return names_in(fd)
+
+
+def names_in(fd: int) -> dict[str, os.stat_result]:
+    """The status of each entry of an open folder, by name.
+
+    Raises:
+        OSError: It cannot be read.
+    """
     found: dict[str, os.stat_result] = {}
-    with folder(path, depth) as fd, os.scandir(fd) as entries:
+    with os.scandir(fd) as entries:
         for entry in entries:
             with suppress(FileNotFoundError):
                 found[entry.name] = entry.stat(follow_symlinks=False)

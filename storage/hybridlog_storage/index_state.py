@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -39,6 +40,7 @@ _TURN: Final = {"_id": "turn"}
 _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
+_OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
 _SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
 """Values of an entry that may change while its segments stay."""
 
@@ -52,6 +54,8 @@ class Indexed:
         state: Progress of the index.
         segments: Digest of each completely indexed segment, by its number as text.
         turn: Counts how often its documents were removed or rebuilt.
+        topics: Topics of its documents, as far as known.
+        span: First and last log time of its documents, ns, as far as known; None without any.
         has_list: Whether the list of its chunks may still exist although it is complete.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
@@ -61,6 +65,8 @@ class Indexed:
     state: State
     segments: Mapping[str, str]
     turn: int
+    topics: tuple[str, ...] = ()
+    span: tuple[int, int] | None = None
     has_list: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
@@ -106,21 +112,33 @@ class IndexState:
         """The index states of these recordings, or of all, by key."""
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
-        wanted = {"id": 1, "index": 1, **dict.fromkeys(_SHOWN, 1)}
+        wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_SHOWN), 1)}
         for document in self._db.find(
             RECORDINGS, asked, wanted, batch_size=_AT_ONCE, read="majority"
         ):
             index = document.get("index") or {}
+            channels = document.get("channels") or ()
+            topics = {str(channel.get("topic", "")) for channel in channels}
+            firsts, lasts = (
+                [t for c in channels if (t := (c.get("stats") or {}).get(name)) is not None]
+                for name in ("first", "last")
+            )
             found[document["_id"]] = Indexed(
                 str(document.get("id", "")),
                 index.get("state", "indexing"),
                 dict(index.get("segments") or {}),
                 int(index.get("turn", 0)),
+                tuple(sorted(topics)),
+                (min(firsts), max(lasts)) if firsts and lasts else None,
                 bool(index.get("has_list")),
                 {name: document.get(name) for name in _SHOWN},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
             )
         return found
+
+    def count(self) -> int:
+        """Number of recordings in the mirror; may be wrong after the server was killed."""
+        return self._db.stats(RECORDINGS).documents
 
     def turn(self, read: ReadConcern = "local") -> int:
         """The number of removals of documents of any recording so far."""
@@ -291,9 +309,14 @@ class IndexState:
         """The store that owns the database, and its place; None without an owner."""
         return self._db.find_one(STORE, {"_id": "store"})
 
-    def claim(self, values: Mapping[str, Any]) -> None:
-        """Register the store that owns the database."""
-        self._db.replace(STORE, {"_id": "store"}, {"_id": "store", **values})
+    def claim(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Register the store that owns the database; return its mark.
+
+        The index gets a new id, so that nothing is believed of it that was known before.
+        """
+        mark = {"_id": "store", **values, "index": secrets.token_hex(8)}
+        self._db.replace(STORE, {"_id": "store"}, mark)
+        return mark
 
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:

@@ -354,7 +354,7 @@ def _check_database(store: hl.Store, database: Database) -> None:
 
 def _check_catalog(store: hl.Store) -> None:
     """The catalog is what the files say."""
-    rows = store.catalog.recordings()
+    rows = {one.id: store.catalog.recording(one.id) for one in store.catalog.summaries()}
     labels = store.directory.labels()
     _check(len(rows) == len(labels), f"{labels} are there, {len(rows)} in the catalog")
     for label in labels:
@@ -362,6 +362,9 @@ def _check_catalog(store: hl.Store) -> None:
         row = rows.get(described.entry.id)
         _check(row is not None, f"{label} is not in the catalog")
         _check(row == (described.files, described.entry), f"the catalog's row of {label} differs")
+        summary = next(one for one in store.catalog.summaries() if one.id == described.entry.id)
+        same = summary._replace(indexed_by="") == described.summary
+        _check(same, f"the catalog's summary of {label} differs")
         for number, table in described.tables.items():
             kept = store.catalog.table(described.entry, number)
             _check(kept.to_bytes() == table.to_bytes(), f"the chunks of {label} {number} differ")

@@ -63,6 +63,8 @@ def add(path: Path, numbers: range) -> None:
 def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
     """What MongoDB gets for each question and for opening, and the answers."""
     heard, answers = {}, {}
+    with hl.open(path, require_database=True):
+        pass  # new recordings are looked at once
     with commands() as sent, hl.open(path, require_database=True) as store:
         heard["open"] = [*sent]
         log = logs.write(path.parent / "more.mcap", logs.content(900 * GAP, MESSAGES))

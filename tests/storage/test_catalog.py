@@ -21,6 +21,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybridlog.entries import summary_of, topic_types
 from hybridlog_storage import catalog as module
 from hybridlog_storage.catalog import (
     CATALOG,
@@ -97,6 +98,12 @@ def segment(rng: random.Random, chunks: int) -> tuple[ChunkTable, list[dict[int,
     return table, told
 
 
+def rows_of(catalog: Catalog) -> dict[str, tuple[str, RecordingEntry]]:
+    """State of the files and entry of each recording that has a summary, by id."""
+    rows = {one.id: catalog.recording(one.id) for one in catalog.summaries()}
+    return {recording: row for recording, row in rows.items() if row is not None}
+
+
 class Model:
     """A recording as a list of what is in it."""
 
@@ -139,7 +146,15 @@ class Model:
     @property
     def described(self) -> Described:
         channels = {c: channel(c) for c in CHANNELS}
-        return Described(self.entry, f"looks of {self.id}", self.tables, channels)
+        entry = self.entry
+        return Described(
+            entry,
+            summary_of(entry, f"outside of {self.id}"),
+            topic_types(entry),
+            f"looks of {self.id}",
+            self.tables,
+            channels,
+        )
 
     def put(self, catalog: Catalog, *, decoded: bool = True) -> None:
         catalog.put(self.described)
@@ -272,7 +287,7 @@ def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
     other = Model(2, "other", segments=0)
     for one in (model, other):
         one.put(catalog)
-    found = catalog.recordings()
+    found = rows_of(catalog)
     assert found == {
         model.id: (f"looks of {model.id}", model.entry),
         other.id: (f"looks of {other.id}", other.entry),
@@ -287,7 +302,7 @@ def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
     )
     changed = replace(other.entry, status="recovered", tags={})
     catalog.put(replace(other.described, entry=changed, files="otherwise"))
-    assert catalog.recordings()[other.id] == ("otherwise", changed)
+    assert rows_of(catalog)[other.id] == ("otherwise", changed)
 
 
 def test_a_directory_may_have_any_name(catalog: Catalog) -> None:
@@ -295,7 +310,7 @@ def test_a_directory_may_have_any_name(catalog: Catalog) -> None:
     model = Model(5, label)
     model.put(catalog)
     catalog.put_damage(model.id, {(0, 1): f"{label}: a file of it"})
-    assert catalog.recordings()[model.id][1].label == label
+    assert rows_of(catalog)[model.id][1].label == label
     assert catalog.damage(model.id) == {(0, 1): f"{label}: a file of it"}
 
 
@@ -380,7 +395,7 @@ def test_a_recording_is_removed_without_a_trace(
         one.put(catalog)
         catalog.put_damage(one.id, {(0, 0): "x"})
     catalog.remove(model.id)
-    assert catalog.recordings().keys() == {other.id}
+    assert rows_of(catalog).keys() == {other.id}
     assert catalog.damage(model.id) == {}
     with pytest.raises(CatalogError):
         catalog.chunks(model.entry)
@@ -411,9 +426,9 @@ def test_one_in_memory_leaves_no_file(tmp_path: Path, model: Model) -> None:
         model.put(made)
         assert made.chunks(model.entry) == model.chunks()
         made.rebuild()
-        assert made.recordings() == {}
+        assert rows_of(made) == {}
         model.put(made)
-        assert made.recordings().keys() == {model.id}
+        assert rows_of(made).keys() == {model.id}
     assert list(tmp_path.iterdir()) == []
 
 
@@ -487,8 +502,13 @@ class Truth:
 
     def check(self, catalog: Catalog) -> bool:
         """That nothing that it says is wrong; returns whether it says all."""
-        complete = True
-        known = catalog.recordings()
+        known = rows_of(catalog)
+        summaries = {one.id: one for one in catalog.summaries()}
+        assert summaries.items() <= {m.id: m.described.summary for m in self.models}.items()
+        complete = len(summaries) == len(self.models)
+        same = catalog.with_fingerprint("f")
+        assert same is None or same in [model.entry for model in self.models]
+        complete &= same is not None
         for model in self.models:
             row = known.pop(model.id, None)
             if row is not None:
@@ -496,6 +516,7 @@ class Truth:
             complete &= row is not None
             for told in (
                 lambda model=model: self._chunks(catalog, model),
+                lambda model=model: self._topics(catalog, model),
                 lambda model=model: catalog.damage(model.id) in ({}, self.damage),
                 lambda model=model: self._schemas(catalog),
             ):
@@ -513,6 +534,11 @@ class Truth:
                     assert found is None or found.tobytes() == want.tobytes()
         assert known == {}
         return complete
+
+    @staticmethod
+    def _topics(catalog: Catalog, model: Model) -> bool:
+        described = model.described
+        return set(catalog.topics(described.summary.topics)) == described.topics
 
     @staticmethod
     def _chunks(catalog: Catalog, model: Model) -> bool:
@@ -621,6 +647,8 @@ def test_whatever_page_of_the_file_is_lost_nothing_wrong_is_said(
 
 CHANGES = {
     "recordings": ("files", "entry", "crc"),
+    "summaries": ("summary", "crc"),
+    "topics": ("topics",),
     "segments": ("digest", "chunks", "crc"),
     "stamps": ("digest", "rows", "crc"),
     "damage": ("chunks", "crc"),
@@ -664,22 +692,23 @@ def test_a_row_that_was_changed_is_not_believed(
             db.commit()
         with closing(Catalog(tmp_path, STORE)) as opened:
             complete = truth.is_whole(opened)
-            if table in {"recordings", "segments", "damage"}:
+            if table in {"recordings", "summaries", "topics", "segments", "damage"}:
                 assert not complete, other
             truth.make_again(opened)
 
 
-@pytest.mark.parametrize("table", ["recordings", "segments", "stamps", "damage", "schemas"])
+@pytest.mark.parametrize("table", [*CHANGES, "fingerprints"])
 def test_rows_that_changed_places_or_are_gone_are_not_believed(
     truth: Truth, tmp_path: Path, table: str
 ) -> None:
     """As they are, checksums and all."""
-    keys = {"recordings": "id", "schemas": "hash"}.get(table, "id")
+    keys = {"topics": "hash", "schemas": "hash"}.get(table, "id")
     path = tmp_path / CATALOG
     for change in ("exchange", "delete", "drop"):
         shutil.copy(truth.path, path)
         with closing(sqlite3.connect(path)) as db:
-            one, other = [k for (k,) in db.execute(f"select distinct {keys} from {table} limit 2")]
+            found = [k for (k,) in db.execute(f"select distinct {keys} from {table} limit 2")]
+            one, other = found[0], found[-1]
             if change == "exchange":
                 for old, new in ((one, "x"), (other, one), ("x", other)):
                     db.execute(f"update {table} set {keys} = ? where {keys} = ?", (new, old))
@@ -698,16 +727,16 @@ def test_the_catalog_of_another_store_is_made_anew(tmp_path: Path, model: Model)
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)
     with closing(Catalog(tmp_path, STORE)) as same:
-        assert same.recordings().keys() == {model.id}
+        assert rows_of(same).keys() == {model.id}
     with closing(Catalog(tmp_path, "6" * 32)) as other:
-        assert other.recordings() == {}
+        assert rows_of(other) == {}
         with pytest.raises(CatalogError):
             other.chunks(model.entry)
         model.put(other)
         assert other.chunks(model.entry) == model.chunks()
 
 
-@pytest.mark.parametrize("version", ["1", "", "3", None])
+@pytest.mark.parametrize("version", ["1", "", "4", None])
 def test_the_catalog_of_another_version_is_made_anew(
     tmp_path: Path, model: Model, version: str | None
 ) -> None:
@@ -723,7 +752,7 @@ def test_the_catalog_of_another_version_is_made_anew(
         db.execute('create table "of ""theirs" (n)')
         db.commit()
     with closing(Catalog(tmp_path, STORE)) as again:
-        assert again.recordings() == {}
+        assert rows_of(again) == {}
         model.put(again)
     with closing(Catalog(tmp_path, STORE)) as again:
         assert again.chunks(model.entry) == model.chunks()
@@ -764,14 +793,14 @@ def test_a_file_in_use_is_no_damaged_file(
             for use in (
                 lambda: Catalog(tmp_path, STORE),
                 lambda: model.put(made),
-                made.recordings,
+                made.summaries,
                 made.rebuild,
             ):
                 with pytest.raises(StoreError, match="locked") as told:
                     use()
                 assert not isinstance(told.value, CatalogError)
             db.execute("rollback")
-        assert made.recordings().keys() == {model.id}
+        assert rows_of(made).keys() == {model.id}
         assert made.chunks(model.entry) == model.chunks()
 
 
@@ -782,7 +811,7 @@ def test_a_full_disk_leaves_it_as_it_was(catalog: Catalog, model: Model) -> None
     with pytest.raises(DiskFullError, match="No space left"):
         Model(4, "other").put(catalog)
     catalog._db.execute("pragma max_page_count = 1000000")
-    assert catalog.recordings().keys() == {model.id}
+    assert rows_of(catalog).keys() == {model.id}
     assert catalog.chunks(model.entry) == model.chunks()
 
 
@@ -800,7 +829,7 @@ def test_what_is_interrupted_leaves_it_as_it_was(
         patch.setattr(ChunkTable, "to_bytes", stop)
         with pytest.raises(KeyboardInterrupt):
             again.put(catalog)
-    assert catalog.recordings()[model.id][1] == model.entry
+    assert rows_of(catalog)[model.id][1] == model.entry
     assert catalog.chunks(model.entry) == model.chunks()
     again.put(catalog)
     assert catalog.chunks(again.entry) == again.chunks()
@@ -812,13 +841,13 @@ def test_what_is_interrupted_leaves_it_as_it_was(
 def test_two_that_have_it_open_see_what_the_other_does(tmp_path: Path, model: Model) -> None:
     with closing(Catalog(tmp_path, STORE)) as one, closing(Catalog(tmp_path, STORE)) as other:
         model.put(one)
-        assert other.recordings().keys() == {model.id}
+        assert rows_of(other).keys() == {model.id}
         assert other.chunks(model.entry) == model.chunks()
         other.remove(model.id)
-        assert one.recordings() == {}
+        assert rows_of(one) == {}
         model.put(other)
         one.rebuild()
-        assert other.recordings() == {}
+        assert rows_of(other) == {}
         model.put(other)
         assert one.chunks(model.entry) == model.chunks()
 
@@ -844,16 +873,16 @@ def test_one_that_was_made_anew_is_taken_up(tmp_path: Path, model: Model, how: s
                 other.rebuild()
             other_model = Model(8, "other")
             other_model.put(other)
-            assert one.recordings().keys() == {other_model.id}
+            assert rows_of(one).keys() == {other_model.id}
             model.put(one)
-            assert other.recordings().keys() == {model.id, other_model.id}
+            assert rows_of(other).keys() == {model.id, other_model.id}
             assert other.chunks(model.entry) == model.chunks()
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from tests.storage.test_catalog import STORE, Catalog, Model
+from tests.storage.test_catalog import STORE, Catalog, Model, rows_of
 
 first, count = int(sys.argv[2]), int(sys.argv[3])
 catalog = Catalog(Path(sys.argv[1]), STORE)
@@ -862,7 +891,7 @@ for number in range(first, first + count):
     model.put(catalog)
     catalog.put_damage(model.id, {(0, number): "x"})
     assert catalog.chunks(model.entry) == model.chunks()
-    assert catalog.recordings()[model.id][1] == model.entry
+    assert rows_of(catalog)[model.id][1] == model.entry
     if number % 5 == 0:
         catalog.remove(model.id)
 print("done")
@@ -892,7 +921,7 @@ def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
         if number % 5 and (model := Model(number, f"run{number}", segments=2, chunks=3))
     }
     with closing(Catalog(tmp_path, STORE)) as opened:
-        assert opened.recordings().keys() == want.keys()
+        assert rows_of(opened).keys() == want.keys()
         for model in want.values():
             assert opened.chunks(model.entry) == model.chunks()
             assert len(opened.damage(model.id)) == 1
@@ -917,4 +946,4 @@ def test_several_threads_use_one(catalog: Catalog) -> None:
     for thread in threads:
         thread.join()
     assert failures == []
-    assert catalog.recordings() == {}
+    assert rows_of(catalog) == {}

@@ -381,10 +381,12 @@ def test_a_database_says_whose_it_is(state: IndexState) -> None:
     assert state.mark() is None
     state.put(recording(), "clearing", turn=1)
     assert state.mark() is None
-    state.claim({"id": "a", "host": "h", "path": "/p"})
-    assert state.mark() == {"_id": "store", "id": "a", "host": "h", "path": "/p"}
-    state.claim({"id": "b"})
-    assert state.mark() == {"_id": "store", "id": "b"}
+    one = state.claim({"id": "a", "host": "h", "path": "/p"})
+    assert state.mark() == one
+    assert one.items() >= {"_id": "store", "id": "a", "host": "h", "path": "/p"}.items()
+    other = state.claim({"id": "b"})
+    assert state.mark() == other == {"_id": "store", "id": "b", "index": other["index"]}
+    assert other["index"] != one["index"]  # nothing is believed that was known of the old one
     assert state.turn() == 1
 
 

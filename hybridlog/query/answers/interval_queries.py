@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import groupby, islice
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined, span_of
+from hybridlog.losses import extent_of
+from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 
 class IntervalQueries:
@@ -85,7 +88,10 @@ class IntervalQueries:
         # Windows that begin together are in the order of the recordings' keys.
         ordered = sorted(found, key=lambda item: item[0])
         wide = Intervals.of((name, rows) for _, name, rows in ordered).widened(before, after)
-        return wide.within({e.id: _extent(e) for e in self._session.recordings()})
+        snapshot = self._session.snapshot()
+        return wide.within(
+            {name: _extent(snapshot.summaries[snapshot.by_id[name]]) for name in wide.recordings}
+        )
 
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Test which spans of log time of a recording contain any message.
@@ -103,7 +109,7 @@ class IntervalQueries:
         question = self._question
         if not question.returns_all:
             raise UsageError("limit and every cannot be combined with a test for any message.")
-        if recording not in question.recordings or not len(spans):
+        if not len(spans) or not self._asks(recording):
             return np.zeros(len(spans), np.bool_)
         rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
         covered = joined(rows[np.argsort(rows[:, 0], kind="stable")])
@@ -118,12 +124,18 @@ class IntervalQueries:
         inside: NDArray[np.bool_] = first < end
         return inside
 
+    def _asks(self, recording: str) -> bool:
+        """True if a recording belongs to the question."""
+        place = self._session.snapshot().by_id.get(recording, -1)
+        places = self._session.chosen(self._question)
+        row = int(np.searchsorted(places, place))
+        return row < len(places) and int(places[row]) == place
+
     def _times(self) -> Iterator[tuple[RecordingEntry, NDArray[np.int64]]]:
         """Log times of the messages of the answer, by recording."""
         if not self._question.returns_all:
-            plan = self._planner.scan_plan()
-            for run in self._planner.runs(plan):
-                entry_of = [channel.recording for channel in plan.channels]
+            for run in self._planner.runs():
+                entry_of = [channel.recording for channel in run.channels]
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
@@ -133,13 +145,11 @@ class IntervalQueries:
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
-        whole = replace(self._question, bounds=None, during=None)
-        parts = {
-            p.recording.id: p for p in Planner(self._session, whole, self._planner.counters).parts()
-        }
-        for recording, span in RangeResolver(self._session, self._question).spans():
-            if recording.id in parts:
-                yield parts[recording.id], span
+        ranges = RangeResolver(self._session, self._question).spans()
+        for summary, spans in groupby(ranges, key=itemgetter(0)):
+            (part,) = self._planner.parts_in(summary, None, None)
+            for _, span in spans:
+                yield part, span
 
     def _states_in(
         self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
@@ -152,7 +162,7 @@ class IntervalQueries:
             yield clipped(holding.add(np.array([time]), np.array([holds]), counted=False), span)
         for found in self._planner.outcomes(inner):
             yield clipped(holding.add(found.log_time, found.holds), span)
-        yield clipped(holding.finish(span_of(part.recording)[1]), span)
+        yield clipped(holding.finish(extent_of(part.recording)[1]), span)
 
     def _last_before(
         self, part: Part, span: Span, first: Sequence[Part]
@@ -257,9 +267,9 @@ def _steps(
     return differs, last
 
 
-def _extent(entry: RecordingEntry) -> Span:
+def _extent(recording: RecordingSummary) -> Span:
     """Span of log time in which a recording has messages, or may have some by now."""
-    if entry.span is None:
+    if recording.span is None:
         return 0, TIME_LIMIT - 1
-    begin, end = span_of(entry)
-    return begin, TIME_LIMIT - 1 if entry.status == "open" else end
+    begin, end = recording.extent
+    return begin, TIME_LIMIT - 1 if recording.status == "open" else end

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_lists import earlier_and_earlier
-from hybridlog.query.intervals import span_of
 from hybridlog.query.planner import Planner
-from hybridlog.query.times import TimeLike, parse_time
+from hybridlog.query.times import TimeLike, is_relative, parse_time
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
@@ -29,23 +29,36 @@ def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
     """The last message not after a time, in any recording; None if none exists."""
-    candidates: list[tuple[int, int, RecordingEntry]] = []
-    for recording in session.chosen(question.recordings):
-        start, end = span_of(recording)
-        now = parse_time(moment, start=start, end=end)
-        if start < end and start <= now:
-            candidates.append((min(now, end - 1), start, recording))
+    snapshot = session.snapshot()
+    places = session.chosen(question)
+    start, end = snapshot.begin[places], snapshot.end[places]
+    latest = np.minimum(_moments(moment, start, end), end - 1)
+    latest[(start >= end) | (start > latest)] = -1
     best: tuple[tuple[int, str, int], Message] | None = None
     # Ask the recording that could hold the latest message first: it usually does.
-    for latest, start, recording in sorted(candidates, key=itemgetter(0), reverse=True):
-        if best is not None and latest < best[0][0]:
+    while len(latest):
+        row = int(latest.argmax())
+        now = int(latest[row])
+        if now < 0 or (best is not None and now < best[0][0]):
             break
-        found = _last_of(session, question, counters, recording, (start, latest))
+        latest[row] = -1
+        recording = session.entry_of(snapshot.summaries[places[row]])
+        found = _last_of(session, question, counters, recording, (int(start[row]), now))
         if found is not None:
             place = found.log_time_ns, recording.key, found.seq
             if best is None or place > best[0]:
                 best = place, found
     return best[1] if best is not None else None
+
+
+def _moments(
+    moment: TimeLike, start: NDArray[np.int64], end: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """A time in each of some recordings, ns."""
+    if not is_relative(moment):
+        return np.full(len(start), parse_time(moment, start=None, end=None), np.int64)
+    spans = zip(start.tolist(), end.tolist(), strict=True)
+    return np.array([parse_time(moment, start=a, end=b) for a, b in spans], np.int64)
 
 
 def just_before(question: Question, recording: str, begin: int, latest: int) -> Question:
@@ -73,10 +86,8 @@ def _last_of(
         start, latest = span
         for begin in earlier_and_earlier(latest, start):
             narrow = just_before(question, recording.id, begin, latest)
-            planner = Planner(session, narrow, counters)
-            plan = planner.scan_plan()
-            for run in planner.runs(plan):
-                return next(messages_in(plan.channels, run))
+            for run in Planner(session, narrow, counters).runs():
+                return next(messages_in(run))
         return None
     wanted = set(question.topics)
     channels = {

@@ -27,12 +27,10 @@ def in_force(
     Their log time becomes the beginning of the range, which keeps the slice within the
     range. The publish time remains the time at which they were sent.
     """
-    latching: dict[str, set[str]] = {}
-    for channel in Planner(session, question, counters).channels():
-        if depth_of(channel.channel):
-            latching.setdefault(channel.recording.id, set()).add(channel.channel.topic)
     for recording, begin in RangeResolver(session, question).beginnings():
-        topics = sorted(latching.get(recording.id, ()))
+        channels = session.channels(session.entry_of(recording))
+        latching = {c.channel.topic for c in channels if depth_of(c.channel)}
+        topics = sorted(latching.intersection(question.topics))
         if not topics:
             continue
         before = replace(
@@ -54,11 +52,14 @@ def _last(
     session: Session, before: Question, counters: Counters, begin: int
 ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
     """The last messages of each latching channel, oldest first."""
-    planner = Planner(session, before, counters)
-    plan = planner.scan_plan()
-    room = [depth_of(channel.channel) for channel in plan.channels]
+    room: list[int] = []
     found: list[Batch] = []
-    for run in planner.runs(plan):
+    channels: Sequence[RecordedChannel] = ()
+    # The runs of one recording have the same channels.
+    for run in Planner(session, before, counters).runs():
+        if not channels:
+            channels = run.channels
+            room = [depth_of(channel.channel) for channel in channels]
         rows = []
         for row, index in enumerate(run.batch.channel.tolist()):
             if room[index] > 0:
@@ -68,10 +69,10 @@ def _last(
             found.append(run.batch.take(np.array(rows[::-1], np.intp)))
         if not any(room):
             break
-    has_publish_time = np.array([c.channel.has_publish_time for c in plan.channels])
+    has_publish_time = np.array([c.channel.has_publish_time for c in channels])
     for batch in reversed(found):
         batch.publish_time = np.where(
             has_publish_time[batch.channel], batch.publish_time, batch.log_time
         )
         batch.log_time = np.full(len(batch), begin, np.int64)
-        yield batch, plan.channels
+        yield batch, channels

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.index_columns import KeyColumns
     from hybridlog_storage.topic_places import TopicPlace
 
@@ -313,12 +312,9 @@ class Mongo:
         low, high = np.maximum.accumulate(times[:-1, 1]), times[1:, 0]
         is_apart = low < high
         if int(is_apart.sum()) >= (_MOST_APART if most is None else most):
-            own = {part.recording.id for part in parts}
-            others = np.array(
-                [_extent(r) for r in self._session.recordings() if r.id not in own], np.int64
-            ).reshape(-1, 2)
-            before = np.searchsorted(np.sort(others[:, 0]), high, "left")
-            is_apart &= before > np.searchsorted(np.sort(others[:, 1]), low, "right")
+            first, end = self._session.snapshot().others({part.recording.id for part in parts})
+            before = np.searchsorted(np.sort(first), high, "left")
+            is_apart &= before > np.searchsorted(np.sort(end), low, "right")
         groups = np.split(np.arange(len(order)), np.flatnonzero(is_apart) + 1)
         return [
             (
@@ -409,13 +405,6 @@ def _time_of(part: Part) -> tuple[Span, Span | None]:
         return (first, end), part.bounds
     is_whole = low <= first and end <= high
     return (max(first, low), min(end, high)), None if is_whole else part.bounds
-
-
-def _extent(entry: RecordingEntry) -> Span:
-    """The log time in which a recording may have messages."""
-    if entry.status == "open" or entry.span is None:
-        return 0, TIME_LIMIT - 1
-    return entry.span[0], entry.span[1] + 1
 
 
 def _between(place: TopicPlace, span: Span) -> _Filter:

@@ -1,0 +1,141 @@
+"""All recordings of a store at one moment, in short, to choose among them.
+
+Questions choose recordings here by topic, time and name. Only the chosen ones are read from
+the catalog and compared with their files, so the cost of a question depends on what it is
+about, not on what else is in the store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.summary import RecordingSummary, TopicType
+
+UNFINISHED = frozenset({"open", "unfinished"})
+"""Statuses of recordings that may have ended, or grown, since the snapshot."""
+_LATEST = np.iinfo(np.int64).max
+
+
+class Snapshot:
+    """The summaries of all recordings. Unchangeable, so it is safe for many threads.
+
+    Args:
+        summaries: In any order.
+        topics: Topics and their types, by the hash that summaries have.
+
+    Attributes:
+        summaries: Oldest log time first, empty recordings last.
+        begin: int64[n], first log time of each, ns.
+        end: int64[n], one past the last log time of each, ns; both count lost messages.
+        is_open: bool[n], whether each may have later messages by now.
+    """
+
+    def __init__(
+        self,
+        summaries: Iterable[RecordingSummary],
+        topics: Mapping[str, Sequence[TopicType]],
+    ) -> None:
+        self.summaries = sorted(
+            summaries, key=lambda one: (one.span is None, one.span or (0, 0), one.label)
+        )
+        self._topics = topics
+        numbers = {digest: number for number, digest in enumerate(topics)}
+        extents = [summary.extent for summary in self.summaries]
+        bounds = np.array(extents, np.int64).reshape(-1, 2)
+        self.begin: NDArray[np.int64] = bounds[:, 0].copy()
+        self.end: NDArray[np.int64] = bounds[:, 1].copy()
+        open_ones = [one.status in UNFINISHED for one in self.summaries]
+        self.is_open: NDArray[np.bool_] = np.array(open_ones, np.bool_)
+        self._set = np.array([numbers[one.topics] for one in self.summaries], np.intp)
+        self._having: dict[str, NDArray[np.intp]] = {}
+
+    def __len__(self) -> int:
+        return len(self.summaries)
+
+    @cached_property
+    def by_id(self) -> dict[str, int]:
+        """The position of each recording in `summaries`, by id."""
+        return {summary.id: place for place, summary in enumerate(self.summaries)}
+
+    @cached_property
+    def by_label(self) -> dict[str, int]:
+        """The position of each recording, by label."""
+        return {summary.label: place for place, summary in enumerate(self.summaries)}
+
+    @cached_property
+    def topics(self) -> list[str]:
+        """Names of all topics, sorted; includes those whose messages are all lost."""
+        return sorted({topic.topic for topics in self._topics.values() for topic in topics})
+
+    def topics_of(self, summary: RecordingSummary) -> set[str]:
+        """Names of the topics of a recording."""
+        return {topic.topic for topic in self._topics[summary.topics]}
+
+    def having(self, topics: Collection[str]) -> NDArray[np.intp]:
+        """Positions of the recordings that have any of some topics, in order."""
+        if len(topics) == 1:
+            return self._having_topic(*topics)
+        wanted = set(topics)
+        sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
+        return self._of_sets(sets)
+
+    def _having_topic(self, topic: str) -> NDArray[np.intp]:
+        found = self._having.get(topic)
+        if found is None:
+            sets = [any(t.topic == topic for t in held) for held in self._topics.values()]
+            found = self._having[topic] = self._of_sets(sets)
+        return found
+
+    def _of_sets(self, sets: Sequence[bool]) -> NDArray[np.intp]:
+        if not sets:
+            return np.empty(0, np.intp)
+        return np.flatnonzero(np.array(sets, np.bool_)[self._set])
+
+    def between(self, places: NDArray[np.intp], begin: int, end: int) -> NDArray[np.intp]:
+        """Those of some recordings that overlap a range of log time.
+
+        Args:
+            places: Their positions.
+            begin: Begin of the range, ns.
+            end: End of the range, ns, exclusive.
+        """
+        if begin >= end:
+            return places[:0]
+        low, high = (max(min(bound, _LATEST), -_LATEST) for bound in (begin, end))
+        return places[(self.begin[places] < high) & (self.end[places] > low)]
+
+    def others(self, ids: Collection[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Begin and end of the log time in which all recordings but some may have messages."""
+        is_other = self.begin < self.end
+        is_other |= self.is_open
+        is_other[[self.by_id[recording] for recording in ids if recording in self.by_id]] = False
+        begin = np.where(self.is_open, 0, self.begin)
+        end = np.where(self.is_open, _LATEST, self.end)
+        return begin[is_other], end[is_other]
+
+    def differing(self, places: NDArray[np.intp]) -> list[RecordingSummary]:
+        """One of the recordings at some positions for each set of topics and types."""
+        _, firsts = np.unique(self._set[places], return_index=True)
+        return [self.summaries[place] for place in places[np.sort(firsts)].tolist()]
+
+    def named(self, name: str) -> list[int]:
+        """Positions of the recordings that a name may mean.
+
+        It is a label or an id, else a name, else the beginning of a label, else of an id.
+        """
+        place = self.by_label.get(name, self.by_id.get(name))
+        if place is not None:
+            return [place]
+        everything = list(enumerate(self.summaries))
+        return (
+            [place for place, one in everything if one.name == name]
+            or [place for place, one in everything if one.label.startswith(name)]
+            or [place for place, one in everything if len(name) >= 4 and one.id.startswith(name)]
+        )

@@ -1,0 +1,67 @@
+"""What work costs, counted: the same on every machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import hybridlog as hl
+from tests.servers.commands import commands
+
+
+@dataclass
+class Cost:
+    """The cost of one piece of work.
+
+    Attributes:
+        commands: Commands that MongoDB got.
+        statements: SQL statements that the catalog got.
+        opened: Files and folders opened or listed, below the store.
+    """
+
+    commands: list[str] = field(default_factory=list)
+    statements: list[str] = field(default_factory=list)
+    opened: list[str] = field(default_factory=list)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many of each."""
+        return {
+            "commands": len(self.commands),
+            "statements": len(self.statements),
+            "opened": len(self.opened),
+        }
+
+
+_heard: list[Cost] = []
+
+
+_PYTHON = (".py", ".pyc", ".so", "__pycache__")
+"""Endings of files that Python opens for itself."""
+
+
+def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    if _heard and event in {"open", "os.listdir", "os.scandir"}:
+        path = str(arguments[0])
+        if not path.endswith(_PYTHON) and "site-packages" not in path:
+            _heard[-1].opened.append(path)
+
+
+sys.addaudithook(_hear)
+
+
+def cost_of(store: hl.Store, work: Callable[[], object]) -> Cost:
+    """The cost of some work on an open store whose index is connected with `commands` heard."""
+    cost = Cost()
+    with commands() as sent:
+        store.catalog._db.set_trace_callback(cost.statements.append)
+        _heard.append(cost)
+        try:
+            work()
+        finally:
+            _heard.pop()
+            store.catalog._db.set_trace_callback(None)
+    cost.commands = [one.name for one in sent]
+    return cost

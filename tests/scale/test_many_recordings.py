@@ -1,0 +1,208 @@
+"""What a question costs depends on what it is about, not on what else the store holds."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from tests.imports import ROOT
+from tests.scale.cost import cost_of
+
+DAY = 86_400 * 10**9
+START = 18_262 * DAY  # 2020-01-01
+FEW, MANY = 10, 1_000
+MESSAGES = 12
+
+
+def write_day(path: Path, day: int) -> None:
+    """A log of one day: a few messages of two topics."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        schema = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
+        topics = [writer.register_channel(name, "ros1", schema) for name in ("/pose", "/imu")]
+        for number in range(MESSAGES):
+            time = START + day * DAY + number * 10**9
+            payload = struct.pack("<f", number)
+            for channel in topics:
+                writer.add_message(channel, time, payload, time)
+        writer.finish()
+
+
+def fill(path: Path, count: int) -> None:
+    log = path.parent / "day.mcap"
+    with hl.open(path, create=True) as store:
+        for day in range(count):
+            write_day(log, day)
+            store.record(log, name=f"day{day:05d}")
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """A store of few recordings, and one of many."""
+    top = tmp_path_factory.mktemp("scale")
+    for count in (FEW, MANY):
+        (top / str(count)).mkdir()
+        fill(top / str(count) / "store", count)
+    return {count: top / str(count) / "store" for count in (FEW, MANY)}
+
+
+def day(number: int) -> tuple[int, int]:
+    return START + number * DAY, START + (number + 1) * DAY
+
+
+Work = Callable[[hl.Store], object]
+ASKED: dict[str, Work] = {
+    "at": lambda store: store.topic("pose").at(day(3)[1]),
+    "fetch of a day": lambda store: list(store.topic("pose").between(*day(4))),
+    "frame of a day": lambda store: store.topic("pose").between(*day(4)).to_pandas(),
+    "count of a day": lambda store: store.topic("pose").between(*day(4)).count(),
+    "count with a predicate": lambda store: (
+        store.topic("pose").where("data > 4.5").between(*day(4)).count()
+    ),
+    "filter of MongoDB": lambda store: (
+        store.topic("pose").where({"$expr": {"$gt": ["$data", 4.5]}}).between(*day(4)).count()
+    ),
+    "documents of a day": lambda store: list(store.topic("pose").between(*day(4)).documents()),
+    "intervals of a day": lambda store: (
+        store.topic("pose").where("data > 4.5").between(*day(4)).intervals()
+    ),
+    "first of all": lambda store: store.topic("pose").first(),
+    "last of all": lambda store: store.topic("pose").reverse().first(),
+    "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
+    "topics": lambda store: store.topics(),
+    "info of one": lambda store: store.select(["day00004"]),
+}
+"""Questions about little."""
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_questions_about_little_cost_little(stores: dict[int, Path], name: str) -> None:
+    counts = {}
+    for count, path in stores.items():
+        with hl.open(path, require_database=True) as store:
+            ASKED[name](store)
+            store.refresh()
+            store.connect()
+            counts[count] = cost_of(store, lambda store=store: ASKED[name](store)).counts
+    assert counts[MANY] == counts[FEW]
+
+
+def test_answers_are_right(stores: dict[int, Path]) -> None:
+    for count, path in stores.items():
+        with hl.open(path) as store:
+            pose = store.topic("pose")
+            assert pose.count() == count * MESSAGES
+            assert pose.where("data > 4.5").count() == count * (MESSAGES - 5)
+            assert [m.log_time_ns for m in pose.every(MESSAGES)] == [
+                day(number)[0] for number in range(count)
+            ]
+            frame = pose.between(day(3)[0], day(6)[0]).to_pandas()
+            assert list(frame["recording"].unique()) == ["day00003", "day00004", "day00005"]
+            assert pose.at(day(5)[0] - 1).log_time_ns == day(4)[0] + (MESSAGES - 1) * 10**9
+
+
+def test_opening_asks_once(stores: dict[int, Path]) -> None:
+    """The catalog is read once, and MongoDB is asked for its mark and its size only."""
+    counts = {}
+    for count, path in stores.items():
+        with hl.open(path, require_database=True) as store:
+            store.refresh()
+            counts[count] = cost_of(store, store.connect).counts
+    assert counts[MANY] == counts[FEW]
+    assert counts[MANY]["opened"] < 20
+
+
+CHANGES: dict[str, Work] = {
+    "tag": lambda store: store.tag("day00004", place="hall"),
+    "note": lambda store: store.note("day00004", "all quiet"),
+    "rename": lambda store: store.rename("day00004", "fourth"),
+    "rename back": lambda store: store.rename("fourth", "day00004"),
+    "verify of one": lambda store: store.verify(["day00004"]),
+    "reindex of one": lambda store: store.reindex(["day00004"]),
+    "repair of one": lambda store: store.repair(["day00004"]),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_work_on_one_recording_costs_the_same(stores: dict[int, Path], name: str) -> None:
+    counts = {}
+    for count, path in stores.items():
+        with hl.open(path, require_database=True) as store:
+            store.verify(["day00003"])  # what Python loads is loaded
+            counts[count] = cost_of(store, lambda store=store: CHANGES[name](store)).counts
+    assert counts[MANY] == counts[FEW]
+
+
+def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Path) -> None:
+    """It is recorded, and removed again."""
+    counts, removals = {}, {}
+    write_day(tmp_path / "more.mcap", 5_000)
+    write_day(tmp_path / "before.mcap", 5_001)
+    for count, path in stores.items():
+        with hl.open(path, require_database=True) as store:
+            store.record(tmp_path / "before.mcap")
+            counts[count] = cost_of(
+                store, lambda store=store: store.record(tmp_path / "more.mcap")
+            ).counts
+            store.remove("before")
+            store.connect()
+            removals[count] = cost_of(store, lambda store=store: store.remove("more")).counts
+            assert store.topic("pose").count() == count * MESSAGES
+    assert counts[MANY] == counts[FEW]
+    assert removals[MANY] == removals[FEW]
+
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
+import hybridlog as hl
+with hl.open(sys.argv[1]) as store:
+    pose = store.topic("pose")
+    print(pose.count(), pose.where("data > 4.5").count(), sum(1 for _ in pose))
+    print(len(pose.to_pandas()), len(store.reindex()), len(store.verify().findings))
+"""
+
+
+def test_all_of_it_works_with_1024_files(stores: dict[int, Path]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(stores[MANY])],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "storage")])},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=280,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    messages = MANY * MESSAGES
+    assert done.stdout.split() == [
+        str(n) for n in (messages, messages - MANY * 5, messages, messages, MANY, 0)
+    ]
+
+
+def test_a_name_is_found_among_many_of_the_same(tmp_path: Path) -> None:
+    """Recordings of one name get numbers, and finding a free one does not try them all."""
+    with hl.open(tmp_path / "store", create=True) as store:
+        for number in range(2, 300):
+            (store.directory.recordings / f"talk-{number}").mkdir()
+        (store.directory.recordings / "talk").mkdir()
+        tried = []
+        has = type(store.directory).has
+
+        def counted(self: object, label: str) -> bool:
+            tried.append(label)
+            return has(store.directory, label)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(type(store.directory), "has", counted)
+            assert store.directory.new_recording("talk") == "talk-300"
+        assert len(tried) < 20

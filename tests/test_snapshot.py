@@ -1,0 +1,194 @@
+"""Choosing recordings: against the same choice made one recording at a time."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog import session
+from hybridlog.query import planner
+from hybridlog.snapshot import Snapshot
+from hybridlog_storage.errors import TopicError
+from hybridlog_storage.summary import (
+    RecordingSummary,
+    TopicType,
+    hash_of,
+    topics_from_json,
+    topics_to_json,
+)
+
+TOPICS = [f"/{name}" for name in "abcd"]
+
+
+def summary(number: int, span: tuple[int, int] | None, topics: list[str], **other: Any) -> Any:
+    kinds = topics_to_json(TopicType(topic, "json", "") for topic in topics)
+    values: dict[str, Any] = {
+        "id": f"{number:032x}",
+        "label": f"r{number}",
+        "name": f"run {number % 3}",
+        "tags": {},
+        "source": {},
+        "created": 0,
+        "status": "complete",
+        "span": span,
+        "extent": (0, 0) if span is None else (span[0], span[1] + 1),
+        "topics": hash_of(kinds),
+        "topic_count": len(topics),
+        "messages": 1,
+        "stored_bytes": 1,
+        "segments": 1,
+        "has_losses": False,
+        "has_lost_segments": False,
+        "look": "",
+        **other,
+    }
+    return RecordingSummary(**values), kinds
+
+
+SPANS = st.none() | st.tuples(st.integers(0, 50), st.integers(0, 20)).map(
+    lambda pair: (pair[0], pair[0] + pair[1])
+)
+MANY = st.lists(st.tuples(SPANS, st.lists(st.sampled_from(TOPICS), unique=True)), max_size=12)
+
+
+@given(MANY, st.lists(st.sampled_from(TOPICS)), st.integers(0, 60), st.integers(0, 60))
+def test_recordings_are_chosen_by_topic_and_time(
+    found: list[tuple[tuple[int, int] | None, list[str]]], topics: list[str], begin: int, end: int
+) -> None:
+    made = [summary(number, span, held) for number, (span, held) in enumerate(found)]
+    kinds = {one.topics: topics_from_json(text) for one, text in made}
+    snapshot = Snapshot([one for one, _ in made], kinds)
+    order = sorted(
+        range(len(found)),
+        key=lambda n: (found[n][0] is None, found[n][0] or (0, 0), f"r{n}"),
+    )
+    assert [one.label for one in snapshot.summaries] == [f"r{n}" for n in order]
+    assert snapshot.topics == sorted({topic for _, held in found for topic in held})
+    having = snapshot.having(topics)
+    wanted = [n for n in order if set(found[n][1]) & set(topics)]
+    assert [snapshot.summaries[place].label for place in having] == [f"r{n}" for n in wanted]
+    inside = [
+        n
+        for n in wanted
+        if (span := found[n][0]) is not None and begin < end and span[0] < end and span[1] >= begin
+    ]
+    between = snapshot.between(having, begin, end)
+    assert [snapshot.summaries[place].label for place in between] == [f"r{n}" for n in inside]
+    examples = snapshot.differing(having)
+    assert {frozenset(snapshot.topics_of(one)) for one in examples} == {
+        frozenset(found[n][1]) for n in wanted
+    }
+    assert len(examples) == len({frozenset(found[n][1]) for n in wanted})
+    first, last = snapshot.others({f"{n:032x}" for n in wanted})
+    others = [span for n, (span, _) in enumerate(found) if n not in wanted and span is not None]
+    assert sorted(zip(first.tolist(), last.tolist(), strict=True)) == sorted(
+        (a, b + 1) for a, b in others
+    )
+
+
+def test_a_name_means_a_label_before_all_else() -> None:
+    made = [
+        summary(1, (0, 1), ["/a"], label="x"),
+        summary(2, (1, 2), ["/a"], label="y", name="x"),
+        summary(3, (2, 3), ["/a"], label="yard", name="other"),
+    ]
+    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
+    assert snapshot.named("x") == [0]
+    assert snapshot.named("other") == [2]
+    assert snapshot.named("ya") == [2]
+    assert snapshot.named("y") == [1]
+    assert snapshot.named(f"{2:032x}") == [1]
+    assert snapshot.named(f"{3:032x}"[:4]) == [0, 1, 2]
+    assert snapshot.named("no") == []
+
+
+def test_an_open_recording_may_have_messages_at_any_time() -> None:
+    made, _ = summary(1, (5, 6), ["/a"], status="open")
+    snapshot = Snapshot([made], {made.topics: ()})
+    first, last = snapshot.others(())
+    assert (first.tolist(), last.tolist()) == ([0], [np.iinfo(np.int64).max])
+
+
+# Messages of recordings that overlap here and there.
+
+
+@pytest.fixture(scope="module")
+def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Fourteen recordings, and the log times of their messages."""
+    path = tmp_path_factory.mktemp("overlapping")
+    dice = random.Random(5)
+    times: dict[str, list[int]] = {}
+    with hl.open(path / "store", create=True) as store:
+        for number in range(14):
+            begin = 10**9 + number * 10_000 + dice.choice([0, 0, -15_000, 9_000])
+            own = sorted(begin + dice.randrange(8_000) for _ in range(30))
+            log = path / f"{number}.mcap"
+            with log.open("wb") as file:
+                writer = Writer(file)
+                writer.start()
+                schema = writer.register_schema("n", "jsonschema", b"{}")
+                channel = writer.register_channel("/n", "json", schema)
+                for n, time in enumerate(own):
+                    writer.add_message(channel, time, json.dumps({"n": n}).encode(), time)
+                writer.finish()
+            times[store.record(log).entry.id] = own
+        yield store, times
+
+
+@pytest.mark.parametrize("more", [1, 2, 64])
+@pytest.mark.parametrize("backwards", [False, True])
+def test_messages_are_in_order_however_recordings_are_grouped(
+    overlapping: Any, monkeypatch: pytest.MonkeyPatch, more: int, backwards: bool
+) -> None:
+    monkeypatch.setattr(planner, "_MORE_TOGETHER", more)
+    store, times = overlapping
+    wanted = sorted(
+        (time, recording, n) for recording, own in times.items() for n, time in enumerate(own)
+    )
+    query = store.topic("/n")
+    if backwards:
+        query, wanted = query.reverse(), wanted[::-1]
+
+    def seen(asked: hl.Query) -> list[tuple[int, str, int]]:
+        return [(m.log_time_ns, m.recording, m.fields["n"]) for m in asked]
+
+    assert seen(query) == wanted
+    assert seen(query.limit(50)) == wanted[:50]
+    assert seen(query.every(7)) == wanted[::7]
+    begin, end = wanted[40][0], wanted[300][0]
+    low, high = min(begin, end), max(begin, end)
+    cut = [one for one in wanted if low <= one[0] < high]
+    assert seen(query.between(low, high)) == cut
+    assert query.between(low, high).count() == len(cut)
+    assert query.between(low, high).to_pandas()["n"].tolist() == [n for *_, n in cut]
+    late = [one for one in wanted if one[2] >= 20]
+    assert seen(query.where("n >= 20")) == late
+    moment = wanted[77][0]
+    assert store.topic("/n").at(moment).log_time_ns == moment
+
+
+def test_a_recording_is_read_when_its_turn_comes(
+    overlapping: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, _ = overlapping
+    read = []
+    real = session.current_entry
+
+    def counted(*arguments: Any) -> Any:
+        read.append(arguments[2].label)
+        return real(*arguments)
+
+    monkeypatch.setattr(session, "current_entry", counted)
+    store.refresh()
+    next(iter(store.topic("/n")))
+    assert 1 <= len(read) < 6
+    with pytest.raises(TopicError):
+        store.entry("nothing")
