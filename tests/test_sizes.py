@@ -135,6 +135,7 @@ def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> 
         asked[collection] += 1
         return answers[collection]
 
+    store.connect()
     monkeypatch.setattr(Database, "stats", stats)
     rows = by_name(store.sizes().rows)
     assert asked == {"a": 1, SHARED: 1}
