@@ -28,6 +28,7 @@ from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import (
     CatalogError,
     ConnectionBrokenError,
+    ConnectionLostError,
     DatabaseError,
     DiskFullError,
     HybridlogError,
@@ -168,6 +169,9 @@ class Session:
             if self.connected is not None and self._is_indexed:
                 return self.connected
             try:
+                if self.connected is not None:  # it may have been lost: a new one follows
+                    with suppress(ConnectionLostError):
+                        return self._connect(recordings)
                 for tried in range(1, _TRIES):
                     with suppress(ConnectionBrokenError):
                         return self._connect(recordings)
@@ -268,7 +272,9 @@ class Session:
             DatabaseError: as for `database_for`.
         """
         if self.connected is not None and self.connection.may_write:
-            return self.connected
+            if self.connected.ping():
+                return self.connected
+            self.disconnect()
         return self.database_for(purpose, writes=True)
 
     def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:

@@ -567,7 +567,8 @@ class Store:
         edit.append(self.directory, self.catalog, entry, lines)
         connected = self.session.connected
         if connected is not None and self.session.connection.may_write:
-            index.mirror(self.catalog, connected, entry.id)
+            with suppress(ConnectionLostError):  # the next connection mirrors it
+                index.mirror(self.catalog, connected, entry.id)
         self.refresh()
         return self.entry(entry.id)
 

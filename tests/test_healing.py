@@ -359,6 +359,35 @@ def test_work_on_an_index_that_ends_is_done_again(store: Path, work: str) -> Non
         assert not opened.verify().findings
 
 
+def test_a_connection_about_some_recordings_is_made_again(store: Path) -> None:
+    """It needs a look at the others, which finds that its mongod has ended."""
+    with hl.open(store) as opened:
+        opened.session.connect([opened.select(["one"])[0]])
+        kill_mongod(store)
+        assert opened.verify().index
+        assert opened.without_database is None
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_recording_is_made_and_edited_though_its_mongod_ended(
+    store: Path, tmp_path: Path, *, waits: bool
+) -> None:
+    log = tmp_path / "three.bag"
+    write_bag(log, duration_s=1, seed=3, topics=TOPICS)
+    with hl.open(store, require_database=True) as opened:
+        kill_mongod(store)
+        if waits:
+            ended(store)
+        report = opened.record(log)
+        assert report.indexed == report.entry.messages > 0
+        kill_mongod(store)
+        assert opened.rename("one", "first").label == "first"
+        assert opened.tag("first", place="lab").tags == {"place": "lab"}
+        verified = opened.verify()
+        assert verified.index
+        assert not verified.findings
+
+
 # --- resets, handles, roles ---
 
 
