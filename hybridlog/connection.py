@@ -71,6 +71,9 @@ class Connection:
             place = lease.place_of(self._directory)
             self.may_write = database.may_write()
             mark = state.mark()
+            if self._uri == EMBEDDED and mark is not None and mark.get("id") != place["id"]:
+                database.drop_all()  # the store is a copy that has an id of its own now
+                mark = None
             is_new = lease.check(mark, place, database, embedded=self._uri == EMBEDDED)
             if (is_new or mark is None or "index" not in mark) and self.may_write:
                 mark = state.claim(place)

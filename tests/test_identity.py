@@ -235,6 +235,23 @@ def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     assert documents(uri) == before
 
 
+def test_a_copy_with_an_embedded_index_gets_one_of_its_own(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", 100)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(log, name="one")
+    copy = tmp_path / "copy"
+    shutil.copytree(tmp_path / "store", copy)
+    become_another(copy, None)
+    with hl.open(copy, require_database=True) as store:
+        assert store.verify().index
+        assert store.record(log, name="two", again=True).indexed == COUNT
+        assert not store.verify().findings
+        store.remove("one")
+    with hl.open(tmp_path / "store", require_database=True) as store:
+        assert answers(store) == right()
+        assert not store.verify().findings
+
+
 def test_a_moved_store_takes_its_index_along(place: Path, uri: str, tmp_path: Path) -> None:
     moved = place.rename(tmp_path / "moved")
     with hl.open(moved, mongo=uri) as store:
