@@ -17,7 +17,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -135,7 +135,17 @@ def command(**parameters: Any) -> None:
     path = _path(choices, form)
     started = time.monotonic()
     with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
-        query = _query(store, choices)
+        query = asked = _query(store, choices)
+        between = choices.between if choices.clock == "log" else None
+        if choices.at is not None:
+            try:
+                query = asked.at_time(choices.at)
+            except TopicError:
+                if not choices.quiet:
+                    print_gaps(asked, ("start", choices.at))
+                raise
+            begin, _ = query.question.bounds or ("start", None)
+            between = str(begin), choices.at  # what is lost from there on may be later
         if choices.count:
             output.say(str(query.count()))
         else:
@@ -143,7 +153,7 @@ def command(**parameters: Any) -> None:
         sys.stdout.flush()
         if not choices.quiet:
             print_cost(query.counters, time.monotonic() - started, count=choices.count)
-            print_gaps(query, choices.between if choices.clock == "log" else None)
+            print_gaps(asked, between)
 
 
 def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:
@@ -180,8 +190,6 @@ def _query(store: Store, choices: _Choices) -> Query:
         query = query.where(predicate)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
-    if choices.at is not None:
-        return query.at_time(choices.at)
     if choices.every > 1:
         query = query.every(choices.every)
     if choices.reverse:
