@@ -21,6 +21,7 @@ import numpy as np
 
 from hybridlog_storage.catalog import ChunkEntry
 from hybridlog_storage.chunk import StoredChunk
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import DatabaseError, SegmentError
 from hybridlog_storage.index_documents import with_prefix
 from hybridlog_storage.index_state import IndexState
@@ -115,7 +116,9 @@ class _Few:
             # A copy, since its buffer may be a hundred times as large.
             batch = replace(chunk.batch, buffer=bytes(chunk.batch.buffer))
             waits = replace(chunk, batch=batch)
-            self._channels.update(channels)
+            # Not all channels of the recording, which may be thousands.
+            own = distinct(batch.channel).tolist()
+            self._channels.update({number: channels[number] for number in own})
             self._chunks.append(waits)
             if not is_in_tables:
                 self._untabled.append(waits)

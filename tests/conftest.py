@@ -34,6 +34,7 @@ settings.register_profile(
 settings.load_profile("any machine")
 
 LONGEST = (
+    "test_many_recordings",
     "test_mutants",
     "test_model",
     "test_smoke",
@@ -91,6 +92,7 @@ SLOW = frozenset(
         "query/test_engines.py",
         "query/test_intervals.py",
         "query/test_latest.py",
+        "scale/test_many_recordings.py",
         "schema/test_codec.py",
         "schema/test_wire.py",
         "servers/test_commands.py",

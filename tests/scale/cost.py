@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
+
+import pytest
 
 import hybridlog as hl
 from tests.servers.commands import commands
@@ -19,11 +23,13 @@ class Cost:
         commands: Commands that MongoDB got.
         statements: SQL statements that the catalog got.
         opened: Files and folders opened or listed, below the store.
+        bytes_read: Bytes read from files of the store.
     """
 
     commands: list[str] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
     opened: list[str] = field(default_factory=list)
+    bytes_read: int = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -32,6 +38,7 @@ class Cost:
             "commands": len(self.commands),
             "statements": len(self.statements),
             "opened": len(self.opened),
+            "bytes read": self.bytes_read,
         }
 
 
@@ -52,6 +59,24 @@ def _hear(event: str, arguments: tuple[Any, ...]) -> None:
 sys.addaudithook(_hear)
 
 
+@contextmanager
+def _counting_reads(cost: Cost) -> Iterator[None]:
+    """Count what the calls return that segments, tables and journals are read with."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("pread", "preadv", "read"):
+            patch.setattr(os, name, _counted(getattr(os, name), cost))
+        yield
+
+
+def _counted(read: Callable[..., Any], cost: Cost) -> Callable[..., Any]:
+    def counted(*arguments: Any) -> Any:
+        found = read(*arguments)
+        cost.bytes_read += found if isinstance(found, int) else len(found)
+        return found
+
+    return counted
+
+
 def cost_of(store: hl.Store, work: Callable[[], object]) -> Cost:
     """The cost of some work on an open store whose index is connected with `commands` heard."""
     cost = Cost()
@@ -59,7 +84,8 @@ def cost_of(store: hl.Store, work: Callable[[], object]) -> Cost:
         store.catalog._db.set_trace_callback(cost.statements.append)
         _heard.append(cost)
         try:
-            work()
+            with _counting_reads(cost):
+                work()
         finally:
             _heard.pop()
             store.catalog._db.set_trace_callback(None)

@@ -49,10 +49,12 @@ def fill(path: Path, count: int) -> None:
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """A store of few recordings, and one of many."""
     top = tmp_path_factory.mktemp("scale")
-    for count in (FEW, MANY):
-        (top / str(count)).mkdir()
-        fill(top / str(count) / "store", count)
-    return {count: top / str(count) / "store" for count in (FEW, MANY)}
+    # Names of one length, since journals hold paths.
+    paths = {count: top / f"{count:05d}" / "store" for count in (FEW, MANY)}
+    for count, path in paths.items():
+        path.parent.mkdir()
+        fill(path, count)
+    return paths
 
 
 def day(number: int) -> tuple[int, int]:
