@@ -24,6 +24,7 @@ from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
+from hybridlog_storage import files
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import (
     CatalogError,
@@ -33,6 +34,7 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HybridlogError,
     IndexChangedError,
+    StoreError,
     TopicError,
 )
 from hybridlog_storage.messages import Channel, Schema
@@ -379,7 +381,16 @@ class Session:
             entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
         except CatalogError:
             self.catalog.rebuild()
+            self.invalidate()
+            if self.connected is not None:
+                # Only the index has the list of unreadable chunks now.
+                with suppress(HybridlogError):
+                    self.connect()
             entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
+        except StoreError:
+            if self.directory.has(summary.label):
+                raise
+            return None  # another process has just renamed or removed it
         if entry is not None and is_new:
             # The index may have what the files had before.
             self._doubted.add(entry.id)
@@ -705,5 +716,5 @@ def _make_room(opened: dict[Any, Any]) -> None:
 
     It is closed when the last thread that reads from it also drops it.
     """
-    if len(opened) >= _MAX_OPEN_SEGMENTS:
+    if len(opened) >= files.most_open(_MAX_OPEN_SEGMENTS):
         del opened[next(iter(opened))]

@@ -160,7 +160,7 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
         found[name] = [
-            bson.encode({**d, "index": {**d.get("index", {}), "turn": 0}})
+            bson.encode({**d, "index": {**d["index"], "turn": 0}} if "label" in d else d)
             for d in documents
             if d["_id"] != "turn"
         ]

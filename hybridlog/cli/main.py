@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 import traceback
+from pathlib import Path
 from typing import NoReturn, TextIO
 
 from hybridlog.cli import import_blocker, signals
@@ -19,6 +20,9 @@ def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
     signals.install()
     import_blocker.install()
+    # A shell may have closed them: `hybridlog ls >&-`.
+    sys.stdout = sys.stdout or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         # Characters that the terminal's encoding lacks are shown as escapes.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

@@ -225,6 +225,11 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
                 files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
 
 
+def are_more_than(directory: StoreDirectory, recordings: int) -> bool:
+    """True if there are tables of more recordings than these."""
+    return any(len(_names(directory, top)) > recordings for top in (TABLES, PARTS))
+
+
 def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> None:
     """Remove tables of removed recordings.
 

@@ -419,7 +419,7 @@ class Tables:
         with self._lock:
             if generation == self._generation:
                 self._found[key] = found
-                while len(self._found) > _OPEN_FILES:
+                while len(self._found) > files.most_open(_OPEN_FILES):
                     self._found.popitem(last=False)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
@@ -513,7 +513,7 @@ class Tables:
         found = _SmallFile(file, dict(zip(counts, begins, strict=False)))
         with self._lock:
             self._small[path] = found
-            while len(self._small) > _OPEN_FILES:
+            while len(self._small) > files.most_open(_OPEN_FILES):
                 self._small.popitem(last=False)
         return found
 

@@ -92,7 +92,7 @@ create table recordings (
     crc integer not null) without rowid;
 create table summaries (
     id text primary key, summary text not null, crc integer not null,
-    indexed text not null default '') without rowid;
+    indexed text not null default '', damage integer not null default 0) without rowid;
 create table topics (hash text primary key, topics text not null) without rowid;
 create table fingerprints (
     fingerprint text not null, id text not null, primary key (fingerprint, id)) without rowid;
@@ -337,12 +337,20 @@ class ChunkEntry:
         return (min(firsts), max(lasts)) if firsts and lasts else None
 
 
+def _damage_crc(db: sqlite3.Connection, recording: str) -> int:
+    """Checksum of a recording's list of unreadable chunks; 0 without one."""
+    row = db.execute("select crc from damage where id = ?", (recording,)).fetchone()
+    if row is None:
+        return 0
+    return row[0] if isinstance(row[0], int) else -1
+
+
 def _put_summary(db: sqlite3.Connection, described: Described) -> None:
     entry, text = described.entry, described.summary.to_json()
     topics = topics_to_json(described.topics)
     db.execute("insert or replace into topics values (?, ?)", (hash_of(topics), topics))
-    row = entry.id, text, _text_crc(text)
-    db.execute("insert or replace into summaries values (?, ?, ?, '')", row)
+    row = entry.id, text, _text_crc(text), _damage_crc(db, entry.id)
+    db.execute("insert or replace into summaries values (?, ?, ?, '', ?)", row)
     fingerprint = entry.source.get("fingerprint")
     db.execute("delete from fingerprints where id = ?", (entry.id,))
     if isinstance(fingerprint, str):
@@ -775,8 +783,16 @@ class Catalog:
         """
         with self._reading():
             self._follow()
-            rows = self._db.execute("select summary, crc, indexed from summaries").fetchall()
-            good = [(text, index) for text, crc, index in rows if _text_crc(text) == crc]
+            asked = "select summary, crc, indexed, damage, id from summaries"
+            rows = self._db.execute(asked).fetchall()
+            lists = self._db.execute("select id, chunks, crc from damage").fetchall()
+            whole = {row[0]: row[2] for row in lists if _crc(*row[:2]) == row[2]}
+            # The index has the list of unreadable chunks, too.
+            good = [
+                (text, index if whole.get(recording, 0) == damage else "")
+                for text, crc, index, damage, recording in rows
+                if _text_crc(text) == crc
+            ]
             if len(good) < len(rows) and not self._is_sound():
                 raise CatalogError(f"The catalog {self._path} is damaged.")
         values = json.loads(f"[{','.join(text for text, _ in good)}]")
@@ -889,6 +905,8 @@ class Catalog:
                 rows = [(*place, reason) for place, reason in sorted(damage.items())]
                 row = (recording, json.dumps(rows))
                 db.execute("insert into damage values (?, ?, ?)", (*row, _crc(*row)))
+            asked = "update summaries set damage = ? where id = ?"
+            db.execute(asked, (_damage_crc(db, recording), recording))
 
         self._change(work)
 

@@ -15,6 +15,7 @@ order of steps, to fail at a step, or to lose unsynced data.
 from __future__ import annotations
 
 import os
+import resource
 import secrets
 import stat
 from collections.abc import Iterator, Sequence
@@ -220,6 +221,12 @@ def names_in(fd: int) -> dict[str, os.stat_result]:
             with suppress(FileNotFoundError):
                 found[entry.name] = entry.stat(follow_symlinks=False)
     return found
+
+
+def most_open(most: int) -> int:
+    """Number of files that a cache may hold open: some, or an eighth of what is allowed."""
+    allowed, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return most if allowed < 0 else max(min(most, allowed // 8), 4)
 
 
 def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:

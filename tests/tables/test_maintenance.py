@@ -130,6 +130,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     # As if the recorder had been killed while it wrote.
     (entry,) = few.recordings()
     IndexState(database).put(entry, "open", turn=1)
+    few.catalog.put_indexed([entry.id], "")
     shutil.rmtree(path / TABLES)
     (path / PARTS / f"r{entry.id}").mkdir(parents=True)
     (path / PARTS / f"r{entry.id}" / "1.parquet").write_bytes(b"PAR1 half")
