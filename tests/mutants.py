@@ -259,6 +259,7 @@ POWER = "tests/test_power_cut.py"
 REPAIR = "tests/test_repair.py"
 IDENTITY = "tests/test_identity.py"
 ENTRIES = "tests/test_entries.py"
+SNAPSHOT = "tests/test_snapshot.py"
 RECOVERY = "tests/storage/test_recovery.py"
 SEGMENTS = "tests/storage/test_segments.py"
 CATALOG = "tests/storage/test_catalog.py"
@@ -355,6 +356,66 @@ FORMAT_2 = [
             "    forget(database, entry.key, indexed)\n",
             "",
             STEPS,
+        ),
+    ),
+    *_of(
+        "hybridlog/snapshot.py",
+        (
+            "recordings-that-end-when-a-range-begins-are-in-it",
+            "(self.end[places] > low)]",
+            "(self.end[places] >= low)]",
+            f"{SNAPSHOT}::test_recordings_are_chosen_by_topic_and_time",
+        ),
+        (
+            "one-example-is-enough",
+            "for place in places[np.sort(firsts)].tolist()]",
+            "for place in places[np.sort(firsts)][:1].tolist()]",
+            f"{SNAPSHOT}::test_recordings_are_chosen_by_topic_and_time",
+        ),
+        (
+            "open-recordings-have-an-end",
+            "end = np.where(self.is_open, _LATEST, self.end)",
+            "end = self.end",
+            f"{SNAPSHOT}::test_an_open_recording_may_have_messages_at_any_time",
+        ),
+    ),
+    *_of(
+        "hybridlog/query/planner.py",
+        (
+            "a-long-recording-hides-no-overlap",
+            "reached = np.maximum.accumulate(last[order]) if len(order) else last",
+            "reached = last[order]",
+            f"{SNAPSHOT}::test_messages_are_in_order_however_recordings_are_grouped",
+        ),
+        (
+            "backwards-is-grouped-as-forwards",
+            "(-found.last, -found.first)",
+            "(found.first, found.last)",
+            f"{SNAPSHOT}::test_messages_are_in_order_however_recordings_are_grouped",
+        ),
+    ),
+    *_of(
+        "hybridlog/session.py",
+        (
+            "files-that-changed-are-no-doubt",
+            "            self._doubted.add(entry.id)\n",
+            "",
+            "tests/test_faults.py::test_a_segment_that_is_lost",
+        ),
+        (
+            "a-renamed-recording-is-gone",
+            "entry = None if place is None else self._current(now.summaries[place])",
+            "entry = None",
+            "tests/faults/test_meanwhile.py::test_a_recording_that_is_renamed_is_not_missed",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/opening.py",
+        (
+            "a-look-is-not-looked-at",
+            "if summary is None or summary.look != look or",
+            "if summary is None or",
+            f"{SNAPSHOT}::test_a_journal_that_has_grown_is_read_at_the_opening",
         ),
     ),
     *_of(
@@ -465,7 +526,7 @@ FORMAT_2 = [
         (
             "indexes-are-believed",
             "        if crc32(trailer) == place.trailer_crc:\n            return message_times",
-            "            return message_times",
+            "        if True:\n            return message_times",
             SEGMENTS,
         ),
         (
@@ -485,9 +546,15 @@ FORMAT_2 = [
         ),
         (
             "summaries-are-believed",
-            "for text, crc, index in rows if _text_crc(text) == crc]",
-            "for text, crc, index in rows]",
+            "                if _text_crc(text) == crc\n",
+            "                if True\n",
             f"{CATALOG}::test_a_row_that_was_changed_is_not_believed",
+        ),
+        (
+            "lists-of-damage-are-believed",
+            "index if whole.get(recording, 0) == damage else",
+            "index if True else",
+            "tests/test_catalog_by_hand.py::test_a_row_that_was_changed_is_made_again",
         ),
         (
             "topics-of-recordings-are-believed",

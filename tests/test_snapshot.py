@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import random
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
@@ -16,7 +17,10 @@ import hybridlog as hl
 from hybridlog import session
 from hybridlog.query import planner
 from hybridlog.snapshot import Snapshot
+from hybridlog_storage import journal
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.summary import (
     RecordingSummary,
     TopicType,
@@ -59,6 +63,9 @@ SPANS = st.none() | st.tuples(st.integers(0, 50), st.integers(0, 20)).map(
 MANY = st.lists(st.tuples(SPANS, st.lists(st.sampled_from(TOPICS), unique=True)), max_size=12)
 
 
+@example([((3, 9), ["/a"])], ["/a"], 10, 20)
+@example([((3, 9), ["/a"])], ["/a"], 9, 20)
+@example([((3, 9), ["/a"])], ["/a"], 0, 3)
 @given(MANY, st.lists(st.sampled_from(TOPICS)), st.integers(0, 60), st.integers(0, 60))
 def test_recordings_are_chosen_by_topic_and_time(
     found: list[tuple[tuple[int, int] | None, list[str]]], topics: list[str], begin: int, end: int
@@ -129,7 +136,8 @@ def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with hl.open(path / "store", create=True) as store:
         for number in range(14):
             begin = 10**9 + number * 10_000 + dice.choice([0, 0, -15_000, 9_000])
-            own = sorted(begin + dice.randrange(8_000) for _ in range(30))
+            length = 45_000 if number == 4 else 8_000
+            own = sorted(begin + dice.randrange(length) for _ in range(30))
             log = path / f"{number}.mcap"
             with log.open("wb") as file:
                 writer = Writer(file)
@@ -173,6 +181,20 @@ def test_messages_are_in_order_however_recordings_are_grouped(
     assert seen(query.where("n >= 20")) == late
     moment = wanted[77][0]
     assert store.topic("/n").at(moment).log_time_ns == moment
+
+
+def test_a_journal_that_has_grown_is_read_at_the_opening(tmp_path: Path) -> None:
+    """As by a process that was killed before it told the catalog."""
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("talk") as recording:
+            recording.write(Channel("/n", "json", None), b"{}")
+        path = store.directory.recording("talk")
+        (before,) = store.summaries()
+    assert before.tags == {}
+    Journal(path).append(journal.event(journal.TAGGED, key="place", value="hall"))
+    with hl.open(tmp_path / "store") as store:
+        (now,) = store.summaries()
+    assert now.tags == {"place": "hall"}
 
 
 def test_a_recording_is_read_when_its_turn_comes(
