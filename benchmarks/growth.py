@@ -138,7 +138,7 @@ def main() -> None:
     print("|---|" + "---:|" * len(columns))
     for name in next(iter(columns.values())):
         cells = " | ".join(
-            f"{column[name]:,.1f}" if name in column else "–" for column in columns.values()
+            f"{column[name]:,.1f}" if name in column else "-" for column in columns.values()
         )
         print(f"| {name} | {cells} |")
 
