@@ -67,7 +67,8 @@ def robot() -> Robot:
     seed=st.integers(0, 5),
     x=st.floats(0.3, 13.7),
     y=st.floats(0.3, 9.7),
-    angle=st.floats(-7, 7),
+    # Along a wall, which of its ends is hit depends on the last bit.
+    angle=st.floats(-7, 7).filter(lambda angle: abs(angle) > 1e-6),
 )
 @settings(max_examples=150, deadline=None)
 def test_ray_casting_agrees_with_a_slow_one(seed: int, x: float, y: float, angle: float) -> None:
