@@ -326,8 +326,8 @@ FORMAT_2 = [
         ),
         (
             "what-was-removed-is-not-swept",
-            "        for name in directory.hidden(REMOVED):\n",
-            "        for name in ():\n",
+            "            if name.startswith(REMOVED):\n",
+            "            if False:\n",
             STEPS,
         ),
         (

@@ -81,16 +81,18 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
 
 def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
     if not catalog.is_in_memory:
-        for name in directory.hidden(REMOVED):
-            directory.sweep(name)
+        for name in directory.names():
+            if name.startswith(REMOVED):
+                directory.sweep(name)
     rows = catalog.summaries()
     known = {summary.label: summary for summary in rows}
     for _ in range(_TRIES):
-        looks = directory.looks()
+        names = directory.names()
+        looks = directory.looks(names)
         report.unreadable.clear()
         found = _find(directory, catalog, looks, known, report)
         # A recording that was renamed meanwhile must not be missed.
-        if directory.labels() == list(looks):
+        if directory.names() == names:
             break
     report.copies.clear()
     for recording, copies in found.items():

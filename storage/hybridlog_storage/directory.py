@@ -19,7 +19,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -162,16 +162,35 @@ class StoreDirectory:
         """Labels of all recordings that have a directory, sorted."""
         return [name for name in self._folders() if not name.startswith(".")]
 
-    def looks(self) -> dict[str, str]:
-        """The look of each recording's directory, by label, sorted.
+    def names(self) -> list[str]:
+        """All names below `recordings`, sorted; some may not be recordings.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        try:
+            with files.folder(self.recordings, files.IN_STORE) as fd:
+                return sorted(os.listdir(fd))  # noqa: PTH208 - of a handle
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+
+    def looks(self, names: Sequence[str]) -> dict[str, str]:
+        """The look of each recording's directory, by label.
 
         It changes whenever a file gets or loses its name, and when the journal grows. A
         change inside a segment shows only in `Listing.print`.
+
+        Args:
+            names: From `names`.
+
+        Raises:
+            StoreError: They cannot be read.
         """
         found: dict[str, str] = {}
         try:
             with files.folder(self.recordings, files.IN_STORE) as fd:
-                names = sorted(os.listdir(fd))  # noqa: PTH208 - of a handle
                 for name in names:
                     if not name.startswith("."):
                         with suppress(OSError):
@@ -193,10 +212,6 @@ class StoreDirectory:
         except OSError:
             return True
         return True
-
-    def hidden(self, beginning: str) -> list[str]:
-        """Directories of recordings that are being removed or imported, sorted."""
-        return [name for name in self._folders() if name.startswith(beginning)]
 
     def _folders(self) -> list[str]:
         try:

@@ -86,13 +86,15 @@ class RecordingSummary(NamedTuple):
             TypeError: A value is missing, or there is one too many.
             ValueError: A span is no pair.
         """
-        found = cls._make([*values, indexed_by])
-        span = None
-        if found.span is not None:
-            first, last = found.span
+        span, (begin, end) = values[_SPAN : _SPAN + 2]
+        if span is not None:
+            first, last = span
             span = first, last
-        begin, end = found.extent
-        return found._replace(span=span, extent=(begin, end))
+        rest = values[_SPAN + 2 :]
+        return cls._make([*values[:_SPAN], span, (begin, end), *rest, indexed_by])
+
+
+_SPAN = RecordingSummary._fields.index("span")  # the extent follows
 
 
 def topics_to_json(topics: Iterable[TopicType]) -> str:

@@ -25,18 +25,20 @@ def case(bench: Bench) -> Iterator[Case]:
         yield copy
 
 
-def once(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have something happen after the names of all recordings were looked at."""
-    labels = StoreDirectory.labels
+def once(
+    action: Callable[[], object], monkeypatch: pytest.MonkeyPatch, looking: str = "looks"
+) -> None:
+    """Have something happen after all recordings were looked at."""
+    look_at = getattr(StoreDirectory, looking)
     done: list[object] = []
 
-    def looked(self: StoreDirectory) -> list[str]:
-        found = labels(self)
+    def looked(self: StoreDirectory, *arguments: object) -> object:
+        found = look_at(self, *arguments)
         if not done:
             done.append(action())
         return found
 
-    monkeypatch.setattr(StoreDirectory, "labels", looked)
+    monkeypatch.setattr(StoreDirectory, looking, looked)
 
 
 def renaming(path: Path) -> Callable[[], object]:
@@ -59,7 +61,7 @@ def test_a_recording_that_is_renamed_stays_in_the_index(
     before = ids_present(directory)
     assert before is not None
     assert len(before) == 2
-    once(renaming(case.path), monkeypatch)
+    once(renaming(case.path), monkeypatch, "labels")
     assert ids_present(directory) == before
 
 
