@@ -174,7 +174,8 @@ class StoreDirectory:
         except FileNotFoundError:
             return []
         except OSError as error:
-            raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+            problem = f"The store {self.path} cannot be read: {error.strerror}."
+            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording's directory, by label.
@@ -200,7 +201,8 @@ class StoreDirectory:
         except FileNotFoundError:
             return {}
         except OSError as error:
-            raise StoreError(f"The store {self.path} cannot be read: {error.strerror}.") from error
+            problem = f"The store {self.path} cannot be read: {error.strerror}."
+            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
         return found
 
     def has(self, label: str) -> bool:

@@ -38,7 +38,6 @@ class Cost:
             "commands": len(self.commands),
             "statements": len(self.statements),
             "opened": len(self.opened),
-            "bytes read": self.bytes_read,
         }
 
 

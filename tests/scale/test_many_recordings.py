@@ -88,14 +88,16 @@ ASKED: dict[str, Work] = {
 
 @pytest.mark.parametrize("name", ASKED)
 def test_questions_about_little_cost_little(stores: dict[int, Path], name: str) -> None:
-    counts = {}
+    costs = {}
     for count, path in stores.items():
         with hl.open(path, require_database=True) as store:
             ASKED[name](store)
             store.refresh()
             store.connect()
-            counts[count] = cost_of(store, lambda store=store: ASKED[name](store)).counts
-    assert counts[MANY] == counts[FEW]
+            costs[count] = cost_of(store, lambda store=store: ASKED[name](store))
+    assert costs[MANY].counts == costs[FEW].counts
+    # What is compressed has another size on another day.
+    assert costs[MANY].bytes_read < 1.1 * costs[FEW].bytes_read + 200
 
 
 def test_answers_are_right(stores: dict[int, Path]) -> None:
@@ -120,7 +122,7 @@ def test_opening_asks_once(stores: dict[int, Path]) -> None:
             store.refresh()
             counts[count] = cost_of(store, store.connect).counts
     assert counts[MANY] == counts[FEW]
-    assert counts[MANY]["opened"] < 20
+    assert counts[MANY]["opened"] < 30
 
 
 CHANGES: dict[str, Work] = {
