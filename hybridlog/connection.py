@@ -30,8 +30,8 @@ class Connection:
     Attributes:
         may_write: False if the user of MongoDB may only read.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
-        index: Id of the index, which another index in its place would not have; empty without
-            a connection, or if the user of MongoDB may only read a new one.
+        index: Id of the index; an index that replaces it has another one. Empty without a
+            connection, and for an index without an id that this user may only read.
     """
 
     def __init__(

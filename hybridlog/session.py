@@ -219,7 +219,7 @@ class Session:
             self.repairs.removed += repairs.removed
         self._unavailable = None
         self._rests_until = 0.0
-        self._doubted -= self._doubted if wanted is None else wanted.keys()
+        self._doubted = set() if wanted is None else self._doubted - wanted.keys()
         known = self._indexed.copy()
         if has_changed:
             self.invalidate()

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
+_MAX_CACHED = 128  # sets of topics
 _LATEST = np.iinfo(np.int64).max
 
 
@@ -54,7 +55,7 @@ class Snapshot:
         open_ones = [one.status in UNFINISHED for one in self.summaries]
         self.is_open: NDArray[np.bool_] = np.array(open_ones, np.bool_)
         self._set = np.array([numbers[one.topics] for one in self.summaries], np.intp)
-        self._having: dict[str, NDArray[np.intp]] = {}
+        self._having: dict[frozenset[str], NDArray[np.intp]] = {}
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -80,23 +81,15 @@ class Snapshot:
 
     def having(self, topics: Collection[str]) -> NDArray[np.intp]:
         """Positions of the recordings that have any of some topics, in order."""
-        if len(topics) == 1:
-            return self._having_topic(*topics)
-        wanted = set(topics)
-        sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
-        return self._of_sets(sets)
-
-    def _having_topic(self, topic: str) -> NDArray[np.intp]:
-        found = self._having.get(topic)
+        wanted = frozenset(topics)
+        found = self._having.get(wanted)
         if found is None:
-            sets = [any(t.topic == topic for t in held) for held in self._topics.values()]
-            found = self._having[topic] = self._of_sets(sets)
+            sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
+            found = np.flatnonzero(np.array(sets, np.bool_)[self._set])
+            if len(self._having) >= _MAX_CACHED:
+                self._having.clear()
+            self._having[wanted] = found
         return found
-
-    def _of_sets(self, sets: Sequence[bool]) -> NDArray[np.intp]:
-        if not sets:
-            return np.empty(0, np.intp)
-        return np.flatnonzero(np.array(sets, np.bool_)[self._set])
 
     def between(self, places: NDArray[np.intp], begin: int, end: int) -> NDArray[np.intp]:
         """Those of some recordings that overlap a range of log time.

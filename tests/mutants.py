@@ -389,8 +389,8 @@ FORMAT_2 = [
         ),
         (
             "backwards-is-grouped-as-forwards",
-            "(-found.last, -found.first)",
-            "(found.first, found.last)",
+            "            first, last = -last, -first\n",
+            "            pass\n",
             f"{SNAPSHOT}::test_messages_are_in_order_however_recordings_are_grouped",
         ),
     ),

@@ -121,11 +121,6 @@ def _bring_one(
     progress: Progress | None,
 ) -> None:
     """Bring one recording up to date, unless another process is writing it."""
-    if not directory.is_writable:
-        raise StoreError(
-            f"The index of recording {entry.label!r} is not complete, and the store "
-            f"{directory.path} is read-only. Open it once with write permission."
-        )
     with directory.writing(entry.label) as mine:
         if not mine:
             return  # the process that holds the lock indexes it

@@ -125,10 +125,9 @@ def sizes_of(
     for entry in entries:
         segments = _segment_bytes(directory, catalog, entry)
         tables = _table_bytes(directory.path, entry)
-        messages: Counter[str] = Counter()
+        messages = entry.messages_by_topic()
         payload: Counter[str] = Counter()
         for channel in entry.channels:
-            messages[channel.topic] += channel.stats.messages
             payload[channel.topic] += channel.stats.payload_bytes
         rows += [
             Size(

@@ -154,6 +154,11 @@ class _Index:
             found[place.collection] += count
         return found
 
+    def counted_again(self, entry: RecordingEntry, collections: Iterable[str]) -> Counter[str]:
+        """The numbers as they are now, at any time; reads the whole collections."""
+        asked = {"_meta.rec": entry.key}
+        return Counter({c: self.database.count(c, asked) for c in collections})
+
 
 class _Check:
     """Checks one recording."""
@@ -168,7 +173,7 @@ class _Check:
     ) -> None:
         self._directory = directory
         self._catalog = catalog
-        self._in_index = index
+        self._indexed = index
         self._label = label
         self._result = result
         self._path = directory.recording(label)
@@ -288,14 +293,14 @@ class _Check:
             return
         self._result.chunks += 1
         self._result.messages += len(chunk.batch)
-        if self._in_index is None or not self._has_index:
+        if self._indexed is None or not self._has_index:
             return
         documents, _ = self._indexer.documents_of([chunk], channels)
         key = self._indexer.recording[:16]
-        found = _by_collection(self._in_index.places, documents)
+        found = _by_collection(self._indexed.places, documents)
         for collection, (places, want) in found.items():
             self._expected[collection] += len(want)
-            problem = _compare(self._in_index.database, key, chunk, places, want)
+            problem = _compare(self._indexed.database, key, chunk, places, want)
             if problem:
                 where = f"{name} byte {chunk.offset}, collection {collection}"
                 self.found(where, problem, self._reindex)
@@ -319,18 +324,18 @@ class _Check:
 
     def _index(self, entry: RecordingEntry) -> None:
         """Find documents that are not in the segments."""
-        if self._in_index is None:
+        if self._indexed is None:
             return
-        state = IndexState(self._in_index.database)
+        state = IndexState(self._indexed.database)
         indexed = state.of([entry.key]).get(entry.key)
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._reindex)
         elif not state.is_mirrored(entry):
             self.found("index", "its entry of the recording differs", self._reindex)
-        have = self._in_index.documents_of(entry)
-        if self._in_index.count_all and +have != +self._expected:
+        have = self._indexed.documents_of(entry)
+        if self._indexed.count_all and +have != +self._expected:
             # The recording may have ended since all documents were counted.
-            have = _Index(self._in_index.database, count_all=True).documents_of(entry)
+            have = self._indexed.counted_again(entry, have.keys() | self._expected.keys())
         for collection in sorted(have.keys() | self._expected.keys()):
             found, want = have[collection], self._expected[collection]
             if found != want:

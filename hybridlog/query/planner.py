@@ -248,14 +248,9 @@ class Planner:
         """
         found = self._ranges.resolve()
         # In the order of the answer; going back, a recording begins with its last message.
-        first, last = (
-            (-found.last, -found.first)
-            if self.question.reverse
-            else (
-                found.first,
-                found.last,
-            )
-        )
+        first, last = found.first, found.last
+        if self.question.reverse:
+            first, last = -last, -first
         order = np.argsort(first, kind="stable")
         reached = np.maximum.accumulate(last[order]) if len(order) else last
         edges = np.flatnonzero(first[order][1:] > reached[:-1]) + 1

@@ -347,8 +347,8 @@ def _damage_crc(db: sqlite3.Connection, recording: str) -> int:
 
 def _put_summary(db: sqlite3.Connection, described: Described) -> None:
     entry, text = described.entry, described.summary.to_json()
-    topics = topics_to_json(described.topics)
-    db.execute("insert or replace into topics values (?, ?)", (hash_of(topics), topics))
+    topics = described.summary.topics, topics_to_json(described.topics)
+    db.execute("insert or replace into topics values (?, ?)", topics)
     row = entry.id, text, _text_crc(text), _damage_crc(db, entry.id)
     db.execute("insert or replace into summaries values (?, ?, ?, '', ?)", row)
     fingerprint = entry.source.get("fingerprint")

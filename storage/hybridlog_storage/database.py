@@ -477,7 +477,7 @@ class Database:
         order: int,
         key: Callable[[Any], object],
     ) -> Iterator[Any]:
-        """What a cursor finds; goes on behind the last item if the connection breaks.
+        """Items of a cursor; goes on behind the last one if the connection breaks.
 
         Args:
             ask: Makes the cursor for a filter.
@@ -1115,7 +1115,7 @@ def _unusable_file(address: str, error: OSError) -> UsageError:
 
 
 def _unreachable(address: str, text: str) -> str:
-    """What is wrong when no connection can be made or kept, with its cure."""
+    """The reason why no connection can be made or kept, with its cure."""
     if "CERTIFICATE_VERIFY_FAILED" in text:
         reason = text.rpartition("certificate verify failed: ")[2].partition(" (_ssl")[0]
         return (

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final
 
 from hybridlog_storage import durability, files
-from hybridlog_storage.errors import StoreError, exhausted
+from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -174,8 +174,7 @@ class StoreDirectory:
         except FileNotFoundError:
             return []
         except OSError as error:
-            problem = f"The store {self.path} cannot be read: {error.strerror}."
-            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
+            raise unreadable(error, self.path, f"The store {self.path}") from error
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording's directory, by label.
@@ -201,8 +200,7 @@ class StoreDirectory:
         except FileNotFoundError:
             return {}
         except OSError as error:
-            problem = f"The store {self.path} cannot be read: {error.strerror}."
-            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
+            raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
 
     def has(self, label: str) -> bool:
@@ -221,8 +219,7 @@ class StoreDirectory:
         except FileNotFoundError:
             return []
         except OSError as error:
-            problem = f"The store {self.path} cannot be read: {error.strerror}."
-            raise (exhausted(error.errno, f"reading {self.path}") or StoreError(problem)) from error
+            raise unreadable(error, self.path, f"The store {self.path}") from error
         return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
 
     def listing(self, label: str) -> Listing:
@@ -240,8 +237,7 @@ class StoreDirectory:
         except FileNotFoundError:
             pass
         except OSError as error:
-            problem = f"{path} cannot be read: {error.strerror}."
-            raise (exhausted(error.errno, f"reading {path}") or StoreError(problem)) from error
+            raise unreadable(error, path) from error
         sealed: dict[int, str] = {}
         opened: dict[int, str] = {}
         others = []

@@ -9,7 +9,10 @@ they are caught.
 from __future__ import annotations
 
 import errno
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """System errors that mean a full disk."""
@@ -32,6 +35,18 @@ def exhausted(number: int | None, doing: str) -> ResourceError | None:
     if number == errno.ENOMEM:
         return ResourceError(f"Out of memory while {doing}: end other programs, or add memory.")
     return None
+
+
+def unreadable(error: OSError, path: Path, subject: str = "") -> HybridlogError:
+    """The error for a file or folder that cannot be read: a shortage, or a `StoreError`.
+
+    Args:
+        error: The system's error.
+        path: The file or folder.
+        subject: How the message calls it; by its path without one.
+    """
+    problem = f"{subject or path} cannot be read: {error.strerror}."
+    return exhausted(error.errno, f"reading {path}") or StoreError(problem)
 
 
 class HybridlogError(Exception):

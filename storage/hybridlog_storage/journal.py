@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.errors import StoreError, exhausted
+from hybridlog_storage.errors import StoreError, unreadable
 
 JOURNAL: Final = "journal"
 """Name of the file in a recording's directory."""
@@ -261,8 +261,7 @@ def read(recording: Path) -> JournalState | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        problem = f"{path} cannot be read: {error.strerror}."
-        raise (exhausted(error.errno, f"reading {path}") or StoreError(problem)) from error
+        raise unreadable(error, path) from error
     if len(data) > MAX_JOURNAL:
         raise StoreError(f"{path} is too large to be a journal.")
     return parse(data)

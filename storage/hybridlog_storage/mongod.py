@@ -343,7 +343,7 @@ class EmbeddedMongod:
             files.unlink(self._record_path, depth=_IN_HERE)
 
     def _damage_of_last_run(self) -> str | None:
-        """What the last mongod said about damaged data files before it ended by itself."""
+        """Damage of the data files that the last mongod reported before it ended; None if none."""
         text = _read_from(self.log, 0).rpartition(START_LINE)[2]
         lines = [line for line in text.splitlines() if '"s":"F"' in line]
         if _NOT_AT_FAULT in text or _other_cause(text):

@@ -18,7 +18,7 @@ from typing import Final
 from urllib.parse import quote
 
 from hybridlog_storage import files
-from hybridlog_storage.errors import StoreError, UsageError, exhausted
+from hybridlog_storage.errors import StoreError, UsageError, unreadable
 
 FORMAT: Final = 2
 """Store format of this version."""
@@ -352,8 +352,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
                 f"{file} is a symlink, and none inside a store is followed. Put the file itself "
                 "there."
             ) from error
-        problem = f"{file} cannot be read: {error.strerror}."
-        raise (exhausted(error.errno, f"reading {file}") or StoreError(problem)) from error
+        raise unreadable(error, file) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
 

@@ -1,4 +1,4 @@
-"""What a store knows of each recording without reading its whole entry.
+"""Summaries of recordings, which say enough to choose among them.
 
 A question first chooses among summaries, and then reads the entries of the chosen
 recordings. The summaries of ten thousand recordings load in some ten milliseconds.

@@ -37,7 +37,7 @@ Filter = dict[str, object]
 
 @dataclass(frozen=True)
 class TopicPlace:
-    """TopicPlace of the index documents of a topic.
+    """The place of the index documents of a topic.
 
     Attributes:
         topic: The topic.
