@@ -6,7 +6,6 @@ import io
 import re
 import struct
 import warnings
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -49,6 +48,7 @@ _POINT_TYPES: Final[Mapping[int, str]] = {
     7: "f4",
     8: "f8",
 }
+_MAX_EMPTY = 1 << 31  # a size beside one that is zero
 _COMPRESSED = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _DEPTH_HEADER = struct.Struct("<iff")
@@ -65,11 +65,13 @@ def to_numpy(type_name: str, message: object) -> NDArray[Any]:
       `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
       (NaN for missing measurements).
     * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
-      and `angle` (radians), float32.
+      and `angle` (radians), float32. Ranges without an intensity have NaN.
     * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
-      cloud's own fields; `PointCloud`: shape (n,), `x`, `y`, `z` and the channels.
+      cloud's own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the
+      channels, NaN where a channel ends early.
 
-    Images and `PointCloud2` clouds are views of the message's data, without a copy.
+    An empty image, picture or cloud is an empty array. A step of 0 means rows without
+    padding. Images and `PointCloud2` clouds are views of the message's data, without a copy.
 
     Args:
         type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
@@ -103,6 +105,8 @@ def _image(message: Any) -> NDArray[Any]:
     encoding = str(message.encoding).strip()
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = _bytes(message.data)
+    if not encoding and not height * width and not len(data):
+        return np.empty((min(height, _MAX_EMPTY), min(width, _MAX_EMPTY)), np.uint8)
     channels, sample = 1, np.dtype(np.uint8)
     planes = _PLANAR.get(encoding.lower())
     if planes is not None:
@@ -115,6 +119,7 @@ def _image(message: Any) -> NDArray[Any]:
     if message.is_bigendian:
         sample = sample.newbyteorder(">")
     row = width * channels * sample.itemsize
+    step = step or row
     _check_rows("an image", (height, width), row, step, len(data))
     pixel = channels * sample.itemsize
     if channels == 1:
@@ -158,7 +163,7 @@ def _view(
     """An array over `data`; the caller checked that it lies inside."""
     if 0 in shape:
         # If one size is zero, the others are unchecked; numpy refuses those it cannot multiply.
-        return np.empty(tuple(min(size, 1 << 31) for size in shape), dtype)
+        return np.empty(tuple(min(size, _MAX_EMPTY) for size in shape), dtype)
     array: NDArray[Any] = np.ndarray(shape, dtype, data.data, 0, strides)
     return array
 
@@ -166,6 +171,8 @@ def _view(
 def _compressed_image(message: Any) -> NDArray[Any]:
     form = str(message.format)
     data = _bytes(message.data).tobytes()
+    if not data:
+        return np.empty((0, 0), np.uint8)
     if "compressedDepth" in form:
         return _depth(form, data)
     return _picture(data)
@@ -234,25 +241,30 @@ def _laser_scan(message: Any) -> NDArray[Any]:
     scan = np.empty(len(ranges), [(name, np.float32) for name in names])
     scan["range"] = ranges
     if len(intensities):
-        if len(intensities) != len(ranges):
-            raise PayloadError(
-                f"a scan has {len(ranges)} ranges and {len(intensities)} intensities"
-            )
-        scan["intensity"] = intensities
+        scan["intensity"] = _fill(intensities, len(ranges))
     with np.errstate(over="ignore", invalid="ignore"):
         steps = np.arange(len(ranges)) * float(message.angle_increment)
         scan["angle"] = float(message.angle_min) + steps
     return scan
 
 
+def _fill(values: Any, size: int) -> NDArray[np.float32]:
+    """As many values as there are points: NaN for those that lack, without surplus ones."""
+    filled = np.full(size, np.nan, np.float32)
+    filled[: len(values)] = values[:size]
+    return filled
+
+
 def _point_cloud2(message: Any) -> NDArray[Any]:
     height, width = int(message.height), int(message.width)
     step = int(message.point_step)
     data = _bytes(message.data)
+    if height * width and not step:
+        raise PayloadError("a point cloud has points of 0 bytes")
     order = ">" if message.is_bigendian else "<"
     dtype = _point_dtype(message.fields, step, order)
-    # The step of a single row is often 0.
     row_step = int(message.row_step) if height > 1 else width * step
+    row_step = row_step or width * step  # some drivers leave it out
     _check_rows("a point cloud", (height, width), width * step, row_step, len(data))
     if height == 1:
         return _view(data, (width,), dtype, (step,))
@@ -263,13 +275,11 @@ def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
     """The structure of one point.
 
     Raises:
-        PayloadError: a field has an unknown type, lies outside the point, or overlaps
-            another.
+        PayloadError: a field has an unknown type, or lies outside the point.
     """
     names: list[str] = []
     formats: list[Any] = []
     offsets: list[int] = []
-    ends: list[tuple[int, int, str]] = []
     for field in fields:
         code, offset, count = int(field.datatype), int(field.offset), int(field.count) or 1
         name = _unique(str(field.name), names)
@@ -288,13 +298,6 @@ def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
         names.append(name)
         formats.append(item if count == 1 else (item, (count,)))
         offsets.append(offset)
-        ends.append((offset, end, name))
-    if not names:
-        raise PayloadError("a point cloud has no fields")
-    ends.sort()
-    for (_, end, name), (start, _, other) in pairwise(ends):
-        if start < end:
-            raise PayloadError(f"fields {name!r} and {other!r} of a point cloud overlap")
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
     except (ValueError, OverflowError) as error:
@@ -314,13 +317,8 @@ def _point_cloud(message: Any) -> NDArray[Any]:
     names = ["x", "y", "z"]
     columns = []
     for channel in message.channels:
-        if len(channel.values) != len(points):
-            raise PayloadError(
-                f"a point cloud has {len(points)} points and {len(channel.values)} values "
-                f"in channel {str(channel.name)!r}"
-            )
         names.append(_unique(str(channel.name), names))
-        columns.append(channel.values)
+        columns.append(_fill(channel.values, len(points)))
     cloud = np.empty(len(points), [(name, np.float32) for name in names])
     for axis in ("x", "y", "z"):
         cloud[axis] = np.fromiter((getattr(p, axis) for p in points), np.float32, len(points))

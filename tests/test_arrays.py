@@ -81,7 +81,7 @@ def test_planes(encoding: str, rows: int) -> None:
         ({"width": 2**32 - 1, "height": 2**32 - 1}, "rows of"),
         ({"height": 2**32 - 1}, "needs"),
         ({"width": 5}, "need"),
-        ({"step": 0}, "rows of 0 bytes"),
+        ({"step": 1}, "rows of 1 bytes"),
         ({"step": 2**32 - 1}, "needs"),
         ({"height": -1}, "cannot have"),
         ({"encoding": "64FC999"}, "unknown encoding"),
@@ -100,7 +100,21 @@ def test_images_that_lie(change: dict[str, Any], message: str) -> None:
         to_numpy("sensor_msgs/Image", nv21)
 
 
+def test_a_step_of_0_means_rows_without_padding() -> None:
+    data = bytes(range(36))
+    got = to_numpy("sensor_msgs/Image", image("rgb8", 4, 3, data, step=0))
+    assert got.shape == (3, 4, 3)
+    assert got.tobytes() == data
+    with pytest.raises(PayloadError, match="needs 36 bytes and has 35"):
+        to_numpy("sensor_msgs/Image", image("rgb8", 4, 3, data[:35], step=0))
+
+
 def test_empty_image() -> None:
+    assert to_numpy("sensor_msgs/Image", image("", 0, 0, b"")).shape == (0, 0)
+    assert to_numpy("sensor_msgs/Image", image(" ", 0, 2**32 - 1, b"")).shape == (2**31, 0)
+    for width, data in ((4, bytes(4)), (0, b"x")):
+        with pytest.raises(PayloadError, match="unknown encoding"):
+            to_numpy("sensor_msgs/Image", image("", width, 1, data))
     assert to_numpy("sensor_msgs/Image", image("rgb8", 0, 0, b"")).shape == (0, 0, 3)
     assert to_numpy("sensor_msgs/Image", image("mono8", 7, 0, b"")).shape == (0, 7)
 
@@ -167,6 +181,11 @@ def test_compressed_depth() -> None:
             to_numpy("sensor_msgs/CompressedImage", compressed(form, raw))
 
 
+@pytest.mark.parametrize("form", ["", "jpeg", "32FC1; compressedDepth"])
+def test_a_picture_without_bytes_is_empty(form: str) -> None:
+    assert to_numpy("sensor_msgs/CompressedImage", compressed(form, b"")).shape == (0, 0)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_damaged_pictures(data: st.DataObject) -> None:
@@ -202,7 +221,7 @@ def test_without_pillow(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(builtins, "__import__", refusing)
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[images\]'"):
-        to_numpy("sensor_msgs/CompressedImage", compressed("png", b""))
+        to_numpy("sensor_msgs/CompressedImage", compressed("png", b"x"))
 
 
 # Scans and clouds
@@ -222,8 +241,14 @@ def test_laser_scan() -> None:
     scan.intensities = np.array([4, 5, 6], np.float32)
     assert to_numpy("sensor_msgs/LaserScan", scan)["intensity"].tolist() == [4, 5, 6]
     scan.intensities = np.array([4], np.float32)
-    with pytest.raises(PayloadError, match="3 ranges and 1 intensities"):
-        to_numpy("sensor_msgs/LaserScan", scan)
+    got = to_numpy("sensor_msgs/LaserScan", scan)
+    assert got["intensity"][0] == 4
+    assert np.isnan(got["intensity"][1:]).all()
+    assert got["range"].tolist() == [1, 2, np.inf]
+    scan.intensities = np.array([4, 5, 6, 7], np.float32)
+    assert to_numpy("sensor_msgs/LaserScan", scan)["intensity"].tolist() == [4, 5, 6]
+    scan.ranges = scan.ranges[:0]
+    assert to_numpy("sensor_msgs/LaserScan", scan).shape == (0,)
 
 
 def point_field(name: str, offset: int, datatype: int, count: int = 1) -> SimpleNamespace:
@@ -281,6 +306,34 @@ def test_unorganised_and_empty_clouds() -> None:
     assert to_numpy("sensor_msgs/PointCloud2", cloud(height=1, width=0)).shape == (0,)
 
 
+def test_a_row_step_of_0_means_rows_without_padding() -> None:
+    packed = np.arange(96, dtype=np.uint8)
+    got = to_numpy("sensor_msgs/PointCloud2", cloud(row_step=0, data=packed))
+    assert got.shape == (2, 3)
+    assert got["rgb"][1, 0].tolist() == [60, 61, 62]
+    with pytest.raises(PayloadError, match="needs 96 bytes and has 95"):
+        to_numpy("sensor_msgs/PointCloud2", cloud(row_step=0, data=packed[:95]))
+
+
+def test_fields_that_overlap() -> None:
+    # Drivers give a colour both as a float and as an integer.
+    fields = [point_field("x", 0, 7), point_field("rgb", 12, 7), point_field("rgba", 12, 6)]
+    got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=fields))
+    assert got["rgba"].tolist() == [[0x030201] * 3] * 2
+    assert got["rgb"].view("<u4").tolist() == [[0x030201] * 3] * 2
+    assert got["x"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert np.stack([got, got])["rgba"][1, 1, 2] == 0x030201
+
+
+def test_a_cloud_without_fields() -> None:
+    got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=[]))
+    assert got.shape == (2, 3)
+    assert got.dtype.names == ()
+    assert got.dtype.itemsize == 16
+    nothing = cloud(fields=[], height=0, width=0, point_step=0, row_step=0, data=np.zeros(0, "u1"))
+    assert to_numpy("sensor_msgs/PointCloud2", nothing).shape == (0, 0)
+
+
 def test_big_endian_cloud() -> None:
     data = np.array([(1.5, 3)], [("x", ">f4"), ("n", ">u4")]).view(np.uint8)
     fields = [point_field("x", 0, 7), point_field("n", 4, 6)]
@@ -305,13 +358,13 @@ def test_field_names_that_numpy_refuses() -> None:
         ({"row_step": 40}, "need"),
         ({"point_step": 2**32 - 1}, "cannot be read|need"),
         ({"point_step": 2**32 - 1, "width": 0}, "cannot be read"),
-        ({"point_step": 0}, "ends at byte"),
-        ({"fields": []}, "no fields"),
+        ({"point_step": 0}, "points of 0 bytes"),
+        ({"point_step": 0, "fields": [], "data": np.zeros(0, np.uint8)}, "points of 0 bytes"),
+        ({"point_step": 0, "width": 0}, "ends at byte"),
         ({"fields": [point_field("x", 2**32 - 1, 7)]}, "ends at byte"),
         ({"fields": [point_field("x", -4, 7)]}, "from byte -4"),
         ({"fields": [point_field("x", 0, 7, 2**32 - 1)]}, "ends at byte"),
         ({"fields": [point_field("x", 0, 9)]}, "unknown type 9"),
-        ({"fields": [point_field("x", 0, 7), point_field("y", 2, 7)]}, "overlap"),
         ({"data": np.zeros(97, np.uint8)}, "has 97"),
     ],
 )
@@ -348,9 +401,10 @@ def test_old_point_cloud() -> None:
     message = SimpleNamespace(points=points, channels=channels)
     got = to_numpy("sensor_msgs/PointCloud", message)
     assert got.tolist() == [(0, 0, 0, 7), (1, 2, 3, 8), (2, 4, 6, 9)]
-    channels[0].values = np.zeros(2)
-    with pytest.raises(PayloadError, match="3 points and 2 values"):
-        to_numpy("sensor_msgs/PointCloud", message)
+    channels[0].values = np.array([7, 8], np.float32)
+    got = to_numpy("sensor_msgs/PointCloud", message)["intensity"]
+    assert got[:2].tolist() == [7, 8]
+    assert np.isnan(got[2])
 
 
 def test_other_types_are_refused() -> None:

@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.cli.write_answer import write_answer
-from hybridlog_storage.errors import TopicError
+from hybridlog_storage.errors import PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
 
 CASES = Path(__file__).parent / "cases"
@@ -50,6 +50,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         yield opened
 
 
+IMAGE = (
+    b"uint32 width\nuint32 height\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
+)
+
+
 def record_made(recorder: Any) -> None:
     """Two topics whose fields are called as columns of ours are."""
     text = b"Header header\nuint32 seq\nstring recording\nfloat64 log_time\nint64[] many\n" + (
@@ -57,6 +62,10 @@ def record_made(recorder: Any) -> None:
     )
     channel = Channel("/own", "ros1", Schema("p/Own", "ros1msg", text), {}, True)
     plain = Channel("/plain", "ros1", Schema("p/Plain", "ros1msg", b"float32[] r\nstring s"))
+    image = Channel("/images", "ros1", Schema("sensor_msgs/Image", "ros1msg", IMAGE))
+    for n, encoding in enumerate((b"mono8", b"xxxxx", b"mono8")):
+        payload = struct.pack("<II5sBII2s", 1, 5, encoding, 0, 2, 2, bytes([n + 1, n + 2]))
+        recorder.write(image, struct.pack("<I", 2) + payload, log_time=1000 + n)
     for n in range(10):
         many = struct.pack(f"<I{n}q", n, *((1 << 62) + k for k in range(n)))
         payload = struct.pack("<III", n, 7, 8 + n) + struct.pack("<I", 1) + b"f"
@@ -273,6 +282,20 @@ def test_empty_clouds(store: hl.Store) -> None:
     assert sizes[0] == 0
     assert max(sizes) > 0
     assert frame["data"].iloc[0].dtype == np.uint8
+
+
+def test_one_odd_message_hides_no_others(store: hl.Store) -> None:
+    arrays = store.topic("/c").to_numpy()
+    sizes = [len(data) for data in store.topic("/c").to_pandas()["data"]]
+    assert [cloud.nbytes for cloud in arrays] == sizes
+    assert 0 in sizes
+    images = store.topic("/images")
+    assert [array.tolist() for array in images.to_numpy()] == [[[1, 2]], [[3, 4]]]
+    assert images.counters.unreadable == 1
+    with pytest.raises(PayloadError, match="unknown encoding"):
+        images.at(1001).to_numpy()
+    with pytest.raises(PayloadError, match="no array form"):
+        store.topic("/plain").to_numpy()
 
 
 # --- protobuf ---------------------------------------------------------------------------

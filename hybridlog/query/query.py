@@ -24,7 +24,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import parse_time
-from hybridlog_storage.errors import IndexChangedError, TopicError, UsageError
+from hybridlog_storage.errors import IndexChangedError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -467,8 +467,25 @@ class Query:
         return lines(self._planner())
 
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
-        """Every message as an array (`Message.to_numpy`): stacked if all are alike."""
-        arrays: list[NDArray[Any]] = [message.to_numpy() for message in self]
+        """Every message as an array (`Message.to_numpy`): stacked if all are alike.
+
+        Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+
+        Raises:
+            PayloadError: None of the messages can be an array.
+        """
+        arrays: list[NDArray[Any]] = []
+        refused: PayloadError | None = None
+        unreadable = 0
+        for message in self:
+            try:
+                arrays.append(message.to_numpy())
+            except PayloadError as error:
+                refused = refused or error
+                unreadable += 1
+        if refused is not None and not arrays:
+            raise refused
+        self.counters.unreadable += unreadable
         alike = {(a.shape, a.dtype) for a in arrays}
         return np.stack(arrays) if len(alike) == 1 else arrays
 
