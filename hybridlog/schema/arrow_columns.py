@@ -36,7 +36,8 @@ def array_of(column: Column) -> pa.Array[Any]:
     if isinstance(column, Records):
         return records_array(column)
     values = array_of(column.values)
-    if column.width is not None and isinstance(column.values, Scalars):
+    # Parquet cannot hold lists of a fixed length of 0.
+    if column.width and isinstance(column.values, Scalars):
         return fixed_lists(values, column.width, len(column))
     return lists(values, column.offset)
 

@@ -12,7 +12,7 @@ from hybridlog_storage.messages import REDUCED
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel, Schema
 
-_ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl")}
+_ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
 def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:

@@ -165,7 +165,7 @@ _WORDS = frozenset({*_DTYPES, "byte", "string", *_NOT_PORTABLE})
 
 
 def parse_definition(schema: Schema) -> MessageType:
-    """Parse a definition of encoding `ros1msg`, `ros2msg` or `ros2idl`.
+    """Parse a definition of encoding `ros1msg`, `ros2msg`, `ros2idl` or `omgidl`.
 
     Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are added;
     definitions in the text take precedence.
@@ -179,7 +179,7 @@ def parse_definition(schema: Schema) -> MessageType:
     """
     if not schema.encoding:
         raise DefinitionError(f"{schema.name}: no definition in the source")
-    if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl"}:
+    if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl", "omgidl"}:
         raise DefinitionError(f"{schema.name}: {schema.encoding!r} is not a ROS definition")
     if len(schema.data) > MAX_DEFINITION:
         raise DefinitionError(
@@ -213,13 +213,15 @@ def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
 def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]], str]:
     """Parse the text: fields by canonical type name, and the name of the first type."""
     text = schema.data.decode("utf-8", errors="replace")
+    if ros == 2 and "\n" not in text:
+        text = text.replace("\r", "\n")  # rosidl accepts any line end
     types: dict[str, list[RawField]] = {}
     idl = IdlTypes()
     first = ""
     for section in split_sections(text):
         name = canonical(section.name or schema.name)
         first = first or name
-        kind = section.kind or ("IDL" if schema.encoding == "ros2idl" else "MSG")
+        kind = section.kind or ("IDL" if schema.encoding in {"ros2idl", "omgidl"} else "MSG")
         if kind == "IDL" and ros == 2:
             parse_idl(name, section.text, idl)
             continue
@@ -354,9 +356,10 @@ class _Resolver:
             return ArrayOf(element, None, raw.bound), _Extent(
                 extent.depth, extent.fields, extent.characters, 4
             )
-        if not 0 < width <= MAX_WIDTH:
+        if width > MAX_WIDTH or (width == 0 and self._ros == 2):
+            least = 0 if self._ros == 1 else 1
             raise self._fail(
-                f"{owner}.{raw.name} has {width} elements; from 1 to {MAX_WIDTH} are indexed"
+                f"{owner}.{raw.name} has {width} elements; from {least} to {MAX_WIDTH} are indexed"
             )
         extent = _Extent(extent.depth, extent.fields, extent.characters, extent.size * width)
         return ArrayOf(element, width), extent

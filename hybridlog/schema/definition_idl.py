@@ -1,14 +1,19 @@
 """Parses OMG IDL as ROS 2 uses it: modules, structs, typedefs, constants, enums.
 
 A tokenizer and a recursive-descent parser for the few constructs with a ROS wire form.
-Every other construct is refused by name. Constants matter only as array sizes, so
-expressions are not evaluated: a size is a number or the name of a numeric constant.
+Every other construct is refused by name. Constants matter only as array sizes: integer
+expressions are evaluated, other constants are skipped.
+
+The parser of rosbags is not used: it does not know enums, and fails on deep nesting.
 """
 
 from __future__ import annotations
 
+import operator
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 
 from hybridlog.schema.definition_text import RawField, canonical
 from hybridlog_storage.errors import DefinitionError
@@ -25,6 +30,21 @@ _TOKEN = re.compile(
 )
 _MAX_DEPTH = 16
 _MAX_DIGITS = 20
+_MAX_VALUE = 1 << 64
+
+_OPERATORS: Mapping[str, tuple[int, Callable[[int, int], int]]] = {
+    "|": (1, operator.or_),
+    "^": (2, operator.xor),
+    "&": (3, operator.and_),
+    "<<": (4, operator.lshift),
+    ">>": (4, operator.rshift),
+    "+": (5, operator.add),
+    "-": (5, operator.sub),
+    "*": (6, operator.mul),
+    "/": (6, lambda one, other: int(Fraction(one, other))),
+    "%": (6, lambda one, other: one - other * int(Fraction(one, other))),
+}
+"""Operators of integer expressions: how tightly they bind, and what they do. Division cuts."""
 
 _WORDS = {
     "boolean": "bool",
@@ -186,6 +206,8 @@ class _Parser:
 
     def _struct(self, scope: list[str]) -> None:
         name = "/".join([*scope, self._name()])
+        if self._peek() == ";":
+            return  # declared here, defined elsewhere
         if self._peek() == ":":
             raise self._fail("not indexed: a struct that inherits")
         self._expect("{")
@@ -212,8 +234,7 @@ class _Parser:
             raw = replace(kind, name=name)
             if self._peek() == "[":
                 self._at += 1
-                width = self._size(scope)
-                self._expect("]")
+                width = self._size(scope, "]")
                 if raw.array or self._peek() == "[":
                     raise self._fail(f"field {name[:80]} is an array of arrays: not indexed")
                 raw = replace(raw, array=True, width=width)
@@ -233,17 +254,16 @@ class _Parser:
             bound = None
             if self._peek() == ",":
                 self._at += 1
-                bound = self._size(scope)
-            self._expect(">")
+                bound = self._size(scope, ">")
+            else:
+                self._expect(">")
             return replace(element, array=True, bound=bound)
         if word in {"unsigned", "long"}:
             while self._peek() in {"long", "short", "double"}:
                 word += " " + self._next()
         if word in {"string", "wstring"} and self._peek() == "<":
             self._at += 1
-            bound = self._size(scope)
-            self._expect(">")
-            return RawField("", word, text_bound=bound)
+            return RawField("", word, text_bound=self._size(scope, ">"))
         if word in _WORDS:
             return RawField("", _WORDS[word])
         if word in {"map", "any", "fixed", "union", "struct", "enum", "bitset", "bitmask"}:
@@ -252,24 +272,46 @@ class _Parser:
             raise self._fail(f"expected a type, found {word[:40]!r}")
         return RawField("", word)
 
-    def _size(self, scope: str) -> int:
-        token = self._next()
-        number = _integer(token)
-        if number is not None:
+    def _size(self, scope: str, end: str) -> int:
+        """An array size and the sign behind it."""
+        tokens = self._until(end)
+        number = self._evaluated(tokens, scope)
+        if number is None or number < 0:
+            found = " ".join(tokens)
+            raise self._fail(f"an array size must be a number or a constant, found {found[:40]!r}")
+        return number
+
+    def _until(self, end: str) -> list[str]:
+        """The tokens before a sign outside of parentheses, which is skipped."""
+        tokens: list[str] = []
+        depth = 0
+        while (token := self._next()) != end or depth > 0:
+            depth += {"(": 1, ")": -1}.get(token, 0)
+            tokens.append(token)
+        return tokens
+
+    def _evaluated(self, tokens: list[str], scope: str) -> int | None:
+        """The value of an integer expression; None for any other."""
+
+        def value(token: str) -> int:
+            number = _integer(token)
+            for candidate in _candidates(scope, token) if number is None else ():
+                if candidate in self._types.constants:
+                    return self._types.constants[candidate]
+            if number is None:
+                raise ValueError(token)
             return number
-        for candidate in _candidates(scope, token):
-            if candidate in self._types.constants:
-                return self._types.constants[candidate]
-        raise self._fail(f"an array size must be a number or a constant, found {token[:40]!r}")
+
+        try:
+            return _Expression(tokens, value).whole()
+        except (ValueError, ZeroDivisionError):
+            return None
 
     def _constant(self, scope: list[str]) -> None:
         self._type("/".join([*scope, ""]))
         name = self._name()
         self._expect("=")
-        value: list[str] = []
-        while (token := self._next()) != ";":
-            value.append(token)
-        number = _integer(value[0]) if len(value) == 1 else None
+        number = self._evaluated(self._until(";"), "/".join([*scope, ""]))
         if number is not None:
             self._types.constants["/".join([*scope, name])] = number
 
@@ -278,6 +320,67 @@ class _Parser:
         self._expect("{")
         while self._next() != "}":
             pass
+
+
+class _Expression:
+    """An integer expression.
+
+    Args:
+        tokens: Its tokens.
+        value: Returns the value of a number or a name; raises ValueError without one.
+    """
+
+    def __init__(self, tokens: list[str], value: Callable[[str], int]) -> None:
+        self._tokens = tokens
+        self._value = value
+        self._at = 0
+
+    def whole(self) -> int:
+        """Its value.
+
+        Raises:
+            ValueError: It is no integer expression, nested too deep or too large.
+            ZeroDivisionError: It divides by zero.
+        """
+        found = self._binary(0, 0)
+        if self._at < len(self._tokens):
+            raise ValueError(self._tokens[self._at])
+        return found
+
+    def _binary(self, binding: int, depth: int) -> int:
+        """A value and the operators behind it that bind more tightly."""
+        found = self._unary(depth)
+        while True:
+            sign = "".join(self._tokens[self._at : self._at + 1])
+            if sign in {"<", ">"}:
+                sign = "".join(self._tokens[self._at : self._at + 2])
+            tightness, apply = _OPERATORS.get(sign, (0, operator.add))
+            if tightness <= binding:
+                return found
+            self._at += len(sign)
+            other = self._binary(tightness, depth)
+            if len(sign) == 2 and not 0 <= other < 64:
+                raise ValueError(sign)
+            found = apply(found, other)
+            if abs(found) > _MAX_VALUE:
+                raise ValueError(sign)
+
+    def _unary(self, depth: int) -> int:
+        negate = False
+        while (word := "".join(self._tokens[self._at : self._at + 1])) in {"+", "-"}:
+            self._at += 1
+            negate ^= word == "-"
+        self._at += 1
+        if word != "(":
+            found = self._value(word or ")")
+        elif depth == _MAX_DEPTH:
+            raise ValueError(word)
+        else:
+            found = self._binary(0, depth + 1)
+            if self._tokens[self._at : self._at + 1] != [")"]:
+                raise ValueError(word)
+            self._at += 1
+        return -found if negate else found
 
 
 def _integer(token: str) -> int | None:

@@ -1,22 +1,30 @@
 """Parses `.msg`, `.srv` and `.action` definitions into unresolved fields.
 
-Each line is one field, so lines are matched one by one. `definition.py` resolves the type
-names of the result. Text without a wire form (comments, constants, defaults, annotations)
-is dropped here.
+Each line is one field, so lines are matched one by one. As in genmsg, only a newline ends a
+line or a comment. `definition.py` resolves the type names of the result. Text without a wire
+form (comments, constants, defaults, annotations) is dropped here.
+
+The parser of rosbags is not used: it refuses CRLF, a byte order mark, services and missing
+newlines, reads prose as fields, and takes 3 s for 20,000 blank lines.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from hybridlog_storage.errors import DefinitionError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 MAX_NAME = 255
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
 _SEPARATOR = re.compile(r"={20,}\s*\Z")
 _HEADER = re.compile(r"(MSG|IDL|SRV|ACTION):\s*(\S+)\s*\Z")
+_RULE = "=" * 80
 _PART_RULE = "---"
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
@@ -75,13 +83,16 @@ def canonical(name: str) -> str:
 
 
 def split_sections(text: str) -> list[Section]:
-    """Split a concatenation at its lines of `=`, each followed by a header line."""
+    """Split a concatenation at its lines of `=`, each followed by a header line.
+
+    The newlines around such a line may be missing.
+    """
     sections: list[Section] = []
     name = kind = ""
     lines: list[str] = []
     expect_header = True
     started = False
-    for line in text.removeprefix("\ufeff").splitlines():
+    for line in _lines(text.removeprefix("\ufeff")):
         if _SEPARATOR.match(line):
             if started:
                 sections.append(Section(name, kind, "\n".join(lines)))
@@ -100,6 +111,20 @@ def split_sections(text: str) -> list[Section]:
     return sections
 
 
+def _lines(text: str) -> Iterator[str]:
+    """The lines of a concatenation; separators get lines of their own."""
+    lines = text.split("\n")
+    for number, line in enumerate(lines):
+        if _RULE in line:
+            end = line.rindex("=") + 1
+            before, behind = line[:end].rstrip("="), line[end:].strip()
+            following = lines[number + 1] if number + 1 < len(lines) else ""
+            if end - len(before) >= len(_RULE) and _HEADER.match(behind or following.strip()):
+                yield from (before, _RULE, behind)
+                continue
+        yield line
+
+
 def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
     """Parse the fields of one `.msg` text, in order.
 
@@ -112,7 +137,7 @@ def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
         DefinitionError: A line is neither a field, a constant nor a comment.
     """
     fields: list[RawField] = []
-    for number, raw_line in enumerate(text.splitlines(), 1):
+    for number, raw_line in enumerate(text.split("\n"), 1):
         line = raw_line.strip()
         if not line or line[0] in "#@":
             continue
@@ -171,7 +196,7 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
         DefinitionError: It has not two or three parts, or an invalid line.
     """
     parts: list[list[str]] = [[]]
-    for line in text.splitlines():
+    for line in text.split("\n"):
         if line.strip() == _PART_RULE:
             parts.append([])
         else:
@@ -213,4 +238,4 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
 
 def has_parts(text: str) -> bool:
     """True if a text is that of a service or an action."""
-    return any(line.strip() == _PART_RULE for line in text.splitlines())
+    return any(line.strip() == _PART_RULE for line in text.split("\n"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, cast
 
@@ -34,10 +35,12 @@ from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Set as AbstractSet
 
     import numpy as np
     import pyarrow as pa
     from google.protobuf.descriptor import Descriptor, FieldDescriptor
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import Message
     from numpy.typing import NDArray
@@ -186,44 +189,78 @@ def _message_class(schema: Schema) -> type[Message]:
             f"more than {MAX_DEFINITION} are not read"
         )
     pool = DescriptorPool()
+    problem: Exception | None = None
     try:
-        _fill(pool, schema.data)
-        made: type[Message] = GetMessageClass(pool.FindMessageTypeByName(schema.name))
+        problem = _fill(pool, schema.data)
+        descriptor = pool.FindMessageTypeByName(schema.name.removeprefix("."))
+        made: type[Message] = GetMessageClass(descriptor)
     except KeyError as error:
-        raise DefinitionError(f"{schema.name}: the definition does not say what it is") from error
+        what = f"is malformed ({problem})" if problem else "does not say what it is"
+        raise DefinitionError(f"{schema.name}: the definition {what}") from error
     except (DecodeError, TypeError, ValueError, RecursionError) as error:
         raise DefinitionError(f"{schema.name}: the definition is malformed ({error})") from error
     return made
 
 
-def _fill(pool: DescriptorPool, data: bytes) -> None:
-    """Add all files of a set to a pool, each after its imports."""
+def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
+    """Adds all files of a set to a pool, each after its imports.
+
+    Imports that the set lacks are dropped: they matter only if a type of theirs is used.
+
+    Returns:
+        The reason why a file could not be added, None if all were.
+
+    Raises:
+        ValueError: Files import each other in a circle.
+    """
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-    waiting = {file.name: file for file in FileDescriptorSet.FromString(data).file}
-    added: set[str] = set()
-    while waiting:
-        ready = [f for f in waiting.values() if not (set(f.dependency) - added) & waiting.keys()]
-        if not ready:
-            raise ValueError(f"files import each other: {', '.join(sorted(waiting))[:200]}")
-        for file in ready:
-            for name in file.dependency:
-                _fill_standard(pool, name, added)
-            if file.name not in added:
-                pool.AddSerializedFile(file.SerializeToString())
-                added.add(file.name)
-            del waiting[file.name]
+    files = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+    if b"google.protobuf." in data:
+        for name in sorted(_STANDARD - files.keys()):
+            files[name] = _standard_file(name)
+    for file in files.values():
+        _drop_imports(file, files.keys())
+    graph = {name: set(file.dependency) for name, file in files.items()}
+    try:
+        waiting = list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        raise ValueError(f"files import each other: {', '.join(error.args[1])[:200]}") from error
+    problem: Exception | None = None
+    # Twice, since an import can have another name than the file, and thus no place in the order.
+    for _ in range(2):
+        problem, failed = None, []
+        for name in waiting:
+            try:
+                pool.AddSerializedFile(files[name].SerializeToString())
+            except TypeError as error:
+                problem = problem or error
+                failed.append(name)
+        waiting = failed
+    return problem
 
 
-def _fill_standard(pool: DescriptorPool, name: str, added: set[str]) -> None:
-    """Adds one of protobuf's own files, after the files that it imports."""
-    if name in added or name not in _STANDARD:
+def _drop_imports(file: FileDescriptorProto, known: AbstractSet[str]) -> None:
+    """Removes the imports of a file that are not known."""
+    names = list(file.dependency)
+    kept = [n for n, name in enumerate(names) if name in known]
+    if len(kept) == len(names):
         return
+    moved = {old: new for new, old in enumerate(kept)}
+    for field in (file.public_dependency, file.weak_dependency):
+        left = [moved[n] for n in field if n in moved]
+        del field[:]
+        field.extend(left)
+    del file.dependency[:]
+    file.dependency.extend(names[n] for n in kept)
+
+
+def _standard_file(name: str) -> FileDescriptorProto:
+    """One of protobuf's own files."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
+
     module = import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
-    for needed in module.DESCRIPTOR.dependencies:
-        _fill_standard(pool, needed.name, added)
-    pool.AddSerializedFile(module.DESCRIPTOR.serialized_pb)
-    added.add(name)
+    return FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
 
 
 def _plain(message: Message, *, whole: bool = False) -> dict[str, Plain]:

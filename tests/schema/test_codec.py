@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import struct
 import sys
 from collections.abc import Iterator
 from functools import lru_cache
@@ -12,6 +14,8 @@ from typing import Any
 
 import bson
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from bson.int64 import Int64
 from hypothesis import Phase, given, settings
@@ -398,6 +402,27 @@ def test_big_arrays_of_objects_are_views() -> None:
     assert not message.data.flags.owndata
 
 
+def test_arrays_without_elements() -> None:
+    rule = "=" * 80
+    codec = ros1(
+        "uint8[0] a\nuint8 b\nfloat64[0] c\nstring[0] d\nSub[0] e\nSub[] f\ntime[0] g\nint16 h\n"
+        f"{rule}\nMSG: pkg/Sub\nuint8[0] z\nint8 w\n"
+    )
+    payload = struct.pack("<BI2bh", 7, 2, 1, 2, -3)
+    inner = [{"z": [], "w": 1}, {"z": [], "w": 2}]
+    wanted = {"a": [], "b": 7, "c": [], "d": [], "e": [], "f": inner, "g": [], "h": -3}
+    assert codec.plain(payload) == wanted
+    for count in (1, 20):
+        length = np.full(count, len(payload))
+        found = codec.arrow(payload * count, np.arange(count) * len(payload), length, None)
+        table = pa.Table.from_struct_array(found.records)
+        stream = io.BytesIO()
+        pq.write_table(table, stream)
+        assert pq.read_table(stream).to_pylist() == table.to_pylist() == [wanted] * count
+    decoded: Any = codec.decode(payload)
+    assert (decoded.b, len(decoded.a), len(decoded.f), decoded.h) == (7, 0, 2, -3)
+
+
 @pytest.mark.parametrize(
     ("encoding", "schema", "reason"),
     [
@@ -639,6 +664,64 @@ def protobuf_channel() -> Channel:
     files = FileDescriptorSet(file=[file])
     files.file.add().ParseFromString(timestamp_pb2.DESCRIPTOR.serialized_pb)
     return Channel("/p", "protobuf", Schema("t.All", "protobuf", files.SerializeToString()))
+
+
+def a_file(name: str, imports: list[str], kind: str = "", package: str = "t") -> Any:
+    """A file of one message with one field."""
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
+
+    file = FileDescriptorProto(name=name, package=package, syntax="proto3", dependency=imports)
+    field = file.message_type.add(name="T").field.add(name="x", number=1, label=1)
+    field.type = Field.TYPE_MESSAGE if kind else Field.TYPE_INT32
+    if kind:
+        field.type_name = kind
+    return file
+
+
+def codec_of_files(*files: Any) -> Any:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    data = FileDescriptorSet(file=files).SerializeToString()
+    return codec_for(Channel("/p", "protobuf", Schema("t.T", "protobuf", data)))
+
+
+def test_descriptor_sets_with_imports_that_lack() -> None:
+    from google.protobuf import any_pb2, descriptor_pb2, type_pb2
+
+    stamp, other = ".google.protobuf.Timestamp", a_file("o.proto", [], package="o")
+    for imports in (["google/protobuf/timestamp.proto"], ["timestamp.proto"], []):
+        assert [p.type for p in codec_of_files(a_file("t.proto", imports, stamp)).paths()] == [
+            "time"
+        ]
+    for files in (
+        [a_file("t.proto", ["gone.proto"])],
+        [a_file("t.proto", ["google/protobuf/any.proto"])],
+        [a_file("t.proto", []), a_file("b.proto", ["gone.proto"], ".gone.T", package="b")],
+    ):
+        assert [(p.path, p.type) for p in codec_of_files(*files).paths()] == [("x", "int32")]
+    for name in ("o.proto", "src/o.proto"):
+        codec = codec_of_files(a_file("t.proto", ["gone.proto", name], ".o.T"), other)
+        assert [p.path for p in codec.paths()] == ["x", "x.x"]
+    public = a_file("t.proto", ["gone.proto", "o.proto", "far.proto"], ".o.T")
+    public.public_dependency.extend([0, 1])
+    public.weak_dependency.append(2)
+    assert codec_of_files(public, other).indexed
+    assert public.SerializeToString()
+    for own in (any_pb2, type_pb2):  # the other one is supplied
+        given = descriptor_pb2.FileDescriptorProto.FromString(own.DESCRIPTOR.serialized_pb)
+        user = a_file("t.proto", ["google/protobuf/type.proto"], ".google.protobuf.Type")
+        assert codec_of_files(user, given).indexed
+
+
+def test_descriptor_sets_that_are_refused() -> None:
+    assert (
+        "couldn't resolve name '.gone.T'"
+        in codec_of_files(a_file("t.proto", ["gone.proto"], ".gone.T")).reason
+    )
+    circle = [a_file("t.proto", ["b.proto"]), a_file("b.proto", ["t.proto"], package="b")]
+    assert "import each other" in codec_of_files(*circle).reason
+    assert "does not say" in codec_of_files(a_file("o.proto", [], package="o")).reason
 
 
 def test_protobuf_rules() -> None:

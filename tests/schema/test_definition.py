@@ -411,8 +411,18 @@ def test_msg_and_idl_may_be_mixed():
         ("struct T { sequence<sequence<long>> x; };", "sequence of sequences"),
         ("typedef long a[2]; struct T { sequence<a> x; }; }; };", "array of arrays"),
         ("typedef a b; typedef b a; struct T { a x; }; }; };", "circle"),
-        ("struct T { long x[1 << 4]; };", "expected ']'"),
-        ("struct T { long x[N]; };", "must be a number or a constant"),
+        ("struct T { long x[N]; };", "must be a number or a constant, found 'N'"),
+        ("struct T { long x[]; };", "must be a number or a constant"),
+        ("struct T { long x[1 +]; };", "must be a number or a constant, found '1 +'"),
+        ("struct T { long x[(1]; };", "ends too early"),
+        ("struct T { long x[2 3]; };", "must be a number or a constant"),
+        ("struct T { long x[1 / 0]; };", "must be a number or a constant"),
+        ("struct T { long x[1 - 2]; };", "must be a number or a constant"),
+        ("struct T { long x[1 << 64]; };", "must be a number or a constant"),
+        ("struct T { long x[1.5]; };", "must be a number or a constant"),
+        ("const long N = 1 << 60 << 60; struct T { long x[N]; };", "found 'N'"),
+        (f"struct T {{ long x[{'(' * 17}1{')' * 17}]; }};", "must be a number or a constant"),
+        ("struct B; struct T { B x; }; }; };", "does not say what"),
         ("struct T { long x", "ends too early"),
         ("struct T { Other x; }; }; };", "does not say what"),
         ("struct T { long x; }; struct T { long y; };", "defined twice"),
@@ -427,6 +437,97 @@ def test_idl_that_is_refused(body, reason):
     with pytest.raises(DefinitionError, match="pkg/") as caught:
         parse(f"module pkg {{ module msg {{ {body}", "ros2idl")
     assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("size", "value"),
+    [
+        ("2 * (3 + 1)", 8),
+        ("1 << 4", 16),
+        ("0xFF & 0x0F | 16 ^ 1", 31),
+        ("20 - 10 - 5", 5),
+        ("100 / 10 / 5", 2),
+        ("-7 / 2 + 10", 7),
+        ("-7 % 4 + 10", 7),
+        ("- -+5", 5),
+        ("LOW * -2", 6),
+        ("1 + 1 << 2 - 1", 4),
+        ("64 >> 2 * 2", 4),
+        ("12 & 6 << 1", 12),
+        (f"{'(' * 15}7{')' * 15}", 7),
+    ],
+)
+def test_integer_expressions_of_idl(size, value):
+    text = f"""module pkg {{ module msg {{
+      const long LOW = -3; const double HALF = 0.5 * 2; const string S = "a;b]";
+      const long N = {size};
+      struct T {{ long a[{size}]; sequence<long, ({size})> b; string<N> c; long d[N]; }};
+    }}; }};""".replace("(64 >> 2 * 2)", "(64 >> 4)")
+    expected = {
+        "a": f"int32[{value}]",
+        "b": f"int32[<={value}]",
+        "c": f"string<={value}",
+        "d": f"int32[{value}]",
+    }
+    assert listing(parse(text, "ros2idl")) == expected
+
+
+def test_forward_declarations_and_other_idl():
+    text = "module a { struct B; struct T { B b; }; struct B { long x; }; };"
+    for encoding in ("ros2idl", "omgidl"):
+        found = parse(f"#pragma once\n{text}", encoding, "a::T")
+        assert listing(found) == {"b": "a/B", "b.x": "int32"}
+
+
+# --- lines and separators
+
+
+@pytest.mark.parametrize("odd", ["\f", "\v", "\r", "\x1c", "\x85", "\u2028", "\u2029", "\0"])
+@pytest.mark.parametrize("encoding", ["ros1msg", "ros2msg"])
+def test_only_a_newline_ends_a_comment(odd, encoding):
+    text = f"# as {odd}uint8 T\nuint8 A=1 # {odd}uint8 b\nfloat64 x # {odd}rac\nfloat64 y{odd}\n"
+    if odd == "\0":
+        text = text.replace("y\0", "y")
+    found = listing(parse(text, encoding, "pkg/T"))
+    assert found == {"x": "float64", "y": "float64"}
+    table = get_types_from_msg(text.replace(f"y{odd}", "y"), "pkg/msg/T")
+    assert [name for name, _ in table["pkg/msg/T"][1]] == ["x", "y"]
+
+
+def test_line_ends_of_other_systems():
+    for encoding in ("ros1msg", "ros2msg"):
+        assert listing(parse("uint8 a\r\n# b\r\nuint8 c\r\n", encoding)) == {
+            "a": "uint8",
+            "c": "uint8",
+        }
+    assert listing(parse("uint8 a\r# b\ruint8 c")) == {"a": "uint8", "c": "uint8"}
+    with pytest.raises(DefinitionError, match="line 1"):
+        parse("uint8 a\r# b\ruint8 c", "ros1msg")
+
+
+@pytest.mark.parametrize("before", ["\n", "", " ", " # a comment", "\n# ="])
+@pytest.mark.parametrize("after", ["\n", "", "  \r\n"])
+@pytest.mark.parametrize("encoding", ["ros1msg", "ros2msg"])
+def test_missing_newlines_around_separators(before, after, encoding):
+    text = (
+        f"pkg/Sub sub{before}{RULE}{after}MSG: pkg/Sub\n"
+        f"float64 x{before}{RULE}{after}MSG: other/Lone\nuint8 y"
+    )
+    assert listing(parse(text, encoding)) == {"sub": "pkg/Sub", "sub.x": "float64"}
+
+
+def test_rules_in_comments_and_constants_separate_nothing():
+    text = f"# {RULE}\nstring A={RULE}\nuint8 x\n# {RULE}\n# MSG: pkg/T\nuint8 y # {RULE} z\n"
+    for encoding in ("ros1msg", "ros2msg"):
+        assert listing(parse(text, encoding)) == {"x": "uint8", "y": "uint8"}
+
+
+def test_arrays_without_elements():
+    text = f"uint8[0] a\nSub[0] b\n{RULE}\nMSG: pkg/Sub\nstring[0] c\n"
+    expected = {"a": "uint8[0]", "b": "pkg/Sub[0]", "b[].c": "string[0]"}
+    assert listing(parse(text, "ros1msg")) == expected
+    with pytest.raises(DefinitionError, match="from 1 to"):
+        parse(text)
 
 
 # --- hostile and broken definitions
