@@ -178,8 +178,8 @@ def pytest_unconfigure() -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """One more than there are processors: much of the time is waiting for others."""
-    return (os.cpu_count() or 1) + 1
+    """Two more than there are processors: much of the time is waiting for others."""
+    return (os.cpu_count() or 1) + 2
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -34,6 +34,7 @@ def run(out: Path, *arguments: str) -> list[Sample]:
     return list(Journal(out).samples.values())
 
 
+@pytest.mark.exhaustive
 def test_every_backend_stores_what_it_says(tmp_path: Path) -> None:
     samples = run(tmp_path, "throughput", "--only", "throughput", *TINY)
     assert {sample.backend for sample in samples} == set(BACKENDS)
