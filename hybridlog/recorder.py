@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridlog.capture import Capture
 from hybridlog.entries import text
+from hybridlog.latched_front import LatchedFront
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -48,6 +49,8 @@ class RecordOptions:
         tags: Tags of the recording.
         matcher: Selects topics; None for all.
         between: Log time `[begin, end)`, ns; None for all.
+        latched: With `between`, also the latched messages that are in force when it begins.
+        original_times: They keep their log time, instead of that of the beginning.
         again: True to record even if the same content is in the store.
         settings: Rotation, chunks and compression of segments.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
@@ -57,6 +60,8 @@ class RecordOptions:
     tags: Mapping[str, str] = field(default_factory=dict)
     matcher: TopicMatcher | None = None
     between: tuple[int, int] | None = None
+    latched: bool = True
+    original_times: bool = False
     again: bool = False
     settings: SegmentSettings = field(default_factory=SegmentSettings)
     no_index: TopicMatcher | None = None
@@ -74,6 +79,8 @@ class RecordReport:
         failure: The reason why they are missing.
         skipped: Messages left out by topic or time.
         elapsed_s: Wall time, seconds.
+        latched: Latched messages from before the time range.
+        latched_left_out: Those that were in force and did not fit in memory.
     """
 
     entry: RecordingEntry
@@ -83,6 +90,8 @@ class RecordReport:
     failure: DatabaseError | None
     skipped: int
     elapsed_s: float
+    latched: int = 0
+    latched_left_out: int = 0
 
 
 def record(
@@ -135,7 +144,7 @@ def record(
         check=refuse_known,
     )
     try:
-        skipped = _copy(source, capture.writer, options, progress)
+        skipped, front = _copy(source, capture.writer, options, progress)
         _check_result(source, capture.writer, options)
         failure = capture.close(_end_of(source))
     except BaseException:
@@ -150,6 +159,8 @@ def record(
         failure,
         skipped,
         time.monotonic() - started,
+        latched=front.messages if front is not None else 0,
+        latched_left_out=front.left_out if front is not None else 0,
     )
 
 
@@ -158,46 +169,62 @@ def _copy(
     writer: RecordingWriter,
     options: RecordOptions,
     progress: Callable[[int, int], None] | None,
-) -> int:
-    """Copy every wanted message from the source to the writer; returns the number left out."""
-    choice = _Choice(options)
-    skipped = 0
+) -> tuple[int, LatchedFront | None]:
+    """Copy every wanted message from the source to the writer.
+
+    Returns:
+        The number of messages left out, and the latched messages in front of a slice.
+    """
+    front = None
+    if options.between is not None and options.latched:
+        front = LatchedFront(options.between[0], original_times=options.original_times)
+    choice = _Choice(options, front)
+    read = 0
     for batch in source.batches():
-        for extra in source.extras:
-            if not extra.name.startswith(OUR_NAMES):
-                writer.add_extra(extra)
-        source.extras.clear()
-        kept = choice.of(batch, source.channels)
-        skipped += len(batch) - len(kept)
-        writer.append(kept, source.channels)
+        _copy_extras(source, writer)
+        read += len(batch)
+        writer.append(choice.of(batch, source.channels), source.channels)
         if progress is not None:
             progress(source.bytes_read, writer.totals.messages)
+    for batch in front.batches() if front is not None else ():
+        writer.append(batch, source.channels)
+    _copy_extras(source, writer)
+    return read - writer.totals.messages, front
+
+
+def _copy_extras(source: Source, writer: RecordingWriter) -> None:
     for extra in source.extras:
         if not extra.name.startswith(OUR_NAMES):
             writer.add_extra(extra)
     source.extras.clear()
-    return skipped
 
 
 class _Choice:
     """Selects the wanted messages."""
 
-    def __init__(self, options: RecordOptions) -> None:
+    def __init__(self, options: RecordOptions, front: LatchedFront | None) -> None:
         self._matcher = options.matcher
         self._between = options.between
+        self._front = front
         self._wanted: list[bool] = []
 
     def of(self, batch: Batch, channels: list[Channel]) -> Batch:
-        mask: NDArray[np.bool_] | None = None
+        """The wanted messages of a batch."""
         if self._matcher is not None:
             for channel in channels[len(self._wanted) :]:
                 self._wanted.append(self._matcher(channel.topic))
-            mask = np.array(self._wanted, np.bool_)[batch.channel]
+            batch = _where(batch, np.array(self._wanted, np.bool_)[batch.channel])
         if self._between is not None:
             begin, end = self._between
             inside = (batch.log_time >= begin) & (batch.log_time < end)
-            mask = inside if mask is None else mask & inside
-        return batch if mask is None or bool(mask.all()) else batch.take(mask)
+            if self._front is not None:
+                batch, inside = self._front.split(batch, inside, channels)
+            batch = _where(batch, inside)
+        return batch
+
+
+def _where(batch: Batch, mask: NDArray[np.bool_]) -> Batch:
+    return batch if mask.all() else batch.take(mask)
 
 
 def _check_result(source: Source, writer: RecordingWriter, options: RecordOptions) -> None:

@@ -24,11 +24,18 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
     if counters.chunks_read:
         taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
     given = counters.messages - counters.reduced
-    found = "" if count else f"{output.counted(given, 'message')}, "
+    found = "" if count else f"{output.counted(given, 'message')}{latched(counters)}, "
     output.note(
         f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
         f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"
     )
+
+
+def latched(counters: Counters) -> str:
+    """The end of a number of messages: ` and 2 latched messages in front`, if any."""
+    if not counters.latched:
+        return ""
+    return f" and {output.counted(counters.latched, 'latched message')} in front"
 
 
 def print_gaps(query: Query, between: tuple[str, str] | None) -> None:

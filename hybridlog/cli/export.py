@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_gaps
+from hybridlog.cli.answer_notes import latched, print_gaps
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
 from hybridlog.cli.query_options import query_of
 from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.write_answer import Front, write_answer
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
@@ -41,6 +42,8 @@ _EXACT = {"mcap", "bag"}
 @options.recordings
 @options.only_topics
 @options.between
+@options.no_latched
+@options.original_times
 @options.force
 @options.mongo
 @options.quiet
@@ -52,12 +55,16 @@ def command(
     recording: tuple[str, ...],
     topic: tuple[str, ...],
     between: tuple[str, str] | None,
+    no_latched: bool,
+    original_times: bool,
     force: bool,
     mongo: str | None,
     quiet: bool,
 ) -> None:
     """Export whole recordings; tables get one file a topic."""
     form = form or _form(target)
+    options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
+    front = Front(latched=not no_latched, original_times=original_times)
     if form in _EXACT:
         check_room(target, form=form, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
@@ -66,8 +73,10 @@ def command(
             raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
         if between is not None:
             query = query.between(*between)
-        write = _write_file if form in _EXACT else _write_directory
-        write(query, form, target, force=force, quiet=quiet)
+        if form in _EXACT:
+            _write_file(query, form, target, front, force=force, quiet=quiet)
+        else:
+            _write_directory(query, form, target, force=force, quiet=quiet)
         if not quiet:
             print_gaps(query, between)
 
@@ -82,11 +91,11 @@ def _form(target: Path) -> str:
     return form
 
 
-def _write_file(query: Query, form: str, target: Path, *, force: bool, quiet: bool) -> None:
-    from hybridlog.cli.write_answer import write_answer
-
+def _write_file(
+    query: Query, form: str, target: Path, front: Front, *, force: bool, quiet: bool
+) -> None:
     with if_stopped(f"{target} is not written."), replacing(target, form=form, force=force):
-        write_answer(query, form, target, quiet=quiet)
+        write_answer(query, form, target, front=front, quiet=quiet)
     _print_written(target, query, 0, quiet=quiet)
 
 
@@ -104,8 +113,6 @@ def _write_directory(query: Query, form: str, directory: Path, *, force: bool, q
 
 
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    from hybridlog.cli.write_answer import write_answer
-
     paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
     for path in paths.values():
         check_room(path, form=form, force=force)
@@ -142,6 +149,7 @@ def _print_written(path: Path, query: Query, missing: int, *, quiet: bool) -> No
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
         output.note(
-            f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}, "
+            f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}"
+            f"{latched(query.counters)}, "
             f"{output.size(path.stat().st_size)}"
         )

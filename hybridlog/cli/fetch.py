@@ -17,6 +17,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.write_answer import Front, write_answer
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ class _Choices:
     count: bool
     form: str | None
     output: Path | None
+    no_latched: bool
+    original_times: bool
     force: bool
     mongo: str | None
     quiet: bool
@@ -121,6 +124,8 @@ class _Choices:
     metavar="FILE",
     help="Write to this file (raw: a directory); - is standard output.",
 )
+@options.no_latched
+@options.original_times
 @options.force
 @options.mongo
 @options.quiet
@@ -162,16 +167,19 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
         from hybridlog.cli.screen import print_answer
 
         return print_answer(query)
-    from hybridlog.cli.write_answer import write_answer
-
+    # With --at, the answer is one message.
+    front = Front(
+        latched=not choices.no_latched and choices.at is None,
+        original_times=choices.original_times,
+    )
     if path is None:
-        missing = write_answer(query, form, sys.stdout.buffer, quiet=True)
+        missing = write_answer(query, form, sys.stdout.buffer, front=front, quiet=True)
     else:
         with (
             if_stopped(f"{path} is not written."),
             replacing(path, form=form, force=choices.force),
         ):
-            missing = write_answer(query, form, path, quiet=choices.quiet)
+            missing = write_answer(query, form, path, front=front, quiet=choices.quiet)
     print_unreadable(missing)
     print_reduced(query.counters.reduced)
     return query
@@ -218,6 +226,9 @@ def _form(choices: _Choices) -> str:
         form = "table" if sys.stdout.isatty() else "jsonl"
     else:
         form = _form_of(choices.output)
+    options.check_latched(
+        no_latched=choices.no_latched, original_times=choices.original_times, form=form
+    )
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
     return form

@@ -96,6 +96,16 @@ between = click.option(
     help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
     "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
 )
+no_latched = click.option(
+    "--no-latched",
+    is_flag=True,
+    help="With --between: leave out the latched messages from before it.",
+)
+original_times = click.option(
+    "--original-times",
+    is_flag=True,
+    help="Latched messages from before the time range keep their log time.",
+)
 where = click.option(
     "--where",
     multiple=True,
@@ -111,6 +121,26 @@ at_least = click.option(
 tags = click.option(
     "--tag", multiple=True, metavar="K=V", help="Store KEY=VALUE with it. Repeatable."
 )
+
+
+def check_latched(*, no_latched: bool, original_times: bool, form: str | None) -> None:
+    """Refuse options about latched messages that have no effect.
+
+    Args:
+        no_latched: `--no-latched` was given.
+        original_times: `--original-times` was given.
+        form: Format of the output; None for a recording.
+
+    Raises:
+        UsageError: They contradict each other, or the format has no such messages.
+    """
+    if no_latched and original_times:
+        raise UsageError("--no-latched leaves no messages for --original-times: give one of them.")
+    if original_times and form not in {None, "mcap", "bag"}:
+        raise UsageError(
+            f"Latched messages from before the time range are in mcap and bag, not in {form}: "
+            "leave out --original-times."
+        )
 
 
 def parse_tags(pairs: Iterable[str]) -> dict[str, str]:

@@ -78,6 +78,8 @@ def _is_file(word: str) -> bool:
     help="No documents in MongoDB for these: questions about them read tables. Repeatable.",
 )
 @options.between
+@options.no_latched
+@options.original_times
 @click.option("--name", metavar="NAME", help="Name of the recording; without, the file's.")
 @options.tags
 @click.option("--again", is_flag=True, help="Record it even if its content is in the store.")

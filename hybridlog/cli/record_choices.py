@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from hybridlog.cli import output
+from hybridlog.cli.options import check_latched
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class RecordChoices:
     exclude: tuple[str, ...]
     no_index: tuple[str, ...]
     between: tuple[str, str] | None
+    no_latched: bool
+    original_times: bool
     name: str | None
     tag: tuple[str, ...]
     again: bool
@@ -83,9 +86,14 @@ def check_choices(choices: RecordChoices) -> None:
     if not choices.is_live:
         if choices.name is not None and len(choices.paths) > 1:
             raise UsageError("--name names one recording: give one path, or leave it out.")
+        check_latched(
+            no_latched=choices.no_latched, original_times=choices.original_times, form=None
+        )
         return
     if choices.between is not None or choices.again:
         raise UsageError("--between and --again are for logs, not for a running robot.")
+    if choices.no_latched or choices.original_times:
+        raise UsageError("--no-latched and --original-times are for --between, and logs.")
     if choices.master is not None and not choices.master.strip():
         raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
     if choices.qos is not None and not choices.ros2:

@@ -121,6 +121,8 @@ def _record_one(
             tags=tags,
             matcher=matcher,
             between=_between(source, choices),
+            latched=not choices.no_latched,
+            original_times=choices.original_times,
             again=choices.again,
             settings=settings,
             no_index=no_index,
@@ -141,7 +143,8 @@ def _check_not_empty(
     report: RecordReport, source: Source, store: Store, options: RecordOptions
 ) -> None:
     """Remove an empty recording, and fail: its time range holds no message."""
-    if options.between is None or report.entry.messages or not report.skipped:
+    messages = report.entry.messages - report.latched
+    if options.between is None or messages or not report.skipped + report.latched:
         return
     store.refresh()
     store.remove(report.entry.id)
@@ -248,6 +251,7 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "messages_indexed": report.indexed,
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
         "messages_skipped": report.skipped,
+        "messages_latched": report.latched,
         "bytes_in": entry.source["bytes"],
         "bytes_stored": entry.stored_bytes,
         "ratio": round(_ratio(entry.source["bytes"], entry.stored_bytes), 3),
@@ -270,6 +274,8 @@ def _print_one(path: Path, report: RecordReport) -> None:
     taken = int(entry.source["bytes"])
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
     left_out = f" ({report.skipped} left out)" if report.skipped else ""
+    if report.latched:
+        left_out += f"; {report.latched} of them latched, from before the time range"
     output.print_table(
         [("recording", "left"), (entry.label, "left")],
         [
@@ -357,6 +363,11 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
                 f"{channel.topic}: {output.unfit(channel.stats.unreadable)}; stored, without "
                 "fields in the index"
             )
+    if report.latched_left_out:
+        output.note(
+            f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
+            "the time range did not fit in memory."
+        )
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
         lost = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
@@ -15,13 +16,29 @@ if TYPE_CHECKING:
 Progress = Callable[[], None]
 
 
-def write_answer(query: Query, form: str, target: Target, *, quiet: bool = False) -> int:
+@dataclass(frozen=True, slots=True)
+class Front:
+    """The choice of latched messages from before the time range, in MCAP and bag files.
+
+    Attributes:
+        latched: They are written.
+        original_times: They keep their log time.
+    """
+
+    latched: bool = True
+    original_times: bool = False
+
+
+def write_answer(
+    query: Query, form: str, target: Target, *, front: Front = Front(), quiet: bool = False
+) -> int:
     """Write the answer of a query, all of it or nothing.
 
     Args:
         query: The query.
         form: A format of `hybridlog.export.FORMATS`.
         target: Path or binary stream.
+        front: The latched messages in front of the answer.
         quiet: No progress bar.
 
     Returns:
@@ -37,22 +54,24 @@ def write_answer(query: Query, form: str, target: Target, *, quiet: bool = False
             bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
         if FORMATS[form].kind == "exact":
-            _write_exact(query, form, target, progress)
+            _write_exact(query, form, target, front, progress)
             return 0
         written = _write_rows(query, form, target, progress)
         return counters.messages - counters.reduced - written
 
 
-def _write_exact(query: Query, form: str, target: Target, progress: Progress) -> None:
+def _write_exact(query: Query, form: str, target: Target, front: Front, progress: Progress) -> None:
     from hybridlog.export import open_batch_writer
 
+    before = query.copy()
     with open_batch_writer(form, target, profile=_profile(query)) as exact:
-        if form != "raw":
-            for batch, channels in query.latched():
+        if form != "raw" and front.latched:
+            for batch, channels in before.latched(original_times=front.original_times):
                 exact.write(batch, [c.channel for c in channels])
         for batch, channels in query.batches():
             exact.write(batch, [c.channel for c in channels])
             progress()
+    query.counters.add(before.counters)
 
 
 def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> int:

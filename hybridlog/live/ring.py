@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import NamedTuple
 
-from hybridlog.latching import depth_of
+from hybridlog.latching import depth_of, publisher_of
 from hybridlog_storage.messages import Channel
 
-_MAX_LATCHED = 32 << 20  # payload bytes of one channel; its last message always stays
+_MAX_LATCHED = 32 << 20  # payload bytes of one publisher; its last message always stays
 
 
 class BufferedMessage(NamedTuple):
@@ -21,11 +24,32 @@ class BufferedMessage(NamedTuple):
     sequence: int
 
 
+@dataclass(slots=True)
+class _Latched:
+    """The last messages of a publisher, and the sum of their payload bytes."""
+
+    messages: deque[BufferedMessage] = field(default_factory=deque)
+    size: int = 0
+
+    def add(self, message: BufferedMessage, depth: int) -> None:
+        self.messages.append(message)
+        self.size += len(message.payload)
+        while len(self.messages) > depth or (self.size > _MAX_LATCHED and len(self.messages) > 1):
+            self.size -= len(self.messages.popleft().payload)
+
+
+def _latch(latched: dict[Hashable, _Latched], message: BufferedMessage) -> None:
+    """Hold a message if its channel latches; the depth bounds how many stay."""
+    depth = depth_of(message.channel)
+    if depth:
+        latched.setdefault(publisher_of(message.channel), _Latched()).add(message, depth)
+
+
 class Ring:
     """Holds the messages of a time span, or as many as fit.
 
-    Latched messages stay until newer ones replace them, whatever their age: later messages
-    cannot be understood without them.
+    Latched messages that leave it are held until newer ones that leave it replace them: later
+    messages cannot be understood without them.
 
     Args:
         span_ns: The span, by the messages' log time.
@@ -36,15 +60,12 @@ class Ring:
         self._span = span_ns
         self._max_bytes = max_bytes
         self._messages: deque[BufferedMessage] = deque()
-        self._latched: dict[Channel, deque[BufferedMessage]] = {}
+        self._latched: dict[Hashable, _Latched] = {}
         self._bytes = 0
         self._cut = False
 
     def add(self, message: BufferedMessage) -> None:
         """Add a message, and drop those that are too old or too many."""
-        depth = depth_of(message.channel)
-        if depth:
-            self._latch(message, depth)
         self._messages.append(message)
         self._bytes += len(message.payload)
         oldest = message.log_time - self._span
@@ -52,23 +73,31 @@ class Ring:
             self._messages and self._messages[0].log_time < oldest
         ):
             self._cut |= is_full
-            self._bytes -= len(self._messages.popleft().payload)
+            dropped = self._messages.popleft()
+            self._bytes -= len(dropped.payload)
+            _latch(self._latched, dropped)
 
     def since(self, begin: int) -> list[BufferedMessage]:
         """The messages from a log time on, ns, in arrival order.
 
-        Older latched messages come first, with the log time `begin`, so that the slice
-        spans no more than requested. Their publish time still tells when they were sent.
+        The latched messages in force at that time come first, with the log time `begin`, so
+        that the slice spans no more than requested. Their publish time still tells when they
+        were sent.
         """
-        found = [message for message in self._messages if message.log_time >= begin]
-        present = {id(message) for message in found}
-        front = [
-            message._replace(log_time=begin, publish_time=message.publish_time or message.log_time)
-            for latched in self._latched.values()
-            for message in latched
-            if id(message) not in present and message.log_time < begin
+        latched: dict[Hashable, _Latched] = {}
+        for message in (m for each in self._latched.values() for m in each.messages):
+            _latch(latched, message)
+        for message in self._messages:
+            if message.log_time < begin:
+                _latch(latched, message)
+        front = sorted(
+            (m for each in latched.values() for m in each.messages if m.log_time < begin),
+            key=attrgetter("log_time"),
+        )
+        return [
+            *(m._replace(log_time=begin, publish_time=m.publish_time or m.log_time) for m in front),
+            *(m for m in self._messages if m.log_time >= begin),
         ]
-        return front + found
 
     def latest(self, topic: str, begin: int, limit: int) -> list[BufferedMessage]:
         """The latest messages of a topic since a log time, ns, at most `limit`."""
@@ -79,12 +108,6 @@ class Ring:
             if message.channel.topic == topic:
                 found.append(message)
         return found
-
-    def _latch(self, message: BufferedMessage, depth: int) -> None:
-        latched = self._latched.setdefault(message.channel, deque(maxlen=depth))
-        latched.append(message)
-        while len(latched) > 1 and sum(len(h.payload) for h in latched) > _MAX_LATCHED:
-            latched.popleft()
 
     @property
     def payload_bytes(self) -> int:

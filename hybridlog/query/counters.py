@@ -18,6 +18,7 @@ class Counters:
 
     Attributes:
         messages: Messages in the answer.
+        latched: Latched messages in front of it, which are not in `messages`.
         payload_bytes: Bytes of their payloads.
         bytes_read: Bytes read from segments and tables.
         chunks_read: Chunks read and decompressed.
@@ -28,6 +29,7 @@ class Counters:
     """
 
     messages: int = 0
+    latched: int = 0
     payload_bytes: int = 0
     bytes_read: int = 0
     chunks_read: int = 0

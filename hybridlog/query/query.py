@@ -302,11 +302,21 @@ class Query:
             if len(batch):
                 yield batch, run.channels
 
-    def latched(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
-        """Latched messages from before the time range that are in force when it begins."""
+    def latched(
+        self, *, original_times: bool = False
+    ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """Latched messages from before the time range that are in force when it begins.
+
+        They are those that a subscriber receives which joins at that time. Their log time is
+        the beginning of the range. Take them before `batches`, and with separate counters.
+
+        Args:
+            original_times: They keep their own log time.
+        """
         from hybridlog.query.answers.latched import in_force
 
-        return in_force(self._session, self.question, self.counters)
+        self.counters.reset()
+        return in_force(self._session, self.question, self.counters, original_times=original_times)
 
     def count(self) -> int:
         """Number of messages."""

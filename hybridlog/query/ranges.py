@@ -176,8 +176,6 @@ class RangeResolver:
 
     def beginnings(self) -> Iterator[tuple[RecordingSummary, int]]:
         """Recordings that begin before the range does, and the beginning of the range, ns."""
-        if self._question.clock != "log" and self._question.bounds is not None:
-            return
         seen: set[str] = set()
         for recording, (begin, _) in self.spans():
             if recording.id not in seen and recording.extent[0] < begin:

@@ -17,7 +17,9 @@ import pyarrow.parquet
 import pytest
 
 from hybridlog.cli.answer_notes import print_cost
+from hybridlog.cli.options import check_latched
 from hybridlog.query.counters import Counters
+from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
 
 from . import odd_log
@@ -246,13 +248,35 @@ def test_raw_directory(store: Path, scans: list[Seen], tmp_path: Path) -> None:
 
 
 def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
-    run(
-        *("fetch", "-t", "scan", "-t", "tf_static", "-r", "robot", "--between", "+2s", "+3s"),
-        *("-o", tmp_path / "x.mcap"),
-        store=store,
-    )
+    asked = ("-t", "scan", "-t", "tf_static", "-r", "robot", "--between", "+2s", "+3s")
+    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", store=store)
     static = next(m for m in seen if m.topic == "/tf_static")
-    assert read_mcap(tmp_path / "x.mcap")[0].payload == static.payload
+    found = read_mcap(tmp_path / "x.mcap")
+    assert found[0].payload == static.payload
+    assert found[0].log_time > static.log_time
+    assert f"{len(found) - 1} messages and 1 latched message in front, " in done.err
+    done = run("export", *asked, tmp_path / "y.mcap", "--original-times", store=store)
+    assert f"{len(found) - 1} messages and 1 latched message in front, " in done.err
+    assert read_mcap(tmp_path / "y.mcap") == [static, *found[1:]]
+    done = run("fetch", *asked, "-o", tmp_path / "z.mcap", "--no-latched", store=store)
+    assert read_mcap(tmp_path / "z.mcap") == found[1:]
+    assert "latched" not in done.err
+    # The message at a time is one message.
+    at = ("fetch", "-t", "tf_static", "-r", "robot", "--at", "+2s", "-o", tmp_path / "at.mcap")
+    assert "1 message, " in run(*at, store=store).err
+
+
+def test_options_about_latched_messages_without_any() -> None:
+    def refused(form: str | None, *, no_latched: bool, original_times: bool) -> str:
+        with pytest.raises(UsageError) as error:
+            check_latched(no_latched=no_latched, original_times=original_times, form=form)
+        return str(error.value)
+
+    assert "give one of them" in refused(None, no_latched=True, original_times=True)
+    assert "not in csv" in refused("csv", no_latched=False, original_times=True)
+    for form in ("mcap", "bag", None):
+        check_latched(no_latched=False, original_times=True, form=form)
+    check_latched(no_latched=True, original_times=False, form="csv")
 
 
 def test_nothing_is_overwritten_without_force(store: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import hybridlog as hl
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
 
@@ -71,6 +72,24 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert {c.compression for c in summary.chunk_indexes} <= {"lz4", ""}
+
+
+def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> None:
+    seen = read_bag(logs / "robot.bag")
+    start = min(m.log_time for m in seen) + 2 * 10**9
+    asked = ("record", logs / "robot.bag", "-t", "tf_static", "-t", "odom", "--again")
+    between = ("--between", "+2s", "+2100ms")
+    inside = [m for m in seen if m.topic == "/odom" and start <= m.log_time < start + 10**8]
+    with hl.open(tmp_path / "s", create=True):
+        done = run(*asked, *between, store=tmp_path / "s")
+        assert f"{len(inside) + 1} ({len(seen) - len(inside) - 1} left out); 1 of them" in done.out
+        found = run(*asked, *between, "--no-latched", "--json", store=tmp_path / "s").json
+        assert (found["messages"], found["messages_latched"]) == (len(inside), 0)
+        # A range without messages is refused, although a latched message is in force.
+        first = min(m.log_time for m in inside)
+        empty = ("--between", f"{first + 1}ns", f"{first + 2}ns")
+        assert "has no message from" in run(*asked, *empty, store=tmp_path / "s", code=2).err
+        assert len(recordings(tmp_path / "s")) == 2
 
 
 def test_several_paths(logs: Path, tmp_path: Path) -> None:

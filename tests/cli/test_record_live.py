@@ -249,6 +249,7 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
         ("", "Nothing to record"),
         ("--replay {bag} {bag}", "not both"),
         ("--replay {bag} --between +1s +2s", "for logs"),
+        ("--replay {bag} --no-latched", "and logs"),
         ("--replay {bag} --throttle /a", "(--throttle TOPIC RATE)"),
         ("--replay {bag} --throttle /a --duration 1s", "(--throttle TOPIC RATE), not '/a'"),
         ("--replay {bag} --priority /a --duration 1s", "(--priority TOPIC WORD), not '/a'"),

@@ -70,6 +70,35 @@ def test_latched_messages_stay_and_stand_in_front() -> None:
     assert not ring.is_short
 
 
+def test_what_is_in_force_when_a_snapshot_begins_not_when_it_ends() -> None:
+    deep = "- durability: transient_local\n  depth: 2"
+    named = Channel("/map", "cdr", TEXT, {"offered_qos_profiles": deep})
+    restarted = [Channel("/tf", "ros1", TEXT, {"latching": "1", "callerid": "/n"}) for _ in "ab"]
+    ring = Ring(100 * SECOND, 1 << 20)
+    for second in range(6):
+        ring.add(BufferedMessage(named, b"%d" % second, T + second * SECOND, None, 0))
+        ring.add(BufferedMessage(restarted[second % 2], b"tf", T + second * SECOND, None, 0))
+    found = [(m.channel.topic, m.payload, m.publish_time) for m in ring.since(T + 3 * SECOND)]
+    assert found[:3] == [
+        ("/map", b"1", T + SECOND),
+        ("/map", b"2", T + 2 * SECOND),
+        ("/tf", b"tf", T + 2 * SECOND),
+    ]
+    assert len(found) == 9
+
+
+def test_deep_publishers_are_held_in_bounded_memory() -> None:
+    keeping_all = "- durability: 1\n  history: 2"
+    channel = Channel("/log", "cdr", TEXT, {"offered_qos_profiles": keeping_all})
+    ring = Ring(SECOND, 1 << 30)
+    for second in range(6):
+        ring.add(BufferedMessage(channel, bytes(10 << 20), T + second * SECOND, None, second))
+    assert [m.sequence for m in ring.since(T + 6 * SECOND)] == [3, 4, 5]
+    ring.add(BufferedMessage(channel, bytes(40 << 20), T + 8 * SECOND, None, 8))
+    ring.add(BufferedMessage(channel, b"", T + 10 * SECOND, None, 9))
+    assert [m.sequence for m in ring.since(T + 9 * SECOND)] == [8, 9]
+
+
 class Robot:
     def __init__(self, store: hl.Store, snapshots: SnapshotOptions, budget: int = 1 << 20) -> None:
         self.speaker = Speaker()

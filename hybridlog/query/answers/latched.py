@@ -1,78 +1,168 @@
-"""Latched messages: those still in force when a slice begins."""
+"""Latched messages: those that a subscriber receives which joins when a slice begins."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.latching import depth_of
+from hybridlog.latching import depth_of, publisher_of
+from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
+from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 
 if TYPE_CHECKING:
-    from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
+    from hybridlog_storage.summary import RecordingSummary
+
+_Key = tuple[int, int]
+"""Log time, ns, and arrival number of a message."""
+
+_FIRST: _Key = (-1, -1)
+"""Before any message."""
 
 
 def in_force(
-    session: Session, question: Question, counters: Counters
+    session: Session, question: Question, counters: Counters, *, original_times: bool
 ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
     """Latched messages from before the time range of a question, which precede its answer.
 
     Their log time becomes the beginning of the range, which keeps the slice within the
     range. The publish time remains the time at which they were sent.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Count the messages, as `latched`, and what is read.
+        original_times: The messages keep their log time.
     """
-    for recording, begin in RangeResolver(session, question).beginnings():
-        channels = session.channels(session.entry_of(recording))
-        latching = {c.channel.topic for c in channels if depth_of(c.channel)}
-        topics = sorted(latching.intersection(question.topics))
-        if not topics:
-            continue
-        before = replace(
-            question,
-            topics=tuple(topics),
-            recordings=(recording.id,),
-            bounds=(0, begin),
-            clock="log",
-            predicate=None,
-            during=None,
-            limit=None,
-            every=1,
-            reverse=True,
-        )
-        yield from _last(session, before, counters, begin)
+    for summary, begin in _beginnings(session, question):
+        recording = session.entry_of(summary)
+        channels = _latching(session, question, recording)
+        for batch, own in _LatchedScan(session, recording, begin, counters).read(channels):
+            counters.latched += len(batch)
+            if not original_times:
+                has_publish_time = np.array([c.channel.has_publish_time for c in own])
+                batch.publish_time = np.where(
+                    has_publish_time[batch.channel], batch.publish_time, batch.log_time
+                )
+                batch.log_time = np.full(len(batch), begin, np.int64)
+            yield batch, own
 
 
-def _last(
-    session: Session, before: Question, counters: Counters, begin: int
-) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
-    """The last messages of each latching channel, oldest first."""
-    room: list[int] = []
-    found: list[Batch] = []
-    channels: Sequence[RecordedChannel] = ()
-    # The runs of one recording have the same channels.
-    for run in Planner(session, before, counters).runs():
-        if not channels:
-            channels = run.channels
-            room = [depth_of(channel.channel) for channel in channels]
-        rows = []
-        for row, index in enumerate(run.batch.channel.tolist()):
-            if room[index] > 0:
-                room[index] -= 1
-                rows.append(row)
-        if rows:
-            found.append(run.batch.take(np.array(rows[::-1], np.intp)))
-        if not any(room):
-            break
-    has_publish_time = np.array([c.channel.has_publish_time for c in channels])
-    for batch in reversed(found):
-        batch.publish_time = np.where(
-            has_publish_time[batch.channel], batch.publish_time, batch.log_time
-        )
-        batch.log_time = np.full(len(batch), begin, np.int64)
-        yield batch, channels
+def _beginnings(session: Session, question: Question) -> Iterator[tuple[RecordingSummary, int]]:
+    """Recordings that begin before the range does, and the log time at which it begins, ns.
+
+    By another clock, the range begins with the first message of the answer.
+    """
+    if question.is_by_log_time:
+        yield from RangeResolver(session, question).beginnings()
+        return
+    for summary, _, _ in RangeResolver(session, question).resolve():
+        if _latching(session, question, session.entry_of(summary)):
+            first = replace(question, recordings=(summary.id,), limit=1, every=1, reverse=False)
+            for run in Planner(session, first, Counters()).runs():
+                yield summary, int(run.batch.log_time[0])
+
+
+def _latching(
+    session: Session, question: Question, recording: RecordingEntry
+) -> list[RecordedChannel]:
+    """The latching channels of a question in a recording."""
+    wanted = set(question.topics)
+    return [
+        channel
+        for channel in session.channels(recording)
+        if channel.channel.topic in wanted and depth_of(channel.channel)
+    ]
+
+
+class _LatchedScan:
+    """Reads the last messages of each publisher before a log time, in order.
+
+    The first pass goes back from that time, one publisher after the other, and finds the
+    first message in force. The second one reads from there on, so memory is bounded by the
+    chunks that overlap in time, whatever the depth.
+    """
+
+    def __init__(
+        self, session: Session, recording: RecordingEntry, begin: int, counters: Counters
+    ) -> None:
+        self._session = session
+        self._recording = recording
+        self._begin = begin
+        self._counters = counters
+        # The statistics of a running recording are not complete.
+        self._has_ended = recording.status != "open"
+
+    def read(
+        self, channels: Sequence[RecordedChannel]
+    ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """The messages in force on some latching channels."""
+        publishers: dict[Hashable, list[RecordedChannel]] = defaultdict(list)
+        for channel in channels:
+            first = channel.stats.first
+            is_before = first is not None and first < self._begin
+            if is_before or not self._has_ended:
+                publishers[publisher_of(channel.channel)].append(channel)
+        own: list[RecordedChannel] = []
+        cuts: list[_Key] = []
+        scans: list[RecordingScan] = []
+        for group in publishers.values():
+            cut = self._first_in_force(group)
+            scans.append(self._scan(group, cut[0], len(own)))
+            own += group
+            cuts += [cut] * len(group)
+        if not own:
+            return
+        times, numbers = np.array(cuts, np.int64).T
+        plan = ScanPlan(own, [_together(scans)], counters=self._counters)
+        whole = np.array([not channel.is_reduced for channel in own], np.bool_)
+        for run in ChunkScan(plan, self._session.segment).runs():
+            of, time = run.batch.channel, run.batch.log_time
+            at = times[of]
+            keep = (time > at) | ((time == at) & (run.seq >= numbers[of]))
+            self._counters.reduced += int((keep & ~whole[of]).sum())
+            keep &= whole[of]
+            if keep.any():
+                yield run.batch.take(keep), own
+
+    def _first_in_force(self, group: Sequence[RecordedChannel]) -> _Key:
+        """The first of the last messages of some publishers that displace one another."""
+        left = max(depth_of(channel.channel) for channel in group)
+        if self._has_ended and left >= sum(channel.stats.messages for channel in group):
+            return _FIRST
+        plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
+        cut = _FIRST
+        for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
+            row = min(left, len(run.batch)) - 1
+            cut = int(run.batch.log_time[row]), int(run.seq[row])
+            left -= row + 1
+            if not left:
+                break
+        return cut
+
+    def _scan(self, group: Sequence[RecordedChannel], begin: int, first: int) -> RecordingScan:
+        """The scan of some channels from a log time on; their indexes begin with `first`."""
+        indexes = {channel.channel_id: first + row for row, channel in enumerate(group)}
+        bounds = max(begin, 0), self._begin
+        chunks = self._session.chunks(self._recording, [*indexes], bounds, "log")
+        return RecordingScan(self._recording, indexes, bounds, chunks)
+
+
+def _together(scans: Sequence[RecordingScan]) -> RecordingScan:
+    """One scan of everything, which reads each chunk once."""
+    bounds = [scan.bounds for scan in scans if scan.bounds is not None]
+    return RecordingScan(
+        scans[0].recording,
+        {channel: index for scan in scans for channel, index in scan.channels.items()},
+        (min(begin for begin, _ in bounds), bounds[0][1]),
+        [*{(c.segment, c.number): c for scan in scans for c in scan.chunks}.values()],
+    )
