@@ -26,6 +26,7 @@ from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
     StoreError,
+    TopicError,
     UsageError,
 )
 from hybridlog_storage.settings import (
@@ -36,12 +37,13 @@ from hybridlog_storage.settings import (
 )
 
 if TYPE_CHECKING:
+    from hybridlog.across.align import Aligned
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
-    from hybridlog.query.times import TimeLike
+    from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
@@ -286,6 +288,59 @@ class Store:
         if isinstance(topics, str):
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self.session, Question(*self.session.having(topics, recordings)))
+
+    def align(
+        self,
+        base: str | Query,
+        others: str | Query | Sequence[str | Query],
+        *,
+        how: str = "asof",
+        tolerance: DurationLike | None = None,
+        fields: Mapping[str, Sequence[str]] | None = None,
+        clock: str = "log",
+    ) -> Aligned:
+        """Make a table of topics side by side: a row for each message of one topic.
+
+        Columns are `log_time`, `recording` if there are several, and the fields of each topic
+        behind its full name without the first slash: `odom.pose.pose.position.x`. For each of
+        `others`, `scan.distance` is the time of its message minus that of the row. Where no
+        message is near enough, its columns are null.
+
+        Args:
+            base: The topic whose messages are the rows, by name, or a query about one.
+            others: The topics beside it, by names, or queries, such as with `where`.
+            how: `asof`: the last message not after the row. `nearest`: the nearest one, the
+                earlier of two. `interpolate`: between the last one and the next one.
+            tolerance: Greatest distance in time; None for any.
+            fields: Paths of the fields wanted, by topic name; None for all. Queries may bring
+                their own.
+            clock: The time that is compared: `log`, `publish` or `header`.
+
+        Raises:
+            TopicError: no such topic or field, or a topic does not have the clock.
+            UsageError: an unknown way or clock, a base of several topics, or a query with
+                limit, every or reverse.
+            TimeError: the tolerance is no duration.
+        """
+        from hybridlog.across.align import side_by_side
+
+        beside = [others] if isinstance(others, str | Query) else others
+        chosen = dict(fields or {})
+        queries = [self._query_of(one, chosen) for one in (base, *beside)]
+        if chosen:
+            raise TopicError(f"{', '.join(chosen)} of fields is no topic of this alignment.")
+        questions = [query.question for query in queries]
+        return side_by_side(
+            self.session, questions[0], questions[1:], how=how, tolerance=tolerance, clock=clock
+        )
+
+    def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
+        """A query about a topic, with its share of the fields, which is taken out of them."""
+        query = self.topic(name) if isinstance(name, str) else name
+        for key in [*fields]:
+            if key == name or self.topic(key).topics == query.topics:
+                query = query.fields(*fields.pop(key))
+        return query
 
     # Changes.
 

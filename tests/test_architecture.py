@@ -52,7 +52,9 @@ ALLOWED = {
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "pandas": ("hybridlog.frames",),
+    "polars": ("hybridlog.frames.polars",),
     "pyarrow": (
+        "hybridlog.across",
         "hybridlog.cli",
         "hybridlog.export",
         "hybridlog.frames",

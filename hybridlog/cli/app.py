@@ -30,6 +30,8 @@ COMMANDS: Final = (
     "fetch",
     "intervals",
     "changes",
+    "align",
+    "resample",
     "export",
     "index",
     "reindex",

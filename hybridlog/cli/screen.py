@@ -56,6 +56,17 @@ def print_answer(query: Query) -> Query:
     return answered
 
 
+def print_table_rows(table: pa.Table) -> None:
+    """Print the rows of a table for people to read; the first column is their title."""
+    answer = _cells(table)
+    if answer.rows and output.fits(answer.names, answer.rows):
+        output.print_table([(name, "left") for name in answer.names], answer.rows)
+        return
+    for row in answer.rows:
+        cells = zip(answer.names[1:], row[1:], strict=True)
+        output.print_record(row[0], [(name, cell) for name, cell in cells if cell])
+
+
 def _cells(table: pa.Table) -> _Answer:
     columns = [[_cell(value) for value in column] for column in table.columns]
     rows = [list(row) for row in zip(*columns, strict=True)]

@@ -157,6 +157,8 @@ def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
     time = np.concatenate([block.log_time for block in blocks])
     order = np.concatenate([block.order for block in blocks])
     later = time[1:] > time[:-1]
+    if later.all():
+        return None
     if bool((later | ((time[1:] == time[:-1]) & (order[1:] >= order[:-1]))).all()):
         return None
     return np.lexsort((order, time))

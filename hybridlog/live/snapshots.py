@@ -20,7 +20,7 @@ from hybridlog.losses import Cause, Ledger
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import numbers_at, to_bool
 from hybridlog.query.predicate.types import check
-from hybridlog.query.topics import TopicMatcher, matcher
+from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -64,12 +64,11 @@ class Trigger:
             TopicError: The pattern is malformed.
             WhereError: The predicate is malformed.
         """
-        topic, _, predicate = text.partition(": ")
-        topic = topic.strip().removesuffix(":")
+        topic, predicate = split_topic(text)
         if not topic:
             raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
         fits = matcher([topic])
-        asked = parse(predicate) if predicate.strip() else None
+        asked = parse(predicate) if predicate else None
         for path in [] if asked is None else asked.fields():
             if path.split(".", 1)[0] in {"_id", "_meta"}:
                 raise WhereError(

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.across.align import Aligned
     from hybridlog.message import Message
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.intervals import Intervals
@@ -469,6 +470,31 @@ class Query:
         from hybridlog.frames.answer import schema_of
 
         return schema_of(Planner(self._session, self.question, Counters()))
+
+    def resample(
+        self,
+        step: DurationLike,
+        how: str = "asof",
+        tolerance: DurationLike | None = None,
+    ) -> Aligned:
+        """The topics at regular log times: every `step` from the beginning of each recording.
+
+        With `between` or `during`, from the beginning of the range. Columns are those of
+        `Store.align`; those of a single topic have no prefix.
+
+        Args:
+            step: Time between two rows, a duration.
+            how: `asof`, `nearest` or `interpolate`, as for `Store.align`.
+            tolerance: Greatest distance in time; None for any.
+
+        Raises:
+            UsageError: an unknown way, a step of 0, another clock than the log's, or limit,
+                every or reverse.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.across.align import resampled
+
+        return resampled(self._session, self.question, step, how, tolerance)
 
     def to_json_lines(self) -> Iterator[list[str]]:
         """The answer in order as lines of JSON, many at a time."""

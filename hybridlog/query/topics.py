@@ -47,6 +47,15 @@ def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
     return list(found)
 
 
+def split_topic(text: str) -> tuple[str, str]:
+    """The topic before the first colon that a space follows, and the rest: `TOPIC: PREDICATE`.
+
+    A text without such a colon is a topic alone.
+    """
+    topic, _, rest = text.partition(": ")
+    return topic.strip().removesuffix(":"), rest.strip()
+
+
 class TopicMatcher:
     """Tests each topic as it appears, if the topics are not known in advance.
 

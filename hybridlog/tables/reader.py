@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.column import ranges
 from hybridlog.tables.fields import UnfitError, alike, original_name, records_of
 from hybridlog.tables.layout import (
@@ -621,7 +622,7 @@ def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: st
 def _records(columns: list[Any], named: Sequence[Any], rows: int) -> Any:
     """Columns as fields of messages, under their own names."""
     if not columns:
-        return pa.array([{}] * rows, pa.struct([]))
+        return structs({}, rows)
     fields = [field.with_type(column.type) for field, column in zip(named, columns, strict=True)]
     return records_of(pa.StructArray.from_arrays(columns, fields=fields))
 

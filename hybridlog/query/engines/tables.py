@@ -101,7 +101,8 @@ class TablesEngine:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows for which the predicate holds, in order."""
-        self.check(part)
+        if part.predicate is not None:
+            self.check(part)
         for rows, holds in self._rows(part, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
             if len(chosen):
@@ -213,6 +214,8 @@ def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructA
 def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.StructArray:
     import pyarrow as pa
 
+    from hybridlog.schema.arrow_columns import structs
+
     names, columns = [], []
     for field, column in zip(records.type, records.flatten(), strict=True):
         below = [path[1:] for path in paths if path[0] == field.name]
@@ -222,7 +225,7 @@ def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.Struc
         names.append(field.name)
         columns.append(column if is_whole else _pruned(column, below))
     if not names:
-        return pa.array([{}] * len(records), pa.struct([]))
+        return structs({}, len(records))
     return pa.StructArray.from_arrays(columns, names=names)
 
 

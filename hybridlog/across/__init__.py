@@ -1,0 +1,1 @@
+"""Questions across topics: joins by time and sets of messages."""

@@ -1,0 +1,652 @@
+"""Topics side by side: a row for each message of one topic, with what others said then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.across.interpolate import interpolated, quaternion_paths
+from hybridlog.across.match import HOWS, UNKNOWN, How, match
+from hybridlog.frames.answer import stream
+from hybridlog.frames.names import free_name
+from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog.schema.arrow_columns import DURATION, numbers
+from hybridlog.schema.arrow_types import common_schema, common_type, converted
+from hybridlog.schema.column import STAMP
+from hybridlog_storage.errors import TimeError, UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from hybridlog.query.question import Clock, Question
+    from hybridlog.query.ranges import Resolved
+    from hybridlog.session import Session
+
+MAX_TIMES = 100_000_000
+"""Maximum number of rows of `resample`."""
+_GRID_ROWS = 65_536
+_TIME = "log_time"
+_RECORDING = "recording"
+_DISTANCE = "distance"
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One topic of an alignment.
+
+    Attributes:
+        question: The question about the topic.
+        prefix: Beginning of its columns' names; empty for none.
+    """
+
+    question: Question
+    prefix: str
+
+
+class Base(Protocol):
+    """What the rows are: messages of a topic, or regular times."""
+
+    @property
+    def question(self) -> Question:
+        """The question; its recordings and times are those of the rows."""
+
+    def empty(self) -> pa.Table:
+        """No rows, with the columns of all of them."""
+
+    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+        """Times of the rows of a recording, ns, and their columns, in order.
+
+        Args:
+            recording: Id of the recording.
+        """
+
+
+class Aligned:
+    """The messages of topics side by side. Each access reads them again.
+
+    Rows are ordered by recording, oldest first, then by log time. Messages of different
+    recordings are never in one row.
+
+    Args:
+        session: The open store.
+        base: The rows.
+        others: The topics beside them.
+        how: Which message of each.
+        tolerance: Greatest distance in time, a duration; None for any.
+        clock: The time that is compared.
+        counters: Count what the answer costs.
+
+    Attributes:
+        counters: The cost of the last answer.
+
+    Raises:
+        UsageError: an unknown way or clock, or a question with limit, every or reverse.
+        TopicError: a topic does not have the clock.
+        TimeError: the tolerance is no duration.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        base: Base,
+        others: Sequence[Stream],
+        *,
+        how: str,
+        tolerance: DurationLike | None,
+        clock: Clock,
+        counters: Counters,
+    ) -> None:
+        if how not in HOWS:
+            raise UsageError(f"Unknown way {how!r}; choose {', '.join(HOWS)}.")
+        self.counters = counters
+        self._session = session
+        self._base = base
+        self._others = others
+        self._how: How = how
+        self._clock: Clock = clock
+        self._tolerance = None if tolerance is None else parse_duration(tolerance)
+
+    def __repr__(self) -> str:
+        names = [name for stream in self._others for name in stream.question.topics]
+        return f"<Aligned {', '.join(names)}; {self._how}>"
+
+    def to_tables(self) -> Iterator[pa.Table]:
+        """The rows in Arrow tables of bounded size; at least one, possibly empty.
+
+        The type of a column may differ between tables if no definition fixes it.
+        """
+        self.counters.reset()
+        partners = [
+            _Partner(
+                self._session,
+                other,
+                how=self._how,
+                tolerance=self._tolerance,
+                clock=self._clock,
+                counters=self.counters,
+            )
+            for other in self._others
+        ]
+        several = len(self._session.chosen(self._base.question)) > 1
+        given = False
+        for resolved in RangeResolver(self._session, self._base.question).resolve():
+            recording = resolved.summary.id
+            for partner in partners:
+                partner.enter(recording, _end_of(resolved, self._clock))
+            for times, table in self._base.tables(recording):
+                label = resolved.summary.label if several else None
+                yield _side_by_side(table, label, [p.rows(times) for p in partners])
+                given = given or bool(table.num_rows)
+        if not given:
+            empty = self._base.empty()
+            none = np.empty(0, np.int64)
+            yield _side_by_side(empty, "" if several else None, [p.rows(none) for p in partners])
+
+    def batches(self) -> Iterator[pa.RecordBatch]:
+        """The rows in Arrow record batches of bounded size."""
+        for table in self.to_tables():
+            yield from table.combine_chunks().to_batches()
+
+    def to_arrow(self) -> pa.Table:
+        """The rows as one Arrow table, first column log time."""
+        return together(list(self.to_tables()))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The rows as a frame, indexed by log time (UTC, ns)."""
+        from hybridlog.frames.frame import frame_of
+
+        table = self.to_arrow()
+        names = table.column_names[1:]
+        return frame_of(table[_TIME], ((name, table[name]) for name in names))
+
+    def to_polars(self) -> Any:
+        """The rows as a polars frame.
+
+        Raises:
+            MissingDependencyError: polars is not installed.
+        """
+        from hybridlog.frames.polars import to_polars
+
+        return to_polars(self.to_arrow())
+
+    def schema(self) -> pa.Schema | None:
+        """Columns where only messages determine them, which are read; None otherwise."""
+        questions = [self._base.question, *(other.question for other in self._others)]
+        known = (self._session.field_types(q.topics, q.recordings) for q in questions)
+        if all(types is not None for types in known):
+            return None
+        return common_schema(self.to_tables())
+
+
+class TopicBase:
+    """The messages of a topic as rows.
+
+    Args:
+        session: The open store.
+        stream: The topic.
+        clock: The time of the rows.
+        counters: Count what is read.
+    """
+
+    def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
+        self._reader = _Reader(session, stream, clock, counters)
+
+    @property
+    def question(self) -> Question:
+        """The question about the topic."""
+        return self._reader.question
+
+    def empty(self) -> pa.Table:
+        """No rows, with all columns."""
+        table = self._reader.empty()[1]
+        return self._reader.named(table, _TIME, table[_TIME])
+
+    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+        """Times and columns of the messages of a recording, in order."""
+        for times, table in self._reader.tables(recording):
+            yield times, self._reader.named(table, _TIME, table[_TIME])
+
+
+class RegularTimes:
+    """Regular times as rows: from the beginning of each recording, or of the asked range.
+
+    Args:
+        session: The open store.
+        question: The question whose recordings and range count.
+        step: Time between two rows, ns.
+
+    Raises:
+        UsageError: the step is zero.
+    """
+
+    def __init__(self, session: Session, question: Question, step: int) -> None:
+        if step == 0:
+            raise UsageError("A step of 0 gives no times: name a duration, such as 100ms.")
+        self.question = question
+        self._step = step
+        spans: dict[str, list[tuple[int, int]]] = {}
+        for summary, span in RangeResolver(session, question).spans():
+            spans.setdefault(summary.id, []).append(span)
+        self._spans = spans
+        rows = sum((end - begin) // step for found in spans.values() for begin, end in found)
+        if rows > MAX_TIMES:
+            raise UsageError(f"There would be {rows} rows; use a longer step or a time range.")
+
+    def empty(self) -> pa.Table:
+        """No rows."""
+        return pa.table({_TIME: numbers(np.empty(0, np.int64), "time")})
+
+    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+        """The times in a recording."""
+        for begin, end in self._spans.get(recording, []):
+            first = begin
+            while first < end:
+                last = min(end, first + _GRID_ROWS * self._step)
+                times = np.arange(first, last, self._step, dtype=np.int64)
+                yield times, pa.table({_TIME: numbers(times, "time")})
+                first = last if last == end else first + len(times) * self._step
+
+
+class _Reader:
+    """Reads one topic with its times on a clock.
+
+    Args:
+        session: The open store.
+        stream: The topic.
+        clock: The clock.
+        counters: Count what is read.
+    """
+
+    def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
+        question = stream.question
+        if not question.returns_all or question.reverse:
+            raise UsageError(
+                "An alignment uses all messages; it cannot be combined with limit, every or "
+                "reverse."
+            )
+        self.prefix = stream.prefix
+        self._session = session
+        self._counters = counters
+        known = session.field_types(question.topics, question.recordings)
+        self.quaternions = quaternion_paths(known)
+        self._own: str | None = None  # column that only tells the time
+        self._clock_column = _TIME
+        if clock != "log":
+            # Refused where the topic does not have the clock.
+            asked = replace(question, clock=clock, bounds=question.bounds or (None, None))
+            Planner(session, asked, Counters()).parts()
+            self._clock_column = STAMP if clock == "header" else "publish_time"
+            question = self._with_clock(question, known)
+        self.question = question
+
+    def _with_clock(self, question: Question, known: dict[str, str] | None) -> Question:
+        name, fields = self._clock_column, question.fields
+        if fields is None:
+            if name == STAMP:
+                return question
+            if known is None:
+                raise UsageError("The fields of this topic are not fixed: name them.")
+            fields = tuple(dict.fromkeys(path.split(".")[0].split("[")[0] for path in known))
+        if not any(path == name or name.startswith(f"{path}.") for path in fields):
+            self._own = name
+            fields = (*fields, name)
+        return replace(question, fields=fields)
+
+    def empty(self) -> tuple[NDArray[np.int64], pa.Table]:
+        """No rows, with the columns of all recordings."""
+        question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
+        table = next(stream(Planner(self._session, question, Counters())))
+        return self._times(table), table
+
+    def tables(
+        self, recording: str, span: tuple[int, int] | None = None
+    ) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+        """Times, ns, and columns of the messages of a recording, by log time.
+
+        Args:
+            recording: Id of the recording.
+            span: Log time `[begin, end)`, ns, of a question without a range.
+        """
+        places = self._session.chosen(self.question)
+        snapshot = self._session.snapshot()
+        if snapshot.by_id[recording] not in places:
+            return
+        question = replace(self.question, recordings=(recording,))
+        if span is not None:
+            question = replace(question, bounds=span)
+        counters = Counters()
+        try:
+            for table in stream(Planner(self._session, question, counters)):
+                if table.num_rows:
+                    yield self._times(table), table
+        except TimeError:
+            return  # the range does not touch this recording
+        finally:
+            self._counters.add(counters)
+
+    def latest(self, recording: str, moment: int) -> int | None:
+        """Log time of the last message of a recording by a time, ns."""
+        if moment >= TIME_LIMIT - 1:
+            return None
+        question = replace(self.question, recordings=(recording,))
+        found = message_at(self._session, question, self._counters, moment)
+        return None if found is None else found.log_time_ns
+
+    def following(self, recording: str, moment: int) -> int | None:
+        """Log time just behind the first message of a recording from a time on, ns."""
+        later = replace(
+            self.question, recordings=(recording,), bounds=(moment, TIME_LIMIT - 1), limit=1
+        )
+        counters = Counters()
+        try:
+            for run in Planner(self._session, later, counters).runs():
+                return int(run.batch.log_time[0]) + 1
+        except TimeError:
+            return moment  # the recording ends before
+        finally:
+            self._counters.add(counters)
+        return moment
+
+    def _times(self, table: pa.Table) -> NDArray[np.int64]:
+        column = table[self._clock_column]
+        if column.null_count:
+            column = column.cast(pa.int64()).fill_null(UNKNOWN)
+        whole = column.chunk(0) if column.num_chunks == 1 else column
+        times: NDArray[np.int64] = whole.to_numpy().view(np.int64)
+        return times
+
+    def named(self, table: pa.Table, first: str, column: Any) -> pa.Table:
+        """The columns of the answer, under their names in it.
+
+        Args:
+            table: The messages.
+            first: Name of the first column, which no field takes.
+            column: That column.
+        """
+        found: dict[str, Any] = {first: column}
+        own = {_TIME, _RECORDING, self._own}
+        for name, values in zip(table.column_names, table.columns, strict=True):
+            if name not in own:
+                found[free_name(self.prefix + name, found)] = values
+        return pa.table(found)
+
+
+class _Partner:
+    """A topic beside the rows: gives the messages that belong to times.
+
+    By the log clock the topic is read in step with the rows, one block at a time. By other
+    clocks the messages of a recording are sorted in memory.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        stream: Stream,
+        *,
+        how: How,
+        tolerance: int | None,
+        clock: Clock,
+        counters: Counters,
+    ) -> None:
+        self._reader = _Reader(session, stream, clock, counters)
+        self._how = how
+        self._tolerance = tolerance
+        self._clock = clock
+        self._none = self._reader.empty()
+        self._recording = ""
+        self._end: int | None = None
+        self._blocks: Iterator[tuple[NDArray[np.int64], pa.Table]] | None = None
+        self._times, self._table = self._none
+        self._last: tuple[int, pa.Table] | None = None  # the message before those of the table
+        self._is_last = True
+
+    def enter(self, recording: str, end: int | None) -> None:
+        """Go on with the messages of another recording.
+
+        Args:
+            recording: Its id.
+            end: Time that all rows are before, by the log clock, ns; None if unknown.
+        """
+        self._recording = recording
+        self._end = end
+        self._blocks = None
+        self._times, self._table = self._none
+        self._last = None
+        self._is_last = False
+
+    def rows(self, times: NDArray[np.int64]) -> pa.Table:
+        """The columns of the messages that belong to some times, with their distance.
+
+        Args:
+            times: int64[n], ns; by the log clock ascending, not before those of the last call.
+        """
+        if self._blocks is None and not self._is_last and len(times):
+            self._open(times)
+        parts = []
+        begin = 0
+        while True:
+            end = len(times)
+            if not self._is_last:
+                # What belongs to times before the last one of the block is known.
+                last = int(self._times[-1]) if len(self._times) else 0
+                end = int(np.searchsorted(times, last))
+            if end > begin or not len(times):
+                parts.append(self._matched(times[begin:end]))
+                begin = end
+            if begin == len(times):
+                return together(parts)
+            self._advance()
+
+    def _open(self, times: NDArray[np.int64]) -> None:
+        if self._clock == "log":
+            self._blocks = self._reader.tables(self._recording, self._span(int(times[0])))
+            return
+        self._blocks = self._reader.tables(self._recording)
+        found = [self._none, *self._blocks]
+        all_times = np.concatenate([part for part, _ in found])
+        table = together([part for _, part in found])
+        order = np.argsort(all_times, kind="stable")
+        order = order[all_times[order] != UNKNOWN]
+        self._times, self._table = all_times[order], table.take(pa.array(order))
+        self._is_last = True
+
+    def _span(self, first: int) -> tuple[int, int] | None:
+        """Log time that can hold the messages of all rows; None for all of it."""
+        reader, recording, end = self._reader, self._recording, self._end
+        if reader.question.bounds is not None:
+            return None
+        if self._tolerance is not None:
+            begin: int | None = max(first - self._tolerance, 0)
+        else:
+            begin = reader.latest(recording, first)
+        if end is not None and self._how != "asof":
+            if self._tolerance is not None:
+                end = min(end + self._tolerance, TIME_LIMIT - 1)
+            else:
+                end = reader.following(recording, end)
+        return begin or 0, TIME_LIMIT - 1 if end is None else end
+
+    def _advance(self) -> None:
+        """Read the next block; the last row before it may still be the latest one."""
+        assert self._blocks is not None
+        found = next(self._blocks, None)
+        if found is None:
+            self._is_last = True
+            return
+        times, table = found
+        if len(self._times):
+            self._last = int(self._times[-1]), self._table.slice(self._table.num_rows - 1)
+        self._times, self._table = times, table
+
+    def _matched(self, times: NDArray[np.int64]) -> pa.Table:
+        """The columns of the messages that belong to times that the block decides."""
+        if self._last is None:
+            return self._found(times, self._times, self._table)
+        # Before the first message of the block, only that and the last one of the block before
+        # come into question.
+        begin = int(np.searchsorted(times, self._times[0]))
+        parts = []
+        if begin:
+            around = np.array([self._last[0], self._times[0]])
+            two = together([self._last[1], self._table.slice(0, 1)])
+            parts.append(self._found(times[:begin], around, two))
+        if begin < len(times) or not parts:
+            parts.append(self._found(times[begin:], self._times, self._table))
+        return together(parts)
+
+    def _found(
+        self, times: NDArray[np.int64], known: NDArray[np.int64], table: pa.Table
+    ) -> pa.Table:
+        found = match(times, known, self._how, self._tolerance)
+        rows = _taken(table, found.before)
+        if self._how == "interpolate":
+            known = known if len(known) else times
+            low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
+            length = (high - low).astype(np.float64)
+            weight = (times - low) / np.where(length > 0, length, 1)
+            weight[length <= 0] = 0
+            after = _taken(table, found.after)
+            rows = interpolated(rows, after, weight, self._reader.quaternions)
+        missing = found.before < 0
+        distance = (
+            pa.array(found.distance, DURATION, mask=missing)
+            if missing.any()
+            else numbers(found.distance, "duration")
+        )
+        return self._reader.named(rows, self._reader.prefix + _DISTANCE, distance)
+
+
+def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
+    """Rows of a table; null for -1."""
+    missing = rows < 0
+    places = pa.array(rows, mask=missing) if missing.any() else numbers(rows)
+    return table.take(places)
+
+
+def _end_of(resolved: Resolved, clock: Clock) -> int | None:
+    """Log time that all rows of a recording are before, ns; None if unknown."""
+    if resolved.windows is not None:
+        return int(resolved.windows[-1, 1]) if len(resolved.windows) else 0
+    return resolved.bounds[1] if resolved.bounds is not None and clock == "log" else None
+
+
+def _side_by_side(table: pa.Table, label: str | None, parts: Sequence[pa.Table]) -> pa.Table:
+    columns = dict(zip(table.column_names, table.columns, strict=True))
+    found: dict[str, Any] = {_TIME: columns.pop(_TIME)}
+    if label is not None:
+        text = label.encode("utf-8", "replace").decode()
+        found[_RECORDING] = pa.repeat(pa.scalar(text, pa.string()), table.num_rows)
+    found |= columns
+    for part in parts:
+        for name, column in zip(part.column_names, part.columns, strict=True):
+            found[free_name(name, found)] = column
+    return pa.table(found)
+
+
+def together(tables: Sequence[pa.Table]) -> pa.Table:
+    """Tables one after the other; a column has the common exact type of all of them."""
+    if len(tables) == 1:
+        return tables[0]
+    if all(table.schema == tables[0].schema for table in tables):
+        return pa.concat_tables(tables)
+    columns: dict[str, Any] = {}
+    for name in dict.fromkeys(chain.from_iterable(table.column_names for table in tables)):
+        chunks = [
+            table[name].combine_chunks() if name in table.column_names else table.num_rows
+            for table in tables
+        ]
+        arrays = [
+            pa.concat_arrays(chunk.chunks) if isinstance(chunk, pa.ChunkedArray) else chunk
+            for chunk in chunks
+        ]
+        kind = common_type([array for array in arrays if not isinstance(array, int)])
+        parts = [
+            pa.nulls(array, kind) if isinstance(array, int) else converted(array, kind)
+            for array in arrays
+        ]
+        columns[name] = pa.chunked_array(parts, kind)
+    return pa.table(columns)
+
+
+def side_by_side(
+    session: Session,
+    base: Question,
+    others: Sequence[Question],
+    *,
+    how: str,
+    tolerance: DurationLike | None,
+    clock: str,
+) -> Aligned:
+    """An alignment of topics to the messages of one topic; see `Store.align`."""
+    if clock not in {"log", "publish", "header"}:
+        raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
+    if len(base.topics) != 1:
+        raise UsageError(
+            f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
+            f"{', '.join(base.topics[:10])}."
+        )
+    counters = Counters()
+    chosen: Clock = clock  # type: ignore[assignment]
+    taken: set[str] = set()
+    streams = [
+        Stream(replace(question, topics=(topic,)), _prefix(topic, taken))
+        for question in (base, *others)
+        for topic in question.topics
+    ]
+    rows = TopicBase(session, streams[0], chosen, counters)
+    return Aligned(
+        session,
+        rows,
+        streams[1:],
+        how=how,
+        tolerance=tolerance,
+        clock=chosen,
+        counters=counters,
+    )
+
+
+def resampled(
+    session: Session,
+    question: Question,
+    step: DurationLike,
+    how: str,
+    tolerance: DurationLike | None,
+) -> Aligned:
+    """An alignment of topics to regular times; see `Query.resample`."""
+    times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
+    taken: set[str] = set()
+    several = len(question.topics) > 1
+    streams = [
+        Stream(replace(question, topics=(topic,)), _prefix(topic, taken) if several else "")
+        for topic in question.topics
+    ]
+    return Aligned(
+        session,
+        times,
+        streams,
+        how=how,
+        tolerance=tolerance,
+        clock="log",
+        counters=Counters(),
+    )
+
+
+def _prefix(topic: str, taken: set[str]) -> str:
+    """The beginning of the names of a topic's columns: `imu/data.`, `imu/data_2.`."""
+    name = short = topic.removeprefix("/")
+    number = 2
+    while name in taken:
+        name = f"{short}_{number}"
+        number += 1
+    taken.add(name)
+    return f"{name}."

@@ -1,0 +1,140 @@
+"""`hybridlog align`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import options
+from hybridlog.cli.answer_notes import print_cost, print_gaps
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.table_output import TableChoices, table_options, write_tables
+from hybridlog_storage.errors import TopicError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+
+
+@click.command()
+@click.option(
+    "--to",
+    "base",
+    required=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="The topic whose messages are the rows.",
+)
+@click.option(
+    "--topic",
+    "-t",
+    required=True,
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="A topic beside it: full name, an unambiguous short one, a glob, or re:REGEX. Repeatable.",
+)
+@options.how
+@options.near
+@click.option(
+    "--clock",
+    type=click.Choice(["log", "publish", "header"]),
+    default="log",
+    help="The time that is compared.",
+)
+@options.store
+@options.between
+@click.option(
+    "--where",
+    multiple=True,
+    metavar="TOPIC: PREDICATE",
+    help="Only messages of this topic that satisfy a predicate. Repeatable.",
+)
+@options.recordings
+@click.option(
+    "--fields",
+    multiple=True,
+    metavar="TOPIC: A,B.C",
+    help="Only these fields of a topic, with commas between them. Repeatable.",
+)
+@table_options
+def command(
+    *,
+    base: str,
+    topic: tuple[str, ...],
+    how: str,
+    tolerance: str | None,
+    clock: str,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    recording: tuple[str, ...],
+    fields: tuple[str, ...],
+    form: str | None,
+    output: Path | None,
+    force: bool,
+    limit: int | None,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Show topics side by side: a row for each message of one, with those of others then.
+
+    Columns are named by topic and field; `distance` is the time of a topic's message minus
+    that of the row. What is not near enough is empty.
+    """
+    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        queries = _queries(opened, [base, *topic], recording)
+        for predicates, add in ((where, _where), (fields, _fields)):
+            for text in predicates:
+                add(opened, queries, text)
+        if between is not None:
+            queries[0] = queries[0].between(*between)
+        aligned = opened.align(queries[0], queries[1:], how=how, tolerance=tolerance, clock=clock)
+        write_tables(aligned.to_tables(), aligned.schema, choices)
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(aligned.counters, time.monotonic() - started, count=False)
+            for query in queries:
+                print_gaps(query, between if clock == "log" else None)
+
+
+def _queries(store: Store, topics: Sequence[str], recordings: Sequence[str]) -> list[Query]:
+    """A query for each topic; the base is one topic."""
+    found = [query_of(store, [name], recordings) for name in topics]
+    return [found[0], *(q.with_topic(topic) for q in found[1:] for topic in q.topics)]
+
+
+def _where(store: Store, queries: list[Query], text: str) -> None:
+    places, predicate = _named(store, queries, text, "--where wants TOPIC: PREDICATE")
+    for place in places:
+        queries[place] = queries[place].where(predicate)
+
+
+def _fields(store: Store, queries: list[Query], text: str) -> None:
+    places, names = _named(store, queries, text, "--fields wants TOPIC: A,B.C")
+    for place in places:
+        queries[place] = queries[place].fields(*parse_fields(names))
+
+
+def _named(store: Store, queries: list[Query], text: str, form: str) -> tuple[list[int], str]:
+    """The queries about a topic before a colon, and what follows it."""
+    from hybridlog.query.topics import resolve, split_topic
+
+    topic, rest = split_topic(text)
+    if not topic or not rest:
+        raise UsageError(f"{form}, not {text!r}.")
+    known = dict.fromkeys(name for query in queries for name in query.topics)
+    names = resolve([topic], known)
+    places = [n for n, query in enumerate(queries) if query.topics[0] in names]
+    if not places:
+        raise TopicError(f"{topic} is no topic of this alignment.")
+    return places, rest

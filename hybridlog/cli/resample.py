@@ -1,0 +1,72 @@
+"""`hybridlog resample`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import click
+
+from hybridlog.cli import options
+from hybridlog.cli.answer_notes import print_cost, print_gaps
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.table_output import TableChoices, table_options, write_tables
+
+
+@click.command()
+@click.option(
+    "--topic",
+    "-t",
+    required=True,
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+)
+@click.option("--step", required=True, metavar="DURATION", help="Time between two rows: 100ms.")
+@options.how
+@options.near
+@options.store
+@options.between
+@options.where
+@options.recordings
+@click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
+@table_options
+def command(
+    *,
+    topic: tuple[str, ...],
+    step: str,
+    how: str,
+    tolerance: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    recording: tuple[str, ...],
+    fields: str | None,
+    form: str | None,
+    output: Path | None,
+    force: bool,
+    limit: int | None,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Show topics at regular times from the beginning of each recording or of the range."""
+    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        query = query_of(opened, topic, recording)
+        if between is not None:
+            query = query.between(*between)
+        for predicate in where:
+            query = query.where(predicate)
+        if fields is not None:
+            query = query.fields(*parse_fields(fields))
+        rows = query.resample(step, how, tolerance)
+        write_tables(rows.to_tables(), rows.schema, choices)
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(rows.counters, time.monotonic() - started, count=False)
+            print_gaps(query, between)
