@@ -27,6 +27,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.stopping import at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,6 +95,7 @@ class RecordReport:
     latched_left_out: int = 0
 
 
+@at_safe_points()
 def record(
     source: Source,
     directory: StoreDirectory,
@@ -104,7 +106,7 @@ def record(
     options: RecordOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> RecordReport:
-    """Record a whole source.
+    """Record a whole source. A signal stops it at safe points only, and then nothing is stored.
 
     Args:
         source: The source, open and not yet read.
@@ -181,6 +183,7 @@ def _copy(
     choice = _Choice(options, front)
     read = 0
     for batch in source.batches():
+        safe_point()
         _copy_extras(source, writer)
         read += len(batch)
         writer.append(choice.of(batch, source.channels), source.channels)

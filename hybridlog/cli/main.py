@@ -29,17 +29,10 @@ def main() -> NoReturn:
     try:
         code = _run()
     except signals.Stopped as stopped:
-        _remove_unfinished()
+        signals.remove_unfinished()
         _complain(f"interrupted. {stopped.consequence}".rstrip())
         code = stopped.exit_code
     _leave(_flushed(code))
-
-
-def _remove_unfinished() -> None:
-    """Remove the files that a command was writing when it was stopped."""
-    unfinished = sys.modules.get("hybridlog.export.unfinished")
-    if unfinished is not None:
-        unfinished.remove_unfinished()
 
 
 def _run() -> int:

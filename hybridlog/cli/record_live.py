@@ -18,7 +18,8 @@ from hybridlog.cli.live_options import recorder_options, sources_of
 from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.signals import SIGNALS
+from hybridlog.cli.signals import SIGNALS, write_note
+from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -55,7 +56,7 @@ def record_live(choices: RecordChoices) -> None:
                 quiet=quiet,
             )
         )
-        with _stop_event() as stop:
+        with _stop_flag() as stop:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()
             with display.table(), _snapshot_on_signal(recorder, options):
@@ -70,10 +71,10 @@ def record_live(choices: RecordChoices) -> None:
         summary.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 
-def _watch(recorder: Recorder, stop: threading.Event, display: _Display) -> RecorderState:
+def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:
     state = recorder.look()
     display.state(state)
-    while not stop.is_set() and not recorder.wait(0):
+    while not stop.is_set and not recorder.wait(0):
         stop.wait(_STATE_S)
         state = recorder.look()
         display.state(state)
@@ -97,29 +98,30 @@ def _explain_wait(last: RecorderState) -> Iterator[None]:
 
 
 @contextmanager
-def _stop_event() -> Iterator[threading.Event]:
-    """An event that the first signal sets; the second signal ends the process at once.
+def _stop_flag() -> Iterator[Flag]:
+    """A flag that the first signal sets; the second signal ends the process at once.
 
     Flushed chunks stay, and the next command on the store seals them.
     """
-    stopped = threading.Event()
-
-    def stop(number: int, _frame: FrameType | None) -> None:
-        if stopped.is_set():
-            text = "\nhybridlog: stopped. Flushed chunks stay; the next command seals them.\n"
-            os.write(2, text.encode())
-            os._exit(128 + number)
-        stopped.set()
-
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, stop)
-    try:
-        yield stopped
-    finally:
+    with Flag() as stopped:
+
+        def stop(number: int, _frame: FrameType | None) -> None:
+            if stopped.is_set:
+                write_note(
+                    "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
+                )
+                os._exit(128 + number)
+            stopped.set()
+
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not signal.SIG_IGN:
+                signal.signal(number, stop)
+        try:
+            yield stopped
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from hybridlog_storage.errors import (
     TimeError,
     UsageError,
 )
+from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
@@ -58,8 +59,10 @@ def record_logs(choices: RecordChoices) -> None:
                 cache_mb=choices.cache_size,
                 quiet=choices.quiet,
             ) as store,
+            at_safe_points(),
         ):
             for path in paths:
+                safe_point()
                 try:
                     done.add(path, _record_one(store, path, choices, settings, tags))
                 except (SourceError, AlreadyRecordedError, UsageError) as error:
@@ -114,7 +117,9 @@ def _record_one(
     from hybridlog.recorder import RecordOptions
     from hybridlog.sources.detect import open_source
 
-    with open_source(path) as source:
+    with anywhere():
+        source = open_source(path)
+    with source:
         matcher, no_index = _matcher(choices), _no_index(choices)
         options = RecordOptions(
             name=choices.name,

@@ -1,22 +1,34 @@
-"""Ctrl-C, `kill` and a closed terminal stop a command with an exception.
+"""Ctrl-C, `kill` and a closed terminal stop a command.
 
-The exception is raised in the main thread, and unfinished files are removed on its way out.
-It is no `KeyboardInterrupt`, because libraries catch that.
+A command that only reads, or whose work the next opening of the store completes or takes back,
+ends at once, without unwinding: unfinished output files are removed, and the process leaves.
+Work in `stopping.at_safe_points` takes itself back: there `Stopped` is raised, at a safe
+point. It is no `KeyboardInterrupt`, because libraries catch that.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
+
+from hybridlog.cli.output import printable
+from hybridlog_storage import stopping
 
 SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Signals that stop a command, as far as this system has them."""
+
+_SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
+"""Clears the line of a progress bar."""
+
+_consequences: list[str | Callable[[], str]] = []
 
 
 class Stopped(BaseException):
@@ -30,7 +42,7 @@ class Stopped(BaseException):
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
-        self.consequence = ""
+        self.consequence = _consequence()
 
     @property
     def exit_code(self) -> int:
@@ -45,30 +57,67 @@ def if_stopped(consequence: str | Callable[[], str]) -> Iterator[None]:
     Args:
         consequence: What becomes of the unfinished work, or a function that says so then.
     """
+    _consequences.append(consequence)
     try:
         yield
-    except Stopped as stopped:
-        stopped.consequence = consequence if isinstance(consequence, str) else consequence()
-        raise
+    finally:
+        _consequences.pop()
 
 
 def install() -> None:
-    """Turn the signals into `Stopped`. Call it in the main thread of the command's process.
+    """Let the signals stop the command. Call it in the main thread of the command's process.
 
-    The second signal is answered with a note that cleaning up is under way; the third stops
-    that as well. An ignored signal stays ignored (`nohup`, background jobs of simple shells).
+    Where work takes itself back, the second signal is answered with a note; the third ends the
+    process at once. SIGINT counts even if it was ignored, which shells without job control do
+    to background jobs; an ignored SIGHUP (`nohup`) or SIGTERM stays ignored.
     """
     received = 0
 
     def stop(number: int, _frame: FrameType | None) -> None:
         nonlocal received
         received += 1
-        if received == 2:
-            with contextlib.suppress(OSError, RuntimeError):
-                print("\nhybridlog: cleaning up; press again to stop that, too", file=sys.stderr)  # noqa: T201
-            return
-        raise Stopped(number)
+        if received == 1:
+            if not stopping.postpone(partial(_stop, number)):
+                _leave(number, _consequence())
+        elif received == 2 and stopping.is_delayed():
+            write_note("\nhybridlog: cleaning up; press again to leave at once")
+        else:
+            _leave(number, "The next command that opens the store cleans up.")
 
     for number in SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:
+        if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, stop)
+
+
+def remove_unfinished() -> None:
+    """Remove the files that a command was writing when it was stopped."""
+    unfinished = sys.modules.get("hybridlog.export.unfinished")
+    if unfinished is not None:
+        unfinished.remove_unfinished()
+
+
+def write_note(text: str) -> None:
+    """Write a line to standard error from a signal handler, which may interrupt a `print`."""
+    with contextlib.suppress(OSError, ValueError):
+        encoding = sys.stderr.encoding or "utf-8"
+        os.write(sys.stderr.fileno(), f"{text}\n".encode(encoding, "backslashreplace"))
+
+
+def _stop(number: int) -> NoReturn:
+    raise Stopped(number)
+
+
+def _consequence() -> str:
+    if not _consequences:
+        return ""
+    last = _consequences[-1]
+    return last if isinstance(last, str) else last()
+
+
+def _leave(number: int, consequence: str) -> NoReturn:
+    """End the process in the handler: no other code of the main thread runs any more."""
+    remove_unfinished()
+    with contextlib.suppress(OSError, ValueError):
+        clear = _SHOW_CURSOR if os.isatty(sys.stderr.fileno()) else ""
+        write_note(clear + printable(f"hybridlog: interrupted. {consequence}".rstrip()))
+    os._exit(128 + number)

@@ -20,6 +20,7 @@ from hybridlog.cli.live_table import LiveTable, drawn
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.live.recorder import RecorderState
@@ -83,7 +84,7 @@ def command(
     path = store_path(store)
     (name,) = choose(path, [] if recording is None else [recording])
     on_screen = not as_json and sys.stdout.isatty() and not once
-    with _ended_by_ctrl_c(), ExitStack() as held:
+    with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
         database = None
         if fields:
             opened = held.enter_context(opened_store(store, mongo, needs_database=True))

@@ -18,6 +18,7 @@ from hybridlog.demo.robot import Robot
 from hybridlog.demo.topics import TOPICS, RobotConfig, Speaker, Types
 from hybridlog.demo.tour import DEFAULT_DURATION_S, DEFAULT_SEED
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, TopicError, UsageError
+from hybridlog_storage.stopping import at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -45,6 +46,7 @@ class BagSummary(NamedTuple):
     truth: Mapping[str, int]
 
 
+@at_safe_points()
 def write_bag(
     path: Path | str,
     *,
@@ -96,6 +98,7 @@ def write_bag(
                 msgtype = topic.type_in(speaker.types)
                 connections.append(writer.add_connection(topic.name, msgtype, **about))
             for log_time, _, index, payload, fact in _messages(speaker, chosen):
+                safe_point()
                 writer.write(connections[index], log_time, payload)
                 counts[chosen[index].name] += 1
                 truth[fact] += 1

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog_storage import files
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
 from hybridlog_storage.socket_directory import is_our_socket, new_socket
+from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -224,7 +225,7 @@ def states(store: Path, name: str, every_s: float) -> Iterator[dict[str, Any]]:
             yield request(store, name, "state")
         except StoreError:
             return
-        time.sleep(max(every_s - (time.monotonic() - started), 0))
+        pause(max(every_s - (time.monotonic() - started), 0))
 
 
 def _line(connection: socket.socket, max_bytes: int) -> bytes:

@@ -30,6 +30,7 @@ from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import MAX_CHANNELS, Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import OnSealing, SegmentFile
 from hybridlog_storage.segment_format import entries_of
+from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -429,6 +430,7 @@ class RecordingWriter:
     def _drain(self, limit: int) -> None:
         """Wait until at most `limit` chunks are being packed or written; raise a failure."""
         while self._storing and (len(self._storing) > limit or self._storing[0].done()):
+            safe_point()
             self._storing.popleft().result()
         if self._broken is not None:
             raise self._broken

@@ -7,11 +7,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
+BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
+"""A wrapper: SIGINT is ignored, as for background jobs of scripts."""
 _LIMIT_S = 120
 
 
@@ -86,15 +89,24 @@ def complete(words: str) -> list[str]:
     return [line.partition(",")[2] for line in ended.stdout.splitlines() if line]
 
 
-def start(*arguments: object, output: IO[bytes], wrapper: tuple[str, ...] = ()) -> Any:
-    """Start a command; both of its streams go to `output`."""
-    return subprocess.Popen(
-        [*wrapper, *COMMAND, *map(str, arguments)],
-        stdin=subprocess.DEVNULL,
-        stdout=output,
-        stderr=subprocess.STDOUT,
-        env=environment(),
-    )
+@contextmanager
+def started(
+    *arguments: object, output: Path, wrapper: Sequence[str] = ()
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A running command, killed if it has not ended; both of its streams go to a file."""
+    with output.open("ab") as file:
+        process = subprocess.Popen(
+            [*wrapper, *COMMAND, *map(str, arguments)],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment(),
+        )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def wait_for(condition: Callable[[], object], limit_s: float = 60) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import hybridlog as hl
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
 
-from .running import recordings, run, start
+from .running import recordings, run, started
 
 
 def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
@@ -212,10 +213,12 @@ def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
 
 
 def test_one_log_recorded_three_times_at_once(logs: Path, tmp_path: Path) -> None:
-    with (tmp_path / "out").open("wb") as output:
+    with ExitStack() as running:
         three = [
-            start("record", logs / "small.bag", "--store", tmp_path / "s", output=output)
-            for _ in range(3)
+            running.enter_context(
+                started("record", logs / "small.bag", "--store", tmp_path / "s", output=out)
+            )
+            for out in [tmp_path / "out"] * 3
         ]
         codes = sorted(process.wait(120) for process in three)
     assert codes == [0, 8, 8], (tmp_path / "out").read_text()

@@ -24,7 +24,7 @@ from hybridlog.live.recorder import RecorderState
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import UsageError
-from tests.cli.running import COMMAND, complete, environment, run
+from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.independent import read
 
 SMALL_S = 5
@@ -35,6 +35,7 @@ def recorder(store: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]
     """A recorder that says on standard output, in JSON, how it is doing."""
     process = subprocess.Popen(
         [
+            *BACKGROUND,
             *COMMAND,
             "record",
             "--store",

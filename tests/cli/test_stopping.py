@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from urllib.parse import quote
 
 import pytest
 
+from hybridlog.cli.signals import SIGNALS
 from hybridlog_storage.mongod import find_mongod
 from tests.independent import read_bag
 
-from .running import COMMAND, environment, open_bytes, recordings, run, start, wait_for
+from .running import (
+    BACKGROUND,
+    COMMAND,
+    environment,
+    open_bytes,
+    recordings,
+    run,
+    started,
+    wait_for,
+)
 
 Server = tuple[str, subprocess.Popen[bytes]]
 
@@ -27,11 +40,11 @@ SLOW = ("--level", "19", "--again")
 def test_a_stopped_record_leaves_nothing(
     number: signal.Signals, logs: Path, fresh: Path, tmp_path: Path
 ) -> None:
-    with (tmp_path / "out").open("wb") as output:
-        process = start(
-            *("record", logs / "odd.mcap", logs / "robot.bag", "--store", fresh, *SLOW),
-            output=output,
-        )
+    with started(
+        *("record", logs / "odd.mcap", logs / "robot.bag", "--store", fresh, *SLOW),
+        output=tmp_path / "out",
+        wrapper=BACKGROUND,
+    ) as process:
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 100_000)
         assert process.poll() is None
         process.send_signal(number)
@@ -45,8 +58,9 @@ def test_a_stopped_record_leaves_nothing(
 
 
 def test_the_second_ctrl_c_waits_for_the_first(logs: Path, fresh: Path, tmp_path: Path) -> None:
-    with (tmp_path / "out").open("wb") as output:
-        process = start("record", logs / "robot.bag", "--store", fresh, *SLOW, output=output)
+    with started(
+        "record", logs / "robot.bag", "--store", fresh, *SLOW, output=tmp_path / "out"
+    ) as process:
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 100_000)
         process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGINT)
@@ -56,8 +70,9 @@ def test_the_second_ctrl_c_waits_for_the_first(logs: Path, fresh: Path, tmp_path
 
 
 def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_path: Path) -> None:
-    with (tmp_path / "out").open("wb") as output:
-        process = start("record", logs / "robot.bag", "--store", fresh, *SLOW, output=output)
+    with started(
+        "record", logs / "robot.bag", "--store", fresh, *SLOW, output=tmp_path / "out"
+    ) as process:
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 200_000)
         process.kill()
         assert process.wait(60) == -signal.SIGKILL
@@ -75,13 +90,97 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
 
 def test_a_file_that_was_being_written_goes_away(store: Path, tmp_path: Path) -> None:
     target = tmp_path / "new.mcap"
-    with (tmp_path / "out").open("wb") as output:
-        process = start("export", target, "--store", store, "-r", "robot", output=output)
+    with started(
+        "export", target, "--store", store, "-r", "robot", output=tmp_path / "out"
+    ) as process:
         wait_for(lambda: process.poll() is not None or list(tmp_path.glob(".new.*")))
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
     assert f"{target} is not written" in (tmp_path / "out").read_text()
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+STOPS_AT_EACH = """
+import os, select, signal, sys
+from importlib import import_module
+
+main = import_module("hybridlog.cli.main").main
+MOMENTS = sys.argv.pop(1).split(",")
+
+def stop(frame, event, argument):
+    place = f"{event} {frame.f_code.co_qualname}"
+    if waiting and place == waiting[0]:
+        waiting.pop(0)
+        if not waiting:
+            sys.setprofile(None)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+for moment in MOMENTS:
+    waiting = ["call RecordingWriter.append", *[moment] * 3]
+    child = os.fork()
+    if child == 0:
+        sys.setprofile(stop)
+        main()
+    ended = os.pidfd_open(child)
+    if not select.select([ended], [], [], 30)[0]:
+        print(f"{moment} hangs", flush=True)
+        os.kill(child, signal.SIGKILL)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(f"{moment} {code}", flush=True)
+"""
+
+LOCKED = (
+    "c_return Condition.__enter__",
+    "call Condition.__exit__",
+    "c_return Condition._release_save",
+    "call Condition._acquire_restore",
+    "c_call ThreadPoolExecutor.submit",
+    "call Future.add_done_callback",
+    "call Threads.submit",
+)
+"""Moments at which an exception would leave a lock held, or a thread without its partner."""
+
+
+def test_a_signal_never_finds_a_lock_that_it_leaves_held(
+    logs: Path, fresh: Path, tmp_path: Path
+) -> None:
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-c", STOPS_AT_EACH, ",".join(LOCKED), "record"),
+            *(str(logs / "robot.bag"), "--store", str(fresh), "--level", "12"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment(TMPDIR=str(tmp_path)),
+        check=False,
+    )
+    codes = [line for line in ended.stdout.splitlines() if line.startswith(("call", "c_"))]
+    assert codes == [f"{moment} 143" for moment in LOCKED], ended.stdout
+    assert ended.stdout.count(f"Nothing of {logs / 'robot.bag'} is stored.") == len(LOCKED)
+    assert "Traceback" not in ended.stdout
+    assert recordings(fresh) == ["small"]
+
+
+@pytest.mark.exhaustive
+def test_a_stop_at_any_time_ends_it_and_leaves_nothing(
+    logs: Path, fresh: Path, tmp_path: Path
+) -> None:
+    chance = random.Random(4)
+    command = ("record", logs / "robot.bag", "--store", fresh, "--level", "12")
+    for number in range(400):
+        pause, signals = chance.uniform(0.2, 2.5), chance.choices(SIGNALS, k=chance.choice([1, 2]))
+        out = tmp_path / f"{number}"
+        with started(*command, output=out) as process:
+            time.sleep(pause)
+            for one in signals:
+                process.send_signal(one)
+            code = process.wait(60)
+        assert code in {0, -signals[0], *(128 + one for one in signals)}, out.read_text()
+        assert code <= 0 or "Traceback" not in out.read_text()
+        if "robot" in recordings(fresh):
+            run("rm", "robot", "--yes", store=fresh)
+        assert recordings(fresh) == ["small"]
 
 
 STOPS_ITSELF = """
@@ -206,10 +305,10 @@ def server(
 def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_path: Path) -> None:
     uri, process = server
     store = tmp_path / "s"
-    with (tmp_path / "out").open("wb") as output:
-        recording = start(
-            *("record", logs / "robot.bag", "--store", store, "--mongo", uri, *SLOW), output=output
-        )
+    with started(
+        *("record", logs / "robot.bag", "--store", store, "--mongo", uri, *SLOW),
+        output=tmp_path / "out",
+    ) as recording:
         wait_for(lambda: recording.poll() is not None or open_bytes(store) > 100_000)
         assert recording.poll() is None
         process.kill()
@@ -258,9 +357,11 @@ def test_a_database_of_another_store(server: Server, logs: Path, tmp_path: Path)
 
 def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "s"
-    with (tmp_path / "out").open("wb") as output:
+    with ExitStack() as running:
         both = [
-            start("record", logs / name, "--store", store, output=output)
+            running.enter_context(
+                started("record", logs / name, "--store", store, output=tmp_path / "out")
+            )
             for name in ("small.bag", "odd.mcap")
         ]
         codes = [process.wait(120) for process in both]

@@ -515,13 +515,14 @@ def _follow(child: int, reading: int) -> dict[str, Any]:
             break
         told += piece
     os.close(reading)
-    os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     *steps, last = told.decode().splitlines() or [""]
     if last.startswith("end "):
         outcome, message = json.loads(last.removeprefix("end "))
     else:
         steps.append(last)
-        outcome, message = "killed", ""
+        is_stopped = code in {128 + signal.SIGINT, 128 + signal.SIGTERM}
+        outcome, message = "stopped" if is_stopped else "killed", ""
     return {"steps": steps, "outcome": "hangs" if hangs else outcome, "message": message}
 
 

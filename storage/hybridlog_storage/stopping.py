@@ -1,0 +1,167 @@
+"""Points at which a signal may stop the process.
+
+Python runs a signal handler between any two instructions of the main thread. An exception
+raised there can leave a lock of the standard library held for ever, such as that of a
+`Condition`, a `Future` or a pool. Threads that need it then never end, and cleanup waits for
+them. So work that shares locks with threads, or that must be taken back when it is stopped,
+runs in `at_safe_points`: handlers only note the signal, and `safe_point` raises.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn, Self
+
+Action = Callable[[], NoReturn]
+"""Raises the exception that stops the work."""
+
+
+class Flag:
+    """An event for signal handlers: `set` takes no lock, unlike that of `threading.Event`.
+
+    Only the main thread may wait for it. A context manager.
+    """
+
+    def __init__(self) -> None:
+        self.is_set = False
+        self._reading, self._writing = os.pipe()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._reading)
+        os.close(self._writing)
+
+    def set(self) -> None:
+        """Set it, and wake the waiting thread."""
+        if not self.is_set:
+            self.is_set = True
+            os.write(self._writing, b"\0")
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until it is set, for at most so long; return whether it is."""
+        poll = select.poll()
+        poll.register(self._reading, select.POLLIN)
+        poll.poll(max(seconds, 0) * 1000)
+        return self.is_set
+
+
+class _Block:
+    """The outermost block that is stopped at safe points only."""
+
+    def __init__(self, flag: Flag) -> None:
+        self.flag = flag
+        self.thread = threading.get_ident()
+        self.action: Action | None = None
+        self.is_anywhere = False
+
+
+_block: _Block | None = None
+
+
+@contextmanager
+def at_safe_points() -> Iterator[None]:
+    """Stop the block at its safe points only; its end is one, too.
+
+    In the main thread, Ctrl-C raises `KeyboardInterrupt` there, unless the program handles it
+    in another way. Blocks may be nested; the outermost counts. Does nothing in other threads.
+    """
+    global _block  # noqa: PLW0603 - signals belong to the process
+    if _block is not None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with Flag() as flag, _delayed_interrupt():
+        block = _block = _Block(flag)
+        try:
+            yield
+        finally:
+            _block = None
+            if block.action is not None:
+                block.action()
+
+
+def is_delayed() -> bool:
+    """True within `at_safe_points`."""
+    return _block is not None
+
+
+def safe_point() -> None:
+    """Raise what a signal asked for, if the block of this thread is to stop."""
+    block = _block
+    if block is not None and block.action is not None and block.thread == threading.get_ident():
+        action, block.action = block.action, None
+        action()
+
+
+@contextmanager
+def anywhere() -> Iterator[None]:
+    """Within `at_safe_points`: work that shares no locks, stopped at any instruction."""
+    safe_point()
+    block = _block
+    if block is None or block.thread != threading.get_ident():
+        yield
+        return
+    block.is_anywhere = True
+    try:
+        yield
+    finally:
+        block.is_anywhere = False
+
+
+def pause(seconds: float) -> None:
+    """Sleep; a safe point at the beginning and at the end, which a signal hastens."""
+    safe_point()
+    block = _block
+    if block is None or block.thread != threading.get_ident():
+        time.sleep(seconds)
+        return
+    block.flag.wait(seconds)
+    safe_point()
+
+
+def postpone(action: Action) -> bool:
+    """Have `action` called at the next safe point. For signal handlers.
+
+    Returns:
+        False outside of `at_safe_points`: the handler has to stop the process itself.
+    """
+    block = _block
+    if block is None:
+        return False
+    if block.is_anywhere:
+        block.is_anywhere = False
+        action()
+    if block.action is None:
+        block.action = action
+    block.flag.set()
+    return True
+
+
+@contextmanager
+def _delayed_interrupt() -> Iterator[None]:
+    """Delay Python's own answer to Ctrl-C."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if not postpone(_interrupt):
+            signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _interrupt() -> NoReturn:
+    raise KeyboardInterrupt
