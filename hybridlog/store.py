@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeVar, cast
 
 from hybridlog import consent, field_indexes
 from hybridlog.entries import text
@@ -38,11 +38,13 @@ from hybridlog_storage.settings import (
 
 if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
+    from hybridlog.across.sync import Synced
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
@@ -333,6 +335,39 @@ class Store:
         return side_by_side(
             self.session, questions[0], questions[1:], how=how, tolerance=tolerance, clock=clock
         )
+
+    def sync(
+        self,
+        topics: Sequence[str | Query],
+        tolerance: DurationLike | None = None,
+        clock: str = "header",
+    ) -> Synced:
+        """Make sets of messages with about the same time, as `message_filters` does.
+
+        The policy is `ApproximateTime`. Only times are read; the messages of a set are read
+        when it is asked for. Sets are of one recording each.
+
+        Args:
+            topics: Two or more, by names, or queries.
+            tolerance: Longest duration of a set; None for any.
+            clock: The time that is compared: `header`, as in ROS, `log` or `publish`.
+
+        Raises:
+            TopicError: no such topic, or one does not have the clock.
+            UsageError: fewer than two topics, an unknown clock, or a query with limit, every
+                or reverse.
+            TimeError: the tolerance is no duration.
+        """
+        from hybridlog.across.sync import Synced
+
+        queries = [self._query_of(one, {}) for one in topics]
+        questions = [
+            query.with_topic(topic).question for query in queries for topic in query.topics
+        ]
+        if clock not in {"log", "publish", "header"}:
+            raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
+        again = partial(open_store, self.directory.path.absolute())
+        return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
 
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
         """A query about a topic, with its share of the fields, which is taken out of them."""

@@ -503,6 +503,7 @@ def public(thing: type) -> dict[str, Any]:
 
 def documented_classes() -> list[type]:
     from hybridlog.across.align import Aligned
+    from hybridlog.across.sync import Synced
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
@@ -516,7 +517,7 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
-    asking = [hl.Query, hl.Message, Aligned, Intervals, Interval]
+    asking = [hl.Query, hl.Message, Aligned, Synced, Intervals, Interval]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
@@ -535,6 +536,8 @@ def test_every_public_name_is_described(thing: type) -> None:
         members |= dict.fromkeys(("question", "counters"))
     if thing.__name__ == "Aligned":
         members |= {"counters": None}
+    if thing.__name__ == "Synced":
+        members |= dict.fromkeys(("topics", "recordings", "times", "counters"))
     assert set(rows) == set(members), set(rows) ^ set(members)
     for name, value in members.items():
         if inspect.isfunction(value):

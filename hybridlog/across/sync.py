@@ -1,0 +1,268 @@
+"""Sets of messages with about the same time, read when they are looked at."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol, overload
+
+import numpy as np
+
+from hybridlog.across.approximate_time import approximate_sets
+from hybridlog.message import messages_in
+from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.counters import Counters
+from hybridlog.query.intervals import Intervals
+from hybridlog.query.planner import Planner
+from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.schema.column import STAMP
+from hybridlog.schema.stamps import stamp_array
+from hybridlog_storage.errors import StoreError, TimeError, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog.query.question import Clock, Question
+    from hybridlog.session import Session
+
+
+class OpenedStore(Protocol):
+    """A store that a process has opened for itself."""
+
+    @property
+    def session(self) -> Session:
+        """Its state."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Topic:
+    """The messages of one topic that are in sets.
+
+    Attributes:
+        question: The question about the topic.
+        log_time: int64[n], ns.
+        number: int64[n], its place among the messages of that log time that the question finds.
+        is_alone: bool[n], True if the topic has no other message of that log time.
+    """
+
+    question: Question
+    log_time: NDArray[np.int64]
+    number: NDArray[np.int64]
+    is_alone: NDArray[np.bool_]
+
+
+class Synced(Sequence[tuple["Message", ...]]):
+    """Sets of messages with about the same time, one of each topic.
+
+    A map-style data set: `len`, `[n]`, slices and iteration. Only times have been read; the
+    messages of a set are read when it is asked for. It can be pickled and used after a fork,
+    such as in workers of a data loader: each process opens the store for itself.
+
+    Attributes:
+        topics: Full names of the topics, in the order of each set.
+        recordings: Id of each set's recording.
+        times: int64[n, topics], times of the messages on the clock, ns.
+        counters: What reading has cost in this process, with the times at first.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        open_again: Callable[[], OpenedStore],
+        questions: Sequence[Question],
+        tolerance: DurationLike | None,
+        clock: Clock,
+    ) -> None:
+        if len(questions) < 2:
+            raise UsageError("A set is of two topics or more: name them.")
+        if any(not q.returns_all or q.reverse for q in questions):
+            raise UsageError("Sets use all messages: leave out limit, every and reverse.")
+        self.topics = tuple(question.topics[0] for question in questions)
+        self.counters = Counters()
+        self._open_again = open_again
+        self._session: Session | None = session
+        self._kept: list[Any] = []  # what another process has opened; it must not be closed here
+        self._process = os.getpid()
+        limit = None if tolerance is None else parse_duration(tolerance)
+        snapshot = session.snapshot()
+        shared = [set(session.chosen(question).tolist()) for question in questions]
+        labels: list[str] = []
+        found: list[list[_Found]] = []
+        for place in sorted(set.intersection(*shared)):
+            recording = snapshot.summaries[place].id
+            columns = [
+                _times_of(session, replace(q, recordings=(recording,)), clock, self.counters)
+                for q in questions
+            ]
+            rows = approximate_sets([column.time for column in columns], limit)
+            labels += [recording] * len(rows)
+            found.append([column.take(rows[:, n]) for n, column in enumerate(columns)])
+        self.recordings = tuple(labels)
+        by_topic = [_joined([part[n] for part in found]) for n in range(len(questions))]
+        self.times: NDArray[np.int64] = np.stack([column.time for column in by_topic], axis=1)
+        self._topics = [
+            _Topic(question, column.log_time, column.number, column.is_alone)
+            for question, column in zip(questions, by_topic, strict=True)
+        ]
+
+    def __repr__(self) -> str:
+        return f"<Synced {', '.join(self.topics)}; {len(self)} sets>"
+
+    def __len__(self) -> int:
+        """Number of sets."""
+        return len(self.recordings)
+
+    @overload
+    def __getitem__(self, place: int) -> tuple[Message, ...]: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[tuple[Message, ...]]: ...
+
+    def __getitem__(self, place: int | slice) -> tuple[Message, ...] | list[tuple[Message, ...]]:
+        """The messages of a set, in the order of the topics; a list for a slice.
+
+        Raises:
+            StoreError: the messages are not in the store any more.
+        """
+        if isinstance(place, slice):
+            return [self[n] for n in range(*place.indices(len(self)))]
+        row = range(len(self))[place]
+        session = self._opened()
+        recording = self.recordings[row]
+        return tuple(self._read(session, topic, recording, row) for topic in self._topics)
+
+    def __iter__(self) -> Iterator[tuple[Message, ...]]:
+        """The sets, one after the other."""
+        return (self[n] for n in range(len(self)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the open store."""
+        state = vars(self).copy()
+        state.update(_session=None, _kept=[], counters=Counters())
+        return state
+
+    def _opened(self) -> Session:
+        """The store, opened by this process."""
+        if self._session is None or self._process != os.getpid():
+            self._kept.append(self._session)
+            store = self._open_again()
+            self._kept.append(store)
+            self._session, self._process = store.session, os.getpid()
+        return self._session
+
+    def _read(self, session: Session, topic: _Topic, recording: str, row: int) -> Message:
+        time, number = int(topic.log_time[row]), int(topic.number[row])
+        plain = replace(
+            topic.question,
+            recordings=(recording,),
+            bounds=None,
+            during=None,
+            predicate=None,
+            clock="log",
+        )
+        if topic.is_alone[row]:
+            found = message_at(session, plain, self.counters, time)
+            if found is not None and found.log_time_ns == time:
+                return found
+        span = Intervals.of([(recording, np.array([[time, time + 1, 1]], np.int64))])
+        question = replace(topic.question, recordings=(recording,), during=span)
+        counters = Counters()
+        runs = Planner(session, question, counters).runs()
+        messages = [message for run in runs for message in messages_in(run)]
+        self.counters.add(counters)
+        if number >= len(messages):
+            raise StoreError(
+                f"A message of {topic.question.topics[0]} is not in the store any more: make the "
+                "sets again."
+            )
+        return messages[number]
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Messages of a topic, by their time on the clock."""
+
+    time: NDArray[np.int64]
+    log_time: NDArray[np.int64]
+    number: NDArray[np.int64]
+    is_alone: NDArray[np.bool_]
+
+    def take(self, rows: NDArray[np.int64]) -> _Found:
+        return _Found(self.time[rows], self.log_time[rows], self.number[rows], self.is_alone[rows])
+
+
+def _joined(parts: Sequence[_Found]) -> _Found:
+    none = np.empty(0, np.int64)
+    empty = _Found(none, none, none, np.empty(0, np.bool_))
+    whole = [empty, *parts]
+    return _Found(
+        np.concatenate([part.time for part in whole]),
+        np.concatenate([part.log_time for part in whole]),
+        np.concatenate([part.number for part in whole]),
+        np.concatenate([part.is_alone for part in whole]),
+    )
+
+
+def _times_of(session: Session, question: Question, clock: Clock, counters: Counters) -> _Found:
+    """The messages of a question about one recording, ordered by their time on a clock.
+
+    Raises:
+        TopicError: the topic does not have the clock.
+    """
+    if clock != "log":
+        # Refused where the topic does not have the clock.
+        asked = replace(question, clock=clock, bounds=(None, None), during=None)
+        Planner(session, asked, Counters()).parts()
+    planner = Planner(session, question, counters)
+    log_times, times, has = (
+        [np.empty(0, np.int64)],
+        [np.empty(0, np.int64)],
+        [np.empty(0, np.bool_)],
+    )
+    try:
+        for log_time, time, known in _read_times(planner, clock):
+            log_times.append(log_time)
+            times.append(time)
+            has.append(known)
+    except TimeError:
+        pass  # the range does not touch this recording
+    log_time, time, known = np.concatenate(log_times), np.concatenate(times), np.concatenate(has)
+    rows = np.arange(len(log_time))
+    is_first = np.ones(len(rows), np.bool_)
+    is_first[1:] = log_time[1:] != log_time[:-1]
+    number = rows - np.maximum.accumulate(np.where(is_first, rows, 0))
+    is_last = np.append(is_first[1:], np.ones(min(len(rows), 1), np.bool_))
+    is_whole = question.is_unbounded and question.predicate is None
+    is_alone = is_first & is_last if is_whole else np.zeros(len(rows), np.bool_)
+    order = np.argsort(time, kind="stable")
+    order = order[known[order]]
+    return _Found(time, log_time, number, is_alone).take(order)
+
+
+_Times = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
+
+
+def _read_times(planner: Planner, clock: Clock) -> Iterator[_Times]:
+    """Log times, times on a clock, and whether these are known, in order."""
+    if clock == "publish":
+        for run in planner.runs():
+            batch = run.batch
+            yield batch.log_time, batch.publish_time, np.ones(len(batch), np.bool_)
+        return
+    for part in planner.parts():
+        if clock == "log":
+            for outcome in planner.outcomes(part):
+                chosen = outcome.log_time[outcome.holds]
+                yield chosen, chosen, np.ones(len(chosen), np.bool_)
+            continue
+        for values in planner.values(part, (STAMP,)):
+            stamps = stamp_array(values.records)
+            if stamps is None:
+                none = np.zeros(len(values.log_time), np.int64)
+                yield values.log_time, none, none.astype(np.bool_)
+                continue
+            known = stamps.is_valid().to_numpy(zero_copy_only=False)
+            filled = stamps.view("int64").fill_null(0).to_numpy()
+            yield values.log_time, filled, known

@@ -1,0 +1,278 @@
+"""Sets of messages against the algorithm of `message_filters`, as it is published."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+from collections import deque
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog.across.approximate_time import approximate_sets
+from hybridlog.across.sync import Synced
+from hybridlog_storage.errors import StoreError, TopicError, UsageError
+
+from .conftest import MS, Logs, Said
+
+
+class ApproximateTime:
+    """ROS's policy as its C++ source has it: messages come one by one and wait in queues.
+
+    Without a limit of the queues and without lower bounds, its search with virtual messages
+    finds nothing that it would not find later.
+    """
+
+    penalty = 0.1
+
+    def __init__(self, topics: int, longest: float) -> None:
+        self.deques: list[deque[int]] = [deque() for _ in range(topics)]
+        self.past: list[list[int]] = [[] for _ in range(topics)]
+        self.longest = longest
+        self.candidate: list[int] = []
+        self.start = self.end = self.pivot_time = 0
+        self.pivot = -1
+        self.published: list[tuple[int, ...]] = []
+
+    def add(self, topic: int, time: int) -> None:
+        self.deques[topic].append(time)
+        self.process()
+
+    def process(self) -> None:
+        while all(self.deques):
+            times = [queue[0] for queue in self.deques]
+            end, start = max(times), min(times)
+            start_index = times.index(start)
+            if self.pivot < 0:
+                if end - start > self.longest:
+                    self.deques[start_index].popleft()
+                    continue
+                self.make_candidate(start, end)
+                self.pivot = len(times) - 1 - times[::-1].index(end)
+                self.pivot_time = end
+                self.to_past(start_index)
+            elif (end - self.end) * (1 + self.penalty) >= start - self.start:
+                self.to_past(start_index)
+            else:
+                self.make_candidate(start, end)
+                self.to_past(start_index)
+            if (
+                start_index == self.pivot
+                or (end - self.end) * (1 + self.penalty) >= self.pivot_time - self.start
+            ):
+                self.publish()
+
+    def make_candidate(self, start: int, end: int) -> None:
+        self.candidate = [queue[0] for queue in self.deques]
+        self.start, self.end = start, end
+        self.past = [[] for _ in self.deques]
+
+    def to_past(self, topic: int) -> None:
+        self.past[topic].append(self.deques[topic].popleft())
+
+    def publish(self) -> None:
+        self.published.append(tuple(self.candidate))
+        self.pivot = -1
+        for queue, past in zip(self.deques, self.past, strict=True):
+            queue.extendleft(reversed(past))
+            past.clear()
+            queue.popleft()
+
+    def finish(self) -> list[tuple[int, ...]]:
+        """What is found when no message follows any more."""
+        while self.pivot >= 0:
+            self.publish()
+            self.process()
+        return self.published
+
+
+times = st.lists(st.integers(0, 60).map(lambda n: 10 * n), max_size=12).map(sorted)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(times, min_size=2, max_size=4),
+    st.none() | st.integers(0, 100),
+    st.randoms(use_true_random=False),
+)
+def test_sets_are_those_of_message_filters(rows: list[list[int]], longest: int | None, rng) -> None:  # type: ignore[no-untyped-def]
+    policy = ApproximateTime(len(rows), float("inf") if longest is None else longest)
+    # The order of arrival across topics does not matter.
+    waiting = [n for n, row in enumerate(rows) for _ in row]
+    rng.shuffle(waiting)
+    iterators = [iter(row) for row in rows]
+    for topic in waiting:
+        policy.add(topic, next(iterators[topic]))
+    want = policy.finish()
+    columns = [np.array(row, np.int64) for row in rows]
+    found = approximate_sets(columns, longest)
+    assert [tuple(columns[n][r] for n, r in enumerate(row)) for row in found.tolist()] == want
+    # Each is used once, and sets do not cross.
+    assert all((b > a).all() for a, b in pairwise(found))
+
+
+def sets_of(
+    logs: Logs, label: str, topics: list[str], longest: int, clock: str
+) -> list[list[Said]]:
+    columns = [
+        sorted(logs.of(label, t), key=lambda m: m.time if clock == "log" else m.stamp)
+        for t in topics
+    ]
+    policy = ApproximateTime(len(topics), longest)
+    for n, column in enumerate(columns):
+        for said in column:
+            policy.add(n, said.time if clock == "log" else said.stamp)
+    counts: list[dict[int, int]] = [{} for _ in topics]
+    found = []
+    for one in policy.finish():
+        row = []
+        for n, time in enumerate(one):
+            # Of messages of one time, the first one that is left.
+            same = [m for m in columns[n] if (m.time if clock == "log" else m.stamp) == time]
+            row.append(same)
+            counts[n][time] = counts[n].get(time, 0) + 1
+        found.append([same[0] for same in row])
+    return found
+
+
+@pytest.mark.parametrize("clock", ["log", "header", "publish"])
+@pytest.mark.parametrize(
+    "topics", [["/base", "/left/pose"], ["/left/pose", "/right/pose", "/base"]]
+)
+def test_messages_of_sets(logs: Logs, clock: str, topics: list[str]) -> None:
+    synced = logs.store.sync(topics, tolerance="20ms", clock=clock)
+    want = [
+        (logs.store.select([label])[0].id, one)
+        for label in logs.said
+        if all(logs.of(label, topic) for topic in topics)
+        for one in sets_of(logs, label, topics, 20 * MS, clock)
+    ]
+    assert len(synced) == len(want) > 10
+    assert synced.topics == tuple(topics)
+    for (recording, said), messages, at, row in zip(
+        want, synced, synced.times.tolist(), synced.recordings, strict=True
+    ):
+        assert [m.topic for m in messages] == topics
+        assert {m.recording for m in messages} == {recording} == {row}
+        for one, message, time in zip(said, messages, at, strict=True):
+            own = {
+                "log": message.log_time_ns,
+                "header": message.header_stamp_ns,
+                "publish": message.publish_time_ns,
+            }[clock]
+            assert own == time == (one.time if clock == "log" else one.stamp)
+    # Each message is there once, also of those with one log time.
+    used = [(m.recording, m.topic, m.seq) for row in synced for m in row]
+    assert len(used) == len(set(used))
+
+
+def test_sets_of_queries(logs: Logs) -> None:
+    on = logs.store.topic("left/pose").where("on == true").between("+100ms", "+900ms")
+    synced = logs.store.sync(["base", on], clock="log")
+    assert len(synced) > 5
+    assert all(pose.fields["on"] is True for _, pose in synced)
+    used = [(m.recording, m.topic, m.seq) for row in synced for m in row]
+    assert len(used) == len(set(used))
+    starts = {label: said[0].time for label, said in logs.said.items()}
+    for _, pose in synced:
+        start = starts[logs.store.entry(pose.recording).label]
+        assert 100 * MS <= pose.log_time_ns - start < 900 * MS
+
+
+def test_only_times_are_read_before_a_set_is_asked_for(logs: Logs) -> None:
+    synced = logs.store.sync(["base", "left/pose"])
+    assert synced.counters.chunks_read == 0
+    assert 0 < synced.counters.bytes_read < 60_000
+    first = synced[0]
+    assert synced.counters.chunks_read <= 4
+    assert [m.raw for m in synced[-len(synced)]] == [m.raw for m in first]
+    assert [[m.raw for m in row] for row in synced[1:3]] == [
+        [m.raw for m in synced[n]] for n in (1, 2)
+    ]
+    with pytest.raises(IndexError):
+        synced[len(synced)]
+
+
+def numbers(synced: Synced, place: int) -> list[int]:
+    return [int(message.decode().header.seq) for message in synced[place]]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("way", ["fork", "spawn"])
+def test_workers_read_sets(logs: Logs, way: str) -> None:
+    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
+    want = [numbers(synced, n) for n in range(16)]
+    context = multiprocessing.get_context(way)
+    with context.Pool(2) as pool:
+        # With fork the workers share what this process has opened; with spawn it is pickled.
+        found = pool.starmap(numbers, [(synced, n) for n in range(16)], chunksize=4)
+        assert found == want
+    assert numbers(synced, 3) == want[3]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_set_is_read_after_a_fork_without_pickling(logs: Logs) -> None:
+    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
+    want = numbers(synced, 5)
+    context = multiprocessing.get_context("fork")
+    answers = context.SimpleQueue()
+
+    def work() -> None:
+        answers.put((numbers(synced, 5), synced._session is not logs.store.session))
+
+    workers = [context.Process(target=work) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    assert [answers.get() for _ in workers] == [(want, True)] * 2
+    for worker in workers:
+        worker.join()
+    assert numbers(synced, 5) == want
+    assert synced._session is logs.store.session
+
+
+def test_a_pickled_set_outlives_the_store(logs: Logs) -> None:
+    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
+    again: Synced = pickle.loads(pickle.dumps(synced))
+    assert (len(again), again.topics, again.recordings) == (
+        len(synced),
+        synced.topics,
+        synced.recordings,
+    )
+    np.testing.assert_array_equal(again.times, synced.times)
+    assert numbers(again, 2) == numbers(synced, 2)
+    # Sizes of what is pickled are those of the arrays.
+    assert len(pickle.dumps(synced)) < 200 * len(synced) + 5000
+
+
+def test_what_is_refused(logs: Logs) -> None:
+    store = logs.store
+    with pytest.raises(UsageError, match="two topics or more"):
+        store.sync(["base"])
+    with pytest.raises(UsageError, match="choose log"):
+        store.sync(["base", "left/pose"], clock="wall")
+    with pytest.raises(UsageError, match="limit, every"):
+        store.sync([store.topic("base").every(2), "left/pose"])
+    with pytest.raises(TopicError, match=r"weather has no header\.stamp"):
+        store.sync(["base", "weather"])
+
+
+@pytest.fixture
+def emptied(tmp_path: Path, logs: Logs) -> Iterator[tuple[hl.Store, Synced]]:
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.import_from(logs.store.directory.path, ["c"])
+        yield store, store.sync(["base", "left/pose"])
+
+
+def test_messages_that_are_gone(emptied: tuple[hl.Store, Synced]) -> None:
+    store, synced = emptied
+    assert len(synced)
+    again: Synced = pickle.loads(pickle.dumps(synced))
+    store.remove("c")
+    with pytest.raises((StoreError, TopicError)):
+        again[0]
