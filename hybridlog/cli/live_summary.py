@@ -71,13 +71,15 @@ class LiveSummary:
 
     def _print(self) -> None:
         reports, state = self._reports, self._state
-        if state.snapshots is None:
+        if state.snapshots is None and reports:
             rows = closing_rows(reports[0], state, self._unreached)
             if self._recorder.reason:
                 rows.append(("ended", self._recorder.reason))
             output.print_table([("recording", "left"), (reports[0].entry.label, "left")], rows)
         elif reports:
             _print_snapshots(reports)
+        elif state.snapshots is None:
+            output.note("Nothing was stored.")
         else:
             output.note("Nothing was triggered; nothing was stored.")
 

@@ -266,6 +266,8 @@ class Recorder:
     def stop(self) -> list[RecordReport]:
         """Stop the sources; flush, index and seal everything.
 
+        If no source was ever reached and no message came, the recording is removed.
+
         Returns:
             A report for each recording.
 
@@ -278,8 +280,11 @@ class Recorder:
         self._control.close()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
-        else:
+        elif self._recorded_by_content or any(source.was_reached for source in self._sources):
             reports = [self._target.close()]
+        else:
+            self._target.abort()
+            return []
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
             for topic, count in self._target.cut_off.items():

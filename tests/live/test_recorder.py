@@ -398,6 +398,23 @@ def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     assert running(store.directory.path) == []
 
 
+@pytest.mark.parametrize(
+    ("is_reached", "is_marked", "recordings"),
+    [(False, False, 0), (True, False, 1), (False, True, 1)],
+)
+def test_a_try_that_reached_nobody_leaves_nothing(
+    store: hl.Store, is_reached: bool, is_marked: bool, recordings: int
+) -> None:
+    running = Running(store)
+    running.speaker.was_reached = is_reached
+    if is_marked:
+        running.recorder.mark("here", {})
+    assert len(running.recorder.stop()) == recordings
+    store.refresh()
+    assert len(store.recordings()) == recordings
+    assert len(list((store.directory.path / "recordings").iterdir())) == recordings
+
+
 def test_sources_that_end_end_it(store: hl.Store) -> None:
     robot = Running(store)
     robot.recorder.ended()
