@@ -24,6 +24,7 @@ from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
+from hybridlog.wording import listed
 from hybridlog_storage import files
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import (
@@ -347,8 +348,14 @@ class Session:
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
-        found = (self._entry_of(summary) for summary in self.snapshot().summaries)
-        return [entry for entry in found if entry is not None]
+        return [*self.entries(self.snapshot().summaries)]
+
+    def entries(self, summaries: Iterable[RecordingSummary]) -> Iterator[RecordingEntry]:
+        """The entries of some recordings, without those that were removed meanwhile."""
+        for summary in summaries:
+            entry = self._entry_of(summary)
+            if entry is not None:
+                yield entry
 
     def entry_of(self, summary: RecordingSummary) -> RecordingEntry:
         """The entry of a recording of the snapshot, compared with its files once.
@@ -442,7 +449,7 @@ class Session:
                 found.append(entry)
         return found
 
-    def select(self, names: Sequence[str] | None) -> list[RecordingEntry]:
+    def select(self, names: Iterable[str | RecordingEntry] | None) -> list[RecordingEntry]:
         """Recordings by label, name, id, or the beginning of one of these; None for all.
 
         Raises:
@@ -451,18 +458,23 @@ class Session:
         if names is None:
             return self.recordings()
         snapshot = self.snapshot()
-        return [self.entry_of(snapshot.summaries[place]) for place in self._named(names)]
+        return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
 
-    def _named(self, names: Sequence[str]) -> list[int]:
-        """Positions of recordings by name, each once, in the order of the names."""
+    def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
+        """Positions of recordings in the snapshot, each once, in the order of the names.
+
+        Raises:
+            TopicError: no recording matches a name, or several do.
+        """
         snapshot = self.snapshot()
         chosen: dict[int, None] = {}
         for given in names:
-            name = self.repairs.copies.get(given, given)
+            asked = given if isinstance(given, str) else given.id
+            name = self.repairs.copies.get(asked, asked)
             found = snapshot.named(name)
             if len(found) != 1:
-                shown = found[:10] or range(min(len(snapshot), 10))
-                candidates = ", ".join(snapshot.summaries[n].label for n in shown) or "none"
+                shown = found or range(len(snapshot))
+                candidates = listed(snapshot.summaries[n].label for n in shown)
                 problem = "is ambiguous" if found else "is not in the store"
                 raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
             chosen[found[0]] = None
@@ -510,13 +522,13 @@ class Session:
         )
 
     def having(
-        self, topics: Sequence[str], recordings: Collection[str] | None = None
+        self, topics: Sequence[str], recordings: Iterable[str | RecordingEntry] | None = None
     ) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         """Topics, and the ids of the recordings that have any of them.
 
         Args:
             topics: Full names.
-            recordings: Ids, labels or names; None for all.
+            recordings: Ids, labels, names or entries; None for all.
 
         Returns:
             The topics, and the ids; None for every recording that has a topic.
@@ -527,12 +539,29 @@ class Session:
         snapshot = self.snapshot()
         places = snapshot.having(topics)
         if recordings is not None:
-            places = np.intersect1d(places, np.array(self._named([*recordings]), np.intp))
+            places = np.intersect1d(places, np.array(self.named(recordings), np.intp))
         if topics and not len(places):
             raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
         if recordings is None:
             return tuple(topics), None
         return tuple(topics), tuple(snapshot.summaries[place].id for place in places.tolist())
+
+    def type_names(self) -> dict[str, str]:
+        """Names of all types of messages, by the hash of their schema."""
+        snapshot = self.snapshot()
+        unknown = snapshot.schemas - self._schemas.keys()
+        if unknown:
+            with suppress(CatalogError):
+                self._schemas |= self.catalog.schemas(unknown)
+        names = {digest: schema.name for digest, schema in self._schemas.items()}
+        if snapshot.schemas <= names.keys():
+            return names
+        # The catalog has lost a schema; entries have the names, too.
+        lost = snapshot.with_schemas(snapshot.schemas - names.keys())
+        for summary in snapshot.differing(lost):
+            channels = self.entry_of(summary).channels
+            names |= {c.schema: c.type for c in channels if c.schema is not None}
+        return names
 
     def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         """The topics that patterns match, and the recordings that have them.
@@ -545,8 +574,8 @@ class Session:
     def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         known = self.topics()
         if not names:
-            listed = "There are: " + ", ".join(known[:20]) if known else "The store is empty."
-            raise TopicError("Name a topic. " + listed)
+            there = f"There are: {listed(known)}." if known else "The store is empty."
+            raise TopicError(f"Name a topic. {there}")
         return self.having(resolve(names, known))
 
     def predicate(

@@ -7,7 +7,9 @@ about, not on what else is in the store.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -75,9 +77,38 @@ class Snapshot:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return sorted({topic.topic for topics in self._topics.values() for topic in topics})
 
+    @cached_property
+    def schemas(self) -> frozenset[str]:
+        """Hashes of all schemas."""
+        return frozenset(
+            topic.schema for topics in self._topics.values() for topic in topics if topic.schema
+        )
+
+    @cached_property
+    def tags(self) -> dict[str, dict[str, list[int]]]:
+        """Positions of the recordings with each tag, by key and value."""
+        found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+        for place, summary in enumerate(self.summaries):
+            for key, value in summary.tags.items():
+                found[key][value].append(place)
+        return found
+
     def topics_of(self, summary: RecordingSummary) -> set[str]:
         """Names of the topics of a recording."""
         return {topic.topic for topic in self._topics[summary.topics]}
+
+    def topics_at(self, places: NDArray[np.intp]) -> list[str]:
+        """Names of all topics of the recordings at some positions, sorted."""
+        if len(places) == len(self.summaries):
+            return self.topics
+        held = list(self._topics.values())
+        sets = np.unique(self._set[places]).tolist()
+        return sorted({topic.topic for number in sets for topic in held[number]})
+
+    def with_schemas(self, schemas: Collection[str]) -> NDArray[np.intp]:
+        """Positions of the recordings that have any of some schemas, by hash, in order."""
+        sets = [any(t.schema in schemas for t in held) for held in self._topics.values()]
+        return np.flatnonzero(np.array(sets, np.bool_)[self._set])
 
     def having(self, topics: Collection[str]) -> NDArray[np.intp]:
         """Positions of the recordings that have any of some topics, in order."""
@@ -104,6 +135,25 @@ class Snapshot:
         low, high = (max(min(bound, _LATEST), -_LATEST) for bound in (begin, end))
         return places[(self.begin[places] < high) & (self.end[places] > low)]
 
+    def during(self, places: NDArray[np.intp], begin: int, end: int, now: int) -> NDArray[np.intp]:
+        """Those of some recordings that overlap a range of log time.
+
+        A recording that is being written begins with its first known message, or when it was
+        started, and reaches until now.
+
+        Args:
+            places: Their positions.
+            begin: Begin of the range, ns.
+            end: End of the range, ns, exclusive.
+            now: The present time, ns.
+        """
+        first, last = self.begin[places], self.end[places]
+        is_written = np.array([self.summaries[p].status == "open" for p in places], np.bool_)
+        created = np.array([self.summaries[p].created for p in places], np.int64)
+        first = np.where(is_written & (first == last), created, first)
+        last = np.where(is_written, np.maximum(last, now), last)
+        return places[(first < last) & (first < end) & (last > begin)]
+
     def others(self, ids: Collection[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Begin and end of the log time in which all recordings but some may have messages."""
         is_other = self.begin < self.end
@@ -118,17 +168,30 @@ class Snapshot:
         _, firsts = np.unique(self._set[places], return_index=True)
         return [self.summaries[place] for place in places[np.sort(firsts)].tolist()]
 
+    def called(self, name: str) -> list[int]:
+        """Positions of the recordings with exactly this label or id, else with this name."""
+        place = self.by_label.get(name, self.by_id.get(name))
+        if place is not None:
+            return [place]
+        return [place for place, one in enumerate(self.summaries) if one.name == name]
+
     def named(self, name: str) -> list[int]:
         """Positions of the recordings that a name may mean.
 
         It is a label or an id, else a name, else the beginning of a label, else of an id.
         """
-        place = self.by_label.get(name, self.by_id.get(name))
-        if place is not None:
-            return [place]
+        found = self.called(name)
+        if found:
+            return found
         everything = list(enumerate(self.summaries))
-        return (
-            [place for place, one in everything if one.name == name]
-            or [place for place, one in everything if one.label.startswith(name)]
-            or [place for place, one in everything if len(name) >= 4 and one.id.startswith(name)]
-        )
+        return [place for place, one in everything if one.label.startswith(name)] or [
+            place for place, one in everything if len(name) >= 4 and one.id.startswith(name)
+        ]
+
+    def matching(self, pattern: str) -> list[int]:
+        """Positions of the recordings whose label or name fits a glob, with case."""
+        return [
+            place
+            for place, one in enumerate(self.summaries)
+            if fnmatchcase(one.label, pattern) or fnmatchcase(one.name, pattern)
+        ]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 from hybridlog import consent, field_indexes
+from hybridlog.choice import Choice
 from hybridlog.entries import text
 from hybridlog.field_indexes import FieldIndex
 from hybridlog.losses import extent_of
@@ -17,6 +18,7 @@ from hybridlog.maintenance.report import Progress, RepairReport, being_written
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
+from hybridlog.recordings import Recordings
 from hybridlog.session import Session
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -39,6 +41,7 @@ from hybridlog_storage.settings import (
 if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
+    from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
@@ -53,6 +56,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.topic_places import TopicPlace
 
 DEFAULT_STORE = "hybridlog-store"
+Names: TypeAlias = "Iterable[str | RecordingEntry]"
+"""Recordings by label, name or id, or their entries."""
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -234,13 +239,56 @@ class Store:
 
     # Recordings and topics.
 
-    def recordings(self) -> list[RecordingEntry]:
-        """All recordings, oldest first."""
-        return self.session.recordings()
+    def recordings(
+        self,
+        name: Texts = None,
+        *,
+        tag: Tags = None,
+        has: Texts = None,
+        type: Texts = None,  # noqa: A002 - the word of the command line
+        during: During = None,
+        where: Texts = None,
+    ) -> Recordings:
+        """The recordings that satisfy all conditions, oldest first; all without conditions.
+
+        Args:
+            name: Label, name, id, the beginning of a label or an id, or a glob (`monday*`)
+                for labels and names; one of several must match.
+            tag: `"robot=7"`, or `"robot"` for any value, or a dictionary.
+            has: Topics that they have: full or short names, globs, `re:`.
+            type: Types of messages: `sensor_msgs/Imu`, `Imu`, a glob.
+            during: Range `[begin, end)` of log time that they overlap, in absolute times;
+                None leaves a side open.
+            where: `"scan: ranges.min < 0.5"`: holds for at least one message of the topic.
+
+        Returns:
+            A sequence of `RecordingEntry`, perhaps empty, with `topic` for queries about them.
+
+        Raises:
+            TopicError: A name without wildcards means no recording, or several.
+            TimeError: `during` is no range of absolute times.
+            WhereError: A predicate cannot be parsed, or does not fit the fields.
+        """
+        return self.choose(Choice.of(name, tag=tag, has=has, type=type, during=during, where=where))
+
+    def choose(self, choice: Choice) -> Recordings:
+        """The recordings that satisfy a choice; see `recordings`."""
+        from hybridlog.choosing import choose
+
+        chosen = choose(self.session, choice)
+        summaries = self.session.snapshot().summaries
+        found = (summaries[place] for place in chosen.places.tolist())
+        return Recordings(self.session, found, chosen.problem)
 
     def summaries(self) -> list[RecordingSummary]:
         """All recordings in short, oldest first; much faster than `recordings`."""
         return list(self.session.snapshot().summaries)
+
+    def is_one(self, names: Sequence[str]) -> bool:
+        """True if a choice by these names is of one recording, whatever the store holds."""
+        from hybridlog.choosing import is_exact
+
+        return len(names) == 1 and is_exact(self.session, names[0])
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its label.
@@ -250,8 +298,10 @@ class Store:
         """
         return self.session.entry(recording)
 
-    def select(self, names: Sequence[str] | None) -> list[RecordingEntry]:
+    def select(self, names: Names | None) -> list[RecordingEntry]:
         """Recordings by label, name, id, or the beginning of one of these; None for all.
+
+        Entries stand for themselves, so `recordings` gives what this takes.
 
         Raises:
             TopicError: No recording matches, or several do.
@@ -280,7 +330,7 @@ class Store:
         """Make a query about all topics."""
         return self.query(self.topics())
 
-    def query(self, topics: Sequence[str], recordings: Sequence[str] | None = None) -> Query:
+    def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.
 
         Raises:
@@ -461,7 +511,7 @@ class Store:
     @_again_if_lost
     def reindex(
         self,
-        recordings: Sequence[str] | None = None,
+        recordings: Names | None = None,
         progress: Progress | None = None,
     ) -> list[RecordingEntry]:
         """Rebuild the index from the segments, recording by recording.
@@ -491,7 +541,9 @@ class Store:
             progress,
         )
         if recordings is None:
-            index.remove_rest(self.directory, self.catalog, database, self.recordings(), progress)
+            index.remove_rest(
+                self.directory, self.catalog, database, self.session.recordings(), progress
+            )
         elif left:
             raise being_written(left[0])
         self.refresh()
@@ -538,7 +590,7 @@ class Store:
         return field_indexes.of_topics(database, names)
 
     @_again_if_lost
-    def sizes(self, recordings: Sequence[str] | None = None) -> Sizes:
+    def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
 
         Args:
@@ -577,7 +629,7 @@ class Store:
 
     @_again_if_lost
     def verify(
-        self, recordings: Sequence[str] | None = None, progress: Progress | None = None
+        self, recordings: Names | None = None, progress: Progress | None = None
     ) -> Verification:
         """Check all checksums, and compare catalog and index with the segments.
 
@@ -690,14 +742,14 @@ class Store:
     def import_from(
         self,
         other: str | Path,
-        recordings: Sequence[str] | None = None,
+        recordings: Choice | Names | None = None,
         progress: Progress | None = None,
     ) -> ImportReport:
         """Import recordings from another store; earlier copies are not repeated.
 
         Args:
             other: The other store's directory.
-            recordings: The recordings; None for all.
+            recordings: The recordings, or what they must satisfy; None for all.
             progress: Called while files are copied and checked.
 
         Raises:
@@ -706,13 +758,18 @@ class Store:
         from hybridlog.maintenance import imports
 
         with Store(StoreDirectory(Path(other)), mongo=EMBEDDED) as source:
-            chosen = source.recordings() if recordings is None else source.select(recordings)
+            chosen: Sequence[RecordingEntry]
+            if isinstance(recordings, Choice):
+                chosen = source.choose(recordings)
+                chosen = chosen if recordings.is_everything else chosen.check()
+            else:
+                chosen = source.select(recordings)
             report = imports.run(source.directory, self.directory, chosen, progress)
         self.refresh()
         return report
 
     def repair(
-        self, recordings: Sequence[str] | None = None, progress: Progress | None = None
+        self, recordings: Names | None = None, progress: Progress | None = None
     ) -> list[Repaired]:
         """Apply all repairs that lose no data; return them.
 
@@ -733,7 +790,7 @@ class Store:
                 self.directory,
                 self.catalog,
                 database,
-                self.recordings() if recordings is None else self._now(chosen),
+                self.session.recordings() if recordings is None else self._now(chosen),
                 progress=progress,
             )
             self.refresh()

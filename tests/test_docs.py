@@ -448,6 +448,11 @@ def commands() -> dict[str, Any]:
     return {name: app.get_command(context, name) for name in app.list_commands(context)}
 
 
+CHOICE = "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--with` | [which recordings]"
+"""The row of a command that chooses recordings by the options that all share."""
+_CHOOSING = {"recording", "tag", "has", "types", "during", "conditions"}
+
+
 @pytest.mark.parametrize("name", sorted(commands()))
 def test_every_option_is_described(name: str) -> None:
     text = sections(DOCS / "cli.md", 2)[name]
@@ -455,7 +460,16 @@ def test_every_option_is_described(name: str) -> None:
         re.findall(r"(?<![\w-])--?[a-zA-Z][\w-]*", "".join(re.findall("`[^`]+`", text)))
     )
     real: set[str] = set()
-    for parameter in commands()[name].params:
+    params = commands()[name].params
+    if CHOICE in text:
+        assert {parameter.name for parameter in params} >= _CHOOSING
+        shared = sections(DOCS / "cli.md", 2)["Choosing recordings"]
+        for parameter in [p for p in params if p.name in _CHOOSING]:
+            assert f"\n| `{parameter.opts[0]}" in shared
+            real.update(parameter.opts)
+            described.update(parameter.opts)
+        params = [p for p in params if p.name not in _CHOOSING]
+    for parameter in params:
         spellings = [*parameter.opts, *parameter.secondary_opts]
         if parameter.param_type_name == "argument":
             shown = (parameter.metavar or parameter.name).strip("[].").upper()
@@ -512,12 +526,13 @@ def documented_classes() -> list[type]:
     from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.recorder import RecordReport
+    from hybridlog.recordings import Recordings
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
-    asking = [hl.Query, hl.Message, Aligned, Synced, Intervals, Interval]
+    asking = [Recordings, hl.Query, hl.Message, Aligned, Synced, Intervals, Interval]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
@@ -538,6 +553,9 @@ def test_every_public_name_is_described(thing: type) -> None:
         members |= {"counters": None}
     if thing.__name__ == "Synced":
         members |= dict.fromkeys(("topics", "recordings", "times", "counters"))
+    if thing.__name__ == "Recordings":
+        conditions = inspect.signature(hl.Store.recordings).parameters
+        members |= dict.fromkeys(("summaries", *(name for name in conditions if name != "self")))
     assert set(rows) == set(members), set(rows) ^ set(members)
     for name, value in members.items():
         if inspect.isfunction(value):

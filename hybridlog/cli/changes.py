@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.store
 @options.between
 @options.where
-@options.recordings
+@options.choice
 @click.option(
     "--pause",
     default="1s",

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import click
     from click.shell_completion import ShellComplete
 
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.directory import StoreDirectory
 
 VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
@@ -41,6 +42,35 @@ def complete_recording(context: click.Context, _: click.Parameter, incomplete: s
     return []
 
 
+def complete_tag(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Tags of recordings: keys, and values after the equals sign."""
+    with _nothing_on_error():
+        tags = _snapshot(_store(context)).tags
+        if "=" in incomplete:
+            key = incomplete.partition("=")[0]
+            offered = [f"{key}={value}" for value in tags.get(key, ())]
+        else:
+            offered = list(tags)
+        return sorted(tag for tag in offered if tag.startswith(incomplete))
+    return []
+
+
+def complete_type(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Types of messages, whole or by the name behind the package."""
+    from contextlib import closing
+
+    from hybridlog.maintenance.opening import open_catalog
+
+    with _nothing_on_error():
+        directory = _store(context)
+        with closing(open_catalog(directory)) as catalog:
+            schemas = catalog.schemas(_snapshot(directory).schemas)
+        names = {schema.name for schema in schemas.values()}
+        names |= {name.rpartition("/")[2] for name in names if incomplete}
+        return sorted(name for name in names if name.startswith(incomplete))
+    return []
+
+
 def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Ids of running recorders that begin with what was typed."""
     from hybridlog.live.control_server import running
@@ -55,6 +85,15 @@ def complete_field(context: click.Context, param: click.Parameter, incomplete: s
     if ":" in incomplete:
         return []
     return [f"{topic}:" for topic in complete_topic(context, param, incomplete)]
+
+
+def complete_condition(
+    context: click.Context, param: click.Parameter, incomplete: str
+) -> list[str]:
+    """Topics, with the colon and space that a predicate follows."""
+    if ":" in incomplete:
+        return []
+    return [f"{topic}: " for topic in complete_topic(context, param, incomplete)]
 
 
 def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
@@ -84,16 +123,25 @@ def _store(context: click.Context) -> StoreDirectory:
 
 def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
     """Topics in the catalog, of some recordings or of all; nothing is repaired for it."""
+    snapshot = _snapshot(directory)
+    named = [
+        place
+        for name in recordings
+        for place in snapshot.called(name) or snapshot.matching(name) or snapshot.named(name)
+    ]
+    if not named:
+        return set(snapshot.topics)
+    return {topic for place in named for topic in snapshot.topics_of(snapshot.summaries[place])}
+
+
+def _snapshot(directory: StoreDirectory) -> Snapshot:
+    """The recordings in the catalog; nothing is repaired for it."""
     from contextlib import closing
 
     from hybridlog.maintenance.opening import open_catalog, snapshot_of
 
     with closing(open_catalog(directory)) as catalog:
-        snapshot = snapshot_of(catalog, catalog.summaries())
-    named = [place for name in recordings for place in snapshot.named(name)]
-    if not named:
-        return set(snapshot.topics)
-    return {topic for place in named for topic in snapshot.topics_of(snapshot.summaries[place])}
+        return snapshot_of(catalog, catalog.summaries())
 
 
 def _short_names(topics: set[str]) -> Iterator[str]:

@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output, sizes_table
-from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import recordings_of
+
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
 
 
 @click.command()
-@click.argument(
-    "recording",
-    nargs=-1,
-    metavar="[RECORDING]...",
-    shell_complete=complete_recording,
-    help="Only these; without, every recording.",
-)
+@options.only_recordings
 @click.option(
     "--by",
     type=click.Choice(["recording", "topic", "both"]),
     default="recording",
     help="A row for each recording, for each topic, or for each topic of each recording.",
 )
+@options.choice
 @options.store
 @options.mongo
 @options.as_json
 def command(
-    *, recording: tuple[str, ...], by: str, store: Path | None, mongo: str | None, as_json: bool
+    *, choice: Choice, by: str, store: Path | None, mongo: str | None, as_json: bool
 ) -> None:
     """Show what recordings and topics take on the disk.
 
@@ -37,7 +36,7 @@ def command(
     what topics have in common are estimates.
     """
     with opened_store(store, mongo, quiet=as_json) as opened:
-        sizes = opened.sizes(recording or None)
+        sizes = opened.sizes(recordings_of(opened, choice))
     rows = sizes.rows
     if by != "both":
         rows = sizes.by_recording() if by == "recording" else sizes.by_topic()

@@ -19,6 +19,7 @@ from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog.query.query import Query
 
 _EXACT = {"mcap", "bag"}
@@ -39,7 +40,7 @@ _EXACT = {"mcap", "bag"}
     help="Format; without, by the suffix (.mcap, .bag).",
 )
 @options.store
-@options.recordings
+@options.choice
 @options.only_topics
 @options.between
 @options.no_latched
@@ -52,7 +53,7 @@ def command(
     target: Path,
     form: str | None,
     store: Path | None,
-    recording: tuple[str, ...],
+    choice: Choice,
     topic: tuple[str, ...],
     between: tuple[str, str] | None,
     no_latched: bool,
@@ -68,7 +69,7 @@ def command(
     if form in _EXACT:
         check_room(target, form=form, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
-        query = query_of(opened, topic, recording)
+        query = query_of(opened, topic, choice)
         if not query.topics:
             raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
         if between is not None:

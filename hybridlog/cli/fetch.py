@@ -21,6 +21,7 @@ from hybridlog.cli.write_answer import Front, write_answer
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -49,7 +50,7 @@ class _Choices:
     clock: str
     at: str | None
     where: tuple[str, ...]
-    recording: tuple[str, ...]
+    choice: Choice
     limit: int | None
     every: int
     reverse: bool
@@ -87,7 +88,7 @@ class _Choices:
 )
 @click.option("--at", metavar="T", help="Only the message that was current at this time.")
 @options.where
-@options.recordings
+@options.choice
 @click.option(
     "--limit",
     "-n",
@@ -186,13 +187,13 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
 
 
 def _query(store: Store, choices: _Choices) -> Query:
-    query = query_of(store, choices.topic, choices.recording)
+    query = query_of(store, choices.topic, choices.choice)
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)
     if choices.event is not None:
         topic, predicate = choices.event
-        events = query_of(store, [topic], choices.recording).where(predicate)
+        events = query_of(store, [topic], choices.choice).where(predicate)
         query = query.around(events, choices.before or 0, choices.after or 0)
     for predicate in choices.where:
         query = query.where(predicate)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,22 +13,17 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
 
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
+
 
 @click.command("import")
 @click.argument("other", type=options.PATH, metavar="STORE", help="Directory of the other store.")
-@click.option(
-    "--recording",
-    "-r",
-    multiple=True,
-    metavar="RECORDING",
-    help="Only this recording of it (label, name, or id). Repeatable.",
-)
+@options.choice
 @options.store
 @options.as_json
 @options.quiet
-def command(
-    *, other: Path, recording: tuple[str, ...], store: Path | None, as_json: bool, quiet: bool
-) -> None:
+def command(*, other: Path, choice: Choice, store: Path | None, as_json: bool, quiet: bool) -> None:
     """Copy recordings from another store.
 
     Every byte is checked. After an interruption, run it again: copied recordings stay.
@@ -37,7 +33,7 @@ def command(
         if_stopped("Run the command again: copied recordings are not copied again."),
         progress_bar("import", 0, quiet=quiet) as bar,
     ):
-        report = opened.import_from(other, recording or None, Stages(bar))
+        report = opened.import_from(other, choice, Stages(bar))
     if as_json:
         output.print_json(asdict(report))
     elif not quiet:

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hybridlog.choice import Choice
 from hybridlog.cli import coverage, options, output, recording_summary, sizes_table
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import recordings_of
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.sizes import Size, Sizes
@@ -25,16 +27,23 @@ if TYPE_CHECKING:
     required=False,
     metavar="[RECORDING|SEGMENT]",
     shell_complete=complete_recording,
-    help="A recording or a segment file; without, every recording.",
+    help="A recording, as for --recording, or a segment file; without, every recording.",
 )
 @click.option(
     "--sizes", is_flag=True, help="Also the bytes of each topic in segments, tables and MongoDB."
 )
+@options.choice
 @options.store
 @options.mongo
 @options.as_json
 def command(
-    *, what: str | None, sizes: bool, store: Path | None, mongo: str | None, as_json: bool
+    *,
+    what: str | None,
+    choice: Choice,
+    sizes: bool,
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
 ) -> None:
     """Show topics, types, rates, sizes, times, clock skew, losses."""
     if what is not None and _is_segment(what):
@@ -43,7 +52,10 @@ def command(
         show_segment(Path(what), as_json=as_json)
         return
     with opened_store(store, mongo, quiet=as_json) as opened:
-        chosen = opened.select(None if what is None else [what])
+        if what is not None:
+            choice = replace(choice, name=(what, *choice.name))
+        chosen = [*recordings_of(opened, choice)]
+        is_one = choice == Choice.of(what) and opened.is_one(choice.name)
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
     if as_json:
@@ -51,7 +63,7 @@ def command(
         for about, entry in zip(full, chosen, strict=True):
             if entry.label in found:
                 about["sizes"] = [sizes_table.as_dict(row) for row in found[entry.label].rows]
-        output.print_json(full[0] if what is not None else full)
+        output.print_json(full[0] if is_one else full)
         return
     if not chosen:
         output.note("The store is empty: `hybridlog record FILE` fills it.")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @options.store
 @options.between
 @options.where
-@options.recordings
+@options.choice
 @options.at_least
 @click.option(
     "--length",

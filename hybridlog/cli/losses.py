@@ -11,20 +11,23 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.coverage import losses_of
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import recordings_of
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog_storage.catalog import RecordingEntry
 
 
 @click.command()
 @options.only_recordings
+@options.choice
 @options.store
 @options.only_topics
 @options.mongo
 @options.as_json
 def command(
     *,
-    recording: tuple[str, ...],
+    choice: Choice,
     store: Path | None,
     topic: tuple[str, ...],
     mongo: str | None,
@@ -35,7 +38,7 @@ def command(
 
     fits = matcher(topic) if topic else None
     with opened_store(store, mongo) as opened:
-        entries = opened.select(recording or None)
+        entries = [*recordings_of(opened, choice)]
         if topic:
             resolve(topic, opened.topics())  # refuses a name that fits no topic
     rows = [

@@ -9,19 +9,24 @@ import click
 
 from hybridlog.cli import options, output, recording_summary
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import recordings_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hybridlog.choice import Choice
     from hybridlog_storage.summary import RecordingSummary
 
 
 @click.command()
+@options.choice
 @options.store
 @options.mongo
 @options.as_json
-def command(*, store: Path | None, mongo: str | None, as_json: bool) -> None:
+def command(*, choice: Choice, store: Path | None, mongo: str | None, as_json: bool) -> None:
     """List the recordings."""
     with opened_store(store, mongo, quiet=as_json) as opened:
-        recordings = opened.summaries()
+        recordings = recordings_of(opened, choice).summaries
     if as_json:
         output.print_json([recording_summary.as_dict(entry) for entry in recordings])
     elif recordings:
@@ -30,7 +35,7 @@ def command(*, store: Path | None, mongo: str | None, as_json: bool) -> None:
         output.note("The store is empty: `hybridlog record FILE` fills it.")
 
 
-def _print(recordings: list[RecordingSummary]) -> None:
+def _print(recordings: Sequence[RecordingSummary]) -> None:
     narrow = output.is_narrow()
     columns: list[output.Column] = [
         ("recording", "left"),

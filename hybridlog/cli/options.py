@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
-from hybridlog.cli.completion import complete_recording, complete_running, complete_topic
+from hybridlog.choice import Choice
+from hybridlog.cli.completion import (
+    complete_condition,
+    complete_recording,
+    complete_running,
+    complete_tag,
+    complete_topic,
+    complete_type,
+)
 from hybridlog_storage.errors import UsageError
 
 PATH: Final = click.Path(readable=False, path_type=Path)
@@ -43,14 +52,85 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for 
 quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
 force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")
 count = click.option("--count", is_flag=True, help="Only print how many.")
-recordings = click.option(
-    "--recording",
-    "-r",
-    multiple=True,
-    metavar="RECORDING",
-    shell_complete=complete_recording,
-    help="Only this recording (id, name, or the beginning of an id). Repeatable.",
+_CHOICE: Final = (
+    click.option(
+        "--recording",
+        "-r",
+        multiple=True,
+        metavar="RECORDING",
+        shell_complete=complete_recording,
+        help="Only this recording: label, name, the beginning of a label or an id, or a glob "
+        "such as 'monday*'. Repeatable.",
+    ),
+    click.option(
+        "--tag",
+        multiple=True,
+        metavar="K=V",
+        shell_complete=complete_tag,
+        help="Only recordings with this tag; K alone is any value. Repeatable.",
+    ),
+    click.option(
+        "--has",
+        multiple=True,
+        metavar="TOPIC",
+        shell_complete=complete_topic,
+        help="Only recordings with this topic. Repeatable.",
+    ),
+    click.option(
+        "--type",
+        "types",
+        multiple=True,
+        metavar="TYPE",
+        shell_complete=complete_type,
+        help="Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob. "
+        "Repeatable.",
+    ),
+    click.option(
+        "--during",
+        nargs=2,
+        metavar="T0 T1",
+        help="Only recordings with a time in this range: ISO 8601, epoch seconds, now, start, end.",
+    ),
+    click.option(
+        "--with",
+        "conditions",
+        multiple=True,
+        metavar="TOPIC: PREDICATE",
+        shell_complete=complete_condition,
+        help="Only recordings with a message that satisfies this, such as "
+        "'scan: ranges.min < 0.5'. Repeatable.",
+    ),
 )
+
+
+def choice(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that choose recordings; the function gets them as `choice`.
+
+    Names in an argument of the command called `names` count as `--recording`.
+    """
+
+    @wraps(function)
+    def chosen(
+        *,
+        recording: tuple[str, ...],
+        tag: tuple[str, ...],
+        has: tuple[str, ...],
+        types: tuple[str, ...],
+        during: tuple[str, str] | None,
+        conditions: tuple[str, ...],
+        names: tuple[str, ...] = (),
+        **others: Any,
+    ) -> Any:
+        made = Choice.of(
+            (*names, *recording), tag=tag, has=has, type=types, during=during, where=conditions
+        )
+        return function(choice=made, **others)
+
+    for option in reversed(_CHOICE):
+        chosen = option(chosen)
+    return chosen
+
+
 running = click.option(
     "--recording",
     "-r",
@@ -61,11 +141,11 @@ running = click.option(
     "Repeatable.",
 )
 only_recordings = click.argument(
-    "recording",
+    "names",
     nargs=-1,
     metavar="[RECORDING]...",
     shell_complete=complete_recording,
-    help="Only these recordings; without, all.",
+    help="Only these recordings, as for --recording; without, all.",
 )
 one_recording = click.argument(
     "recording",

@@ -16,6 +16,7 @@ from hybridlog.cli.query_options import query_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from hybridlog.choice import Choice
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.query import Query
 
@@ -28,7 +29,7 @@ class IntervalChoices:
     topic: str
     between: tuple[str, str] | None
     where: tuple[str, ...]
-    recording: tuple[str, ...]
+    choice: Choice
     count: bool
     mongo: str | None
     as_json: bool
@@ -45,7 +46,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
     started = time.monotonic()
     quiet = choices.quiet or choices.as_json
     with opened_store(choices.store, choices.mongo, quiet=quiet) as store:
-        query = query_of(store, [choices.topic], choices.recording)
+        query = query_of(store, [choices.topic], choices.choice)
         if choices.between is not None:
             query = query.between(*choices.between)
         for predicate in choices.where:

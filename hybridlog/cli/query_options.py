@@ -1,4 +1,4 @@
-"""Makes a query of the options --topic, --recording and --fields."""
+"""Makes a query of the options that choose topics and recordings, and of --fields."""
 
 from __future__ import annotations
 
@@ -6,16 +6,48 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from hybridlog.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
+    from hybridlog.recordings import Recordings
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
 
 
-def query_of(store: Store, topics: Sequence[str] | None, recordings: Sequence[str] | None) -> Query:
-    """A query of some topics of some recordings.
+def recordings_of(store: Store, choice: Choice) -> Recordings:
+    """The chosen recordings; of an empty store none, if nothing is asked of them.
+
+    Raises:
+        TopicError: No recording satisfies the choice; says which condition none does.
+    """
+    chosen = store.choose(choice)
+    return chosen if choice.is_everything else chosen.check()
+
+
+def named_or_chosen(
+    store: Store, choice: Choice, words: Sequence[str]
+) -> tuple[Recordings, Sequence[str], bool]:
+    """The recordings of a command that names one in its first word, or chooses by options.
+
+    Returns:
+        The recordings, the other words, and whether one recording is named.
+
+    Raises:
+        UsageError: There is neither a word nor an option.
+        TopicError: No recording satisfies the choice.
+    """
+    if not choice.is_everything:
+        return recordings_of(store, choice), words, False
+    if not words:
+        raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
+    named = Choice.of(words[0])
+    return recordings_of(store, named), words[1:], store.is_one(named.name)
+
+
+def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
+    """A query of some topics of the chosen recordings.
 
     Short names and globs are resolved among the topics of the chosen recordings. A name that
     is ambiguous in the store may be clear in one recording.
@@ -23,25 +55,21 @@ def query_of(store: Store, topics: Sequence[str] | None, recordings: Sequence[st
     Args:
         store: The store.
         topics: As typed; None or empty for all.
-        recordings: As typed; None or empty for all.
+        choice: The recordings.
 
     Raises:
-        TopicError: A name fits nothing, or several things.
+        TopicError: A name fits nothing, or several things; or no recording is chosen.
     """
-    if not recordings:
+    if choice.is_everything:
         if not topics:
             return store.all_topics()
         with _name_open_recordings(store.summaries):
             return store.topic(*topics)
-    from hybridlog.entries import summary_of
-    from hybridlog.losses import topics_of
-    from hybridlog.query.topics import resolve
-
-    chosen = store.select(recordings)
-    known = {topic for entry in chosen for topic in topics_of(entry)}
-    with _name_open_recordings(lambda: [summary_of(entry) for entry in chosen]):
-        names = resolve(topics, known) if topics else sorted(known)
-    return store.query(names, [entry.id for entry in chosen])
+    chosen = recordings_of(store, choice)
+    if not topics:
+        return chosen.all_topics()
+    with _name_open_recordings(lambda: chosen.summaries):
+        return chosen.topic(*topics)
 
 
 @contextmanager

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import recordings_of
 from hybridlog.cli.signals import if_stopped
+
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
 
 
 @click.command()
-@options.recordings
+@options.choice
 @options.store
 @options.mongo
 @options.cache_size
@@ -22,7 +27,7 @@ from hybridlog.cli.signals import if_stopped
 @options.quiet
 def command(
     *,
-    recording: tuple[str, ...],
+    choice: Choice,
     store: Path | None,
     mongo: str | None,
     cache_size: int | None,
@@ -38,8 +43,8 @@ def command(
     with opened_store(
         store, mongo, needs_database=True, cache_mb=cache_size, quiet=quiet
     ) as opened:
-        chosen = opened.select(recording or None)
-        total = sum(entry.stored_bytes for entry in chosen)
+        chosen = recordings_of(opened, choice)
+        total = sum(entry.stored_bytes for entry in chosen.summaries)
         with (
             if_stopped(
                 "Finished recordings stay indexed; the next command that needs the index "
@@ -47,8 +52,8 @@ def command(
             ),
             progress_bar("reindex", total, quiet=quiet) as bar,
         ):
-            done = opened.reindex(recording or None, Stages(bar))
-    left = [entry.label for entry in chosen if entry.id not in {r.id for r in done}]
+            done = opened.reindex(None if choice.is_everything else chosen, Stages(bar))
+    left = [entry.label for entry in chosen.summaries if entry.id not in {r.id for r in done}]
     for label in left:
         output.note(f"Recording {label} is being written, and was left as it is.")
     for entry in done:

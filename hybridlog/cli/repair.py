@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import recordings_of
 from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
 
 
 @click.command()
 @options.only_recordings
+@options.choice
 @options.store
 @click.option("--moved", is_flag=True, help="The store was moved to here: take its index over.")
 @click.option(
@@ -27,7 +33,7 @@ from hybridlog_storage.errors import UsageError
 @options.quiet
 def command(
     *,
-    recording: tuple[str, ...],
+    choice: Choice,
     store: Path | None,
     moved: bool,
     new_id: bool,
@@ -53,8 +59,9 @@ def command(
         if moved:
             opened.take_over()
             output.say("the index belongs to the store at this place now")
+        chosen = None if choice.is_everything else recordings_of(opened, choice)
         with progress_bar("repair", 0, quiet=quiet) as bar:
-            done = opened.repair(recording or None, Stages(bar))
+            done = opened.repair(chosen, Stages(bar))
     left = [one for one in done if not one.is_cured]
     if as_json:
         output.print_json([asdict(one) for one in done])

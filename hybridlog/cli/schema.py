@@ -15,6 +15,7 @@ from hybridlog.cli.query_options import query_of
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
 
@@ -24,16 +25,16 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 @click.command()
 @click.argument("topic", metavar="TOPIC", shell_complete=complete_topic, help="A topic.")
 @options.store
-@options.recordings
+@options.choice
 @options.mongo
 @options.as_json
 def command(
-    *, topic: str, store: Path | None, recording: tuple[str, ...], mongo: str | None, as_json: bool
+    *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
 ) -> None:
     """Show a topic's message definition and its fields."""
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
     with opened_store(store, mongo, quiet=as_json) as opened:
-        for recorded in query_of(opened, [topic], recording).channels():
+        for recorded in query_of(opened, [topic], choice).channels():
             schema = recorded.channel.schema
             key = (
                 recorded.channel.topic,

@@ -12,21 +12,24 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import recordings_of
 from hybridlog_storage.errors import DatabaseError
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog.maintenance.verify import Verification
 
 
 @click.command()
 @options.only_recordings
+@options.choice
 @options.store
 @options.mongo
 @options.as_json
 @options.quiet
 def command(
     *,
-    recording: tuple[str, ...],
+    choice: Choice,
     store: Path | None,
     mongo: str | None,
     as_json: bool,
@@ -38,10 +41,10 @@ def command(
     """
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        chosen = opened.select(recording or None)
-        total = sum(entry.stored_bytes for entry in chosen)
+        chosen = recordings_of(opened, choice)
+        total = sum(entry.stored_bytes for entry in chosen.summaries)
         with progress_bar("verify", total, quiet=quiet) as bar:
-            result = opened.verify(recording or None, Stages(bar))
+            result = opened.verify(None if choice.is_everything else chosen, Stages(bar))
         why = opened.without_database
     elapsed = time.monotonic() - started
     if as_json:

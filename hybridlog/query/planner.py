@@ -187,6 +187,40 @@ class Planner:
         limit = self.question.limit
         return total if limit is None else min(total, limit)
 
+    def recordings_with_any(self) -> set[str]:
+        """Ids of the recordings that have a message in the answer."""
+        found: set[str] = set()
+        groups: dict[Engine, list[Part]] = defaultdict(list)
+        narrowed: list[Part] = []
+        for part in self.together(self.parts()):
+            if self._is_narrowed(part):
+                narrowed.append(part)
+            else:
+                groups[next(self._choose(part, Need.COUNT))].append(part)
+        for engine, group in groups.items():
+            for part, count in self._count_each(engine, group):
+                if count:
+                    found.add(part.recording.id)
+        if narrowed:
+            for run in ChunkScan(self.plan(narrowed), self.session.segment).unordered():
+                rows = np.unique(run.batch.channel).tolist()
+                found.update(run.channels[row].recording.id for row in rows)
+        return found
+
+    def _count_each(self, engine: Engine, parts: Sequence[Part]) -> Iterator[tuple[Part, int]]:
+        """The count of each part; a server is asked about all at once."""
+        if engine is self._mongo:
+            try:
+                yield from self._mongo.counts(parts)
+            except _RETRIED as error:
+                yield from ((part, self._count_otherwise(part, engine, error)) for part in parts)
+            return
+        for part in parts:
+            try:
+                yield part, engine.count([part])
+            except _RETRIED as error:
+                yield part, self._count_otherwise(part, engine, error)
+
     def together(self, parts: Sequence[Part]) -> Sequence[Part]:
         """Announce parts that will be asked about one by one; a server is asked at once."""
         self._asked = parts

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from hybridlog.choice import Choice
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.across.align import Aligned
+    from hybridlog.choice import During, Tags, Texts
     from hybridlog.message import Message
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.intervals import Intervals
@@ -185,14 +187,28 @@ class Query:
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
-    def in_recording(self, *names: str) -> Query:
-        """Only these recordings, by label, name or id.
+    def in_recording(
+        self,
+        *names: str,
+        tag: Tags = None,
+        has: Texts = None,
+        type: Texts = None,  # noqa: A002 - the word of the command line
+        during: During = None,
+        where: Texts = None,
+    ) -> Query:
+        """Only these recordings: by label, name, id or glob, and as `Store.recordings`.
 
         Raises:
-            TopicError: no such recording exists, or it lacks the topic.
+            TopicError: no such recording exists, or none has the topic.
         """
-        chosen = [entry.id for entry in self._session.select(names)]
-        return self._on(self.topics, chosen)
+        from hybridlog.choosing import choose
+
+        choice = Choice.of(names, tag=tag, has=has, type=type, during=during, where=where)
+        chosen = choose(self._session, choice)
+        if chosen.problem:
+            raise TopicError(chosen.problem)
+        summaries = self._session.snapshot().summaries
+        return self._on(self.topics, [summaries[n].id for n in chosen.places.tolist()])
 
     def with_topic(self, topic: str) -> Query:
         """The same question about one of its topics."""

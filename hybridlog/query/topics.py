@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, text_of
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
 _SHOWN = 10
@@ -279,10 +280,7 @@ def _there_are(known: list[str]) -> str:
 
 
 def _listed(topics: Iterable[str]) -> str:
-    names = list(topics)
-    shown = ", ".join(_shown(name, quote=False) for name in names[:_SHOWN])
-    more = len(names) - _SHOWN
-    return f"{shown} and {more} more" if more > 0 else shown
+    return listed((_shown(name, quote=False) for name in topics), _SHOWN)
 
 
 def _shown(text: str, *, quote: bool = True) -> str:

@@ -87,7 +87,7 @@ def test_usage_names_what_is_wanted() -> None:
         ("record", "[PATH]..."),
         ("schema", "schema [OPTIONS] TOPIC\n"),
         ("verify", "[RECORDING]..."),
-        ("rm", "rm [OPTIONS] RECORDING...\n"),
+        ("rm", "rm [OPTIONS] [RECORDING]...\n"),
         ("export", "-t, --topic TOPIC"),
     ):
         assert words in run(command, "--help").out

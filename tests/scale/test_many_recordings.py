@@ -81,6 +81,12 @@ ASKED: dict[str, Work] = {
     "last of all": lambda store: store.topic("pose").reverse().first(),
     "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
     "topics": lambda store: store.topics(),
+    "chosen ones": lambda store: [
+        *store.recordings("day0*", has="pose", type="Float32", during=day(4))
+    ],
+    "chosen by content": lambda store: [
+        *store.recordings(during=(day(3)[0], day(4)[1]), where="pose: data > 4.5")
+    ],
     "info of one": lambda store: store.select(["day00004"]),
 }
 """Questions about little."""

@@ -151,6 +151,21 @@ class Mongo:
         asked = [question for question, _ in self._questions(parts, lambda f: f.filter)]
         return sum(self._index(parts).count_each(asked))
 
+    def counts(self, parts: Sequence[Part]) -> Iterator[tuple[Part, int]]:
+        """The number of documents that match in each part, with a question for each topic.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+            IndexChangedError: another process changes the index.
+        """
+        by_topic: dict[str, list[Part]] = defaultdict(list)
+        for part in parts:
+            by_topic[part.topic].append(part)
+        for group in by_topic.values():
+            asked = [question for question, _ in self._questions(group, lambda f: f.filter)]
+            found = self._index(group).count_by(asked, "_meta.rec")
+            yield from ((part, found.get(part.recording.key, 0)) for part in group)
+
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """Keys of the matching documents merged with keys of the others."""
         if part in self._ahead or self._look_ahead(part):

@@ -1,0 +1,119 @@
+"""Recordings that were chosen from a store, and queries about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, overload
+
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
+from hybridlog.query.topics import resolve
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError
+
+if TYPE_CHECKING:
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
+
+
+class Recordings(Sequence["RecordingEntry"]):
+    """Some recordings of an open store, oldest first; each entry is read when it is accessed.
+
+    Args:
+        session: The open store.
+        summaries: The recordings in short.
+        problem: The reason why there is none.
+
+    Attributes:
+        summaries: The recordings in short.
+    """
+
+    def __init__(
+        self, session: Session, summaries: Iterable[RecordingSummary], problem: str = ""
+    ) -> None:
+        self.summaries = tuple(summaries)
+        self._session = session
+        self._problem = problem or "The store is empty: `hybridlog record FILE` fills it."
+
+    def __len__(self) -> int:
+        return len(self.summaries)
+
+    @overload
+    def __getitem__(self, index: int) -> RecordingEntry: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Recordings: ...
+
+    def __getitem__(self, index: int | slice) -> RecordingEntry | Recordings:
+        """The entry of a recording, or some of the recordings."""
+        if isinstance(index, slice):
+            return Recordings(self._session, self.summaries[index], self._problem)
+        return self._session.entry_of(self.summaries[index])
+
+    def __iter__(self) -> Iterator[RecordingEntry]:
+        """The entries, without those of recordings that were removed meanwhile."""
+        return self._session.entries(self.summaries)
+
+    def __eq__(self, other: object) -> bool:
+        """True for the same recordings, also as a list of entries."""
+        if isinstance(other, Recordings):
+            return self.ids == other.ids
+        return [*self] == other if isinstance(other, list) else NotImplemented
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<Recordings {listed(one.label for one in self.summaries)}>"
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Their ids."""
+        return tuple(summary.id for summary in self.summaries)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Their labels."""
+        return tuple(summary.label for summary in self.summaries)
+
+    def check(self) -> Recordings:
+        """These recordings.
+
+        Raises:
+            TopicError: There is none; names the condition that no recording satisfies.
+        """
+        if not self.summaries:
+            raise TopicError(self._problem)
+        return self
+
+    def topics(self) -> list[str]:
+        """Names of their topics, sorted; includes those whose messages are all lost."""
+        snapshot = self._session.snapshot()
+        sets = {summary.topics: summary for summary in self.summaries}
+        return sorted({name for summary in sets.values() for name in snapshot.topics_of(summary)})
+
+    def topic(self, *names: str) -> Query:
+        """Make a query about topics of these recordings.
+
+        Args:
+            names: As for `Store.topic`, among the topics of these recordings: a short name
+                that is ambiguous in the store may be clear in them.
+
+        Raises:
+            TopicError: There is no recording; or a name matches no topic, or several.
+        """
+        known = self.check().topics()
+        if not names:
+            raise TopicError(f"Name a topic. There are: {listed(known)}.")
+        return self._query(resolve(names, known))
+
+    def all_topics(self) -> Query:
+        """Make a query about all topics of these recordings.
+
+        Raises:
+            TopicError: There is no recording.
+        """
+        return self._query(self.check().topics())
+
+    def _query(self, topics: Sequence[str]) -> Query:
+        return Query(self._session, Question(*self._session.having(topics, self.ids)))

@@ -1,0 +1,16 @@
+"""Lists of names in messages for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MOST_LISTED = 10
+
+
+def listed(names: Iterable[str], most: int = MOST_LISTED) -> str:
+    """Names with commas between them: `a, b and 4 more` if they are many; `none` without any."""
+    known = list(names)
+    # One name takes no more room than the words for it.
+    if len(known) <= most + 1:
+        return ", ".join(known) or "none"
+    return f"{', '.join(known[:most])} and {len(known) - most} more"

@@ -1,0 +1,382 @@
+"""Choosing recordings by name, tag, topic, type, time and content, in Python and by command."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from click.shell_completion import ShellComplete
+from click.testing import CliRunner
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.choice import Choice
+from hybridlog.cli.app import app
+from hybridlog.recordings import Recordings
+from hybridlog.snapshot import Snapshot
+from hybridlog.wording import listed
+from hybridlog_storage.errors import (
+    HybridlogError,
+    TimeError,
+    TopicError,
+    UsageError,
+    WhereError,
+)
+from tests.test_snapshot import summary
+
+DAY = 86_400 * 10**9
+START = 20_242 * DAY  # 2025-06-03
+SCAN, IMU, ODD = "sensor_msgs/LaserScan", "sensor_msgs/msg/Imu", "acme.robot.Imu"
+
+
+class Made(NamedTuple):
+    """A recording: its name, its tags, and its topics with their type and values of `n`."""
+
+    name: str
+    tags: dict[str, str]
+    topics: dict[str, tuple[str, list[int]]]
+
+
+MADE = [
+    Made("monday 1", {"robot": "7", "place": "lab"}, {"/scan": (SCAN, [1, 2, 3])}),
+    Made("monday 2", {"robot": "8"}, {"/scan": (SCAN, [2, 9]), "/imu": (IMU, [5])}),
+    Made("tuesday", {"robot": "7"}, {"/left/scan": (SCAN, [4]), "/odd": (ODD, [1])}),
+    Made("run[1]", {}, {"/scan": (SCAN, [0])}),
+    Made("run1", {"robot": ""}, {"/imu": (IMU, [6, 7])}),
+]
+LABELS = ["monday-1", "monday-2", "tuesday", "run-1", "run1"]
+
+
+def write(path: Path, day: int, topics: dict[str, tuple[str, list[int]]]) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, (kind, values) in topics.items():
+            schema = writer.register_schema(kind, "jsonschema", b'{"type": "object"}')
+            channel = writer.register_channel(topic, "json", schema)
+            for number, n in enumerate(values):
+                time = START + day * DAY + number * 10**9
+                writer.add_message(channel, time, json.dumps({"n": n}).encode(), time)
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    path = tmp_path_factory.mktemp("choosing")
+    with hl.open(path / "store", create=True) as opened:
+        for day, made in enumerate(MADE):
+            write(path / "log.mcap", day, made.topics)
+            opened.record(path / "log.mcap", name=made.name, tags=made.tags)
+        yield opened
+
+
+class Called(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+def call(store: hl.Store, *words: str, typed: str | None = None) -> Called:
+    """Run a command in this process."""
+    command, *rest = words
+    done = CliRunner().invoke(
+        app, [command, *rest, "--store", str(store.directory.path)], input=typed
+    )
+    if isinstance(done.exception, HybridlogError):
+        return Called(done.exception.exit_code, done.stdout, f"{done.stderr}{done.exception}")
+    return Called(done.exit_code, done.stdout, done.stderr)
+
+
+CHOSEN: list[tuple[dict[str, Any], list[str]]] = [
+    ({}, LABELS),
+    ({"name": "monday*"}, ["monday-1", "monday-2"]),
+    ({"name": "*[12]"}, ["monday-1", "monday-2", "run-1", "run1"]),
+    ({"name": "run[1]"}, ["run-1"]),  # a whole name before a glob
+    ({"name": "run[12]"}, ["run1"]),
+    ({"name": "monday ?"}, ["monday-1", "monday-2"]),  # by name, not by label
+    ({"name": ["tues", "monday-1"]}, ["monday-1", "tuesday"]),
+    ({"tag": "robot=7"}, ["monday-1", "tuesday"]),
+    ({"tag": "robot"}, ["monday-1", "monday-2", "tuesday", "run1"]),
+    ({"tag": "robot="}, ["run1"]),
+    ({"tag": ["robot=7", "place"]}, ["monday-1"]),
+    ({"tag": {"robot": "8"}}, ["monday-2"]),
+    ({"tag": {"robot": None, "place": "lab"}}, ["monday-1"]),
+    ({"has": "scan"}, ["monday-1", "monday-2", "tuesday", "run-1"]),
+    ({"has": "/scan"}, ["monday-1", "monday-2", "run-1"]),
+    ({"has": ["scan", "imu"]}, ["monday-2"]),
+    ({"has": "re:/(odd|imu)"}, ["monday-2", "tuesday", "run1"]),
+    ({"has": "IMU"}, ["monday-2", "run1"]),  # another case, if nothing fits it
+    ({"type": "sensor_msgs/Imu"}, ["monday-2", "run1"]),
+    ({"type": "sensor_msgs/msg/LaserScan"}, ["monday-1", "monday-2", "tuesday", "run-1"]),
+    ({"type": "Imu"}, ["monday-2", "tuesday", "run1"]),
+    ({"type": "acme.*"}, ["tuesday"]),
+    ({"type": "sensor_msgs/*", "has": "/odd"}, ["tuesday"]),
+    ({"during": ("2025-06-04", "2025-06-06")}, ["monday-2", "tuesday"]),
+    ({"during": (START + DAY + 10**9, START + 2 * DAY)}, ["monday-2"]),  # its last message
+    ({"during": (START + DAY + 10**9 + 1, START + 2 * DAY + 1)}, ["tuesday"]),
+    ({"during": (None, "2025-06-04")}, ["monday-1"]),
+    ({"during": ("2025-06-06", "end")}, ["run-1", "run1"]),
+    ({"during": ("start", "now")}, LABELS),
+    ({"where": "scan: n > 3"}, ["monday-2", "tuesday"]),
+    ({"where": "/scan: n > 3"}, ["monday-2"]),
+    ({"where": "**: n = 1"}, ["monday-1", "tuesday"]),
+    ({"where": ["scan: n = 2", "imu: n = 5"]}, ["monday-2"]),
+    ({"where": "imu"}, ["monday-2", "run1"]),
+    ({"tag": "robot=7", "where": "scan: n >= 4"}, ["tuesday"]),
+    ({"tag": "robot=9"}, []),
+    ({"tag": "colour"}, []),
+    ({"has": "/nothing"}, []),
+    ({"type": "Image"}, []),
+    ({"name": "x*"}, []),
+    ({"during": ("2030-01-01", None)}, []),
+    ({"where": "scan: n > 99"}, []),
+]
+
+
+@pytest.mark.parametrize(("asked", "labels"), CHOSEN, ids=[str(asked) for asked, _ in CHOSEN])
+def test_recordings_are_chosen(store: hl.Store, asked: dict[str, Any], labels: list[str]) -> None:
+    found = store.recordings(**asked)
+    assert list(found.labels) == labels
+    assert [entry.label for entry in found] == labels
+    if labels:
+        assert found.check() is found
+    else:
+        with pytest.raises(TopicError, match="There is no recording"):
+            found.topic("scan")
+
+
+def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
+    asked = {"where": "scan: n > 3", "tag": "robot"}
+    with hl.open(store.directory.path, mongo="mongodb://localhost:1/?timeoutMS=20") as away:
+        assert list(away.recordings(**asked).labels) == ["monday-2", "tuesday"]
+        assert away.without_database is None, "it was not even asked"
+
+
+def test_a_filter_that_only_the_index_narrows(store: hl.Store) -> None:
+    """MongoDB finds candidates for a pattern, and the messages decide."""
+    assert list(store.recordings(where="scan: n > 3 or header.frame_id ~ 'x+y'").labels) == [
+        "monday-2",
+        "tuesday",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "words"),
+    [
+        ({"name": "nobody"}, TopicError, "'nobody' is not in the store. There are: monday-1"),
+        ({"name": "mon"}, TopicError, "ambiguous. There are: monday-1, monday-2."),
+        ({"tag": "=7"}, UsageError, "KEY=VALUE"),
+        ({"has": "re:("}, TopicError, "refused"),
+        ({"during": ("+1s", "end")}, TimeError, "absolute, not '[+]1s'"),
+        ({"during": ("2025-06-05", "2025-06-04")}, TimeError, "empty"),
+        ({"during": "2025-06-04"}, TimeError, "two times"),
+        ({"where": ": n > 1"}, UsageError, "TOPIC: PREDICATE"),
+        ({"where": "scan: n >"}, WhereError, "expected a value"),
+        ({"has": [5]}, UsageError, "takes text"),
+    ],
+)
+def test_a_choice_without_a_meaning_is_refused(
+    store: hl.Store, asked: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        store.recordings(**asked)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--tag", "robot=9"), "with the tag robot=9. The store has robot=, robot=7, robot=8."),
+        (("--tag", "colour"), "with the tag colour. The tags of the store are: place, robot."),
+        (("-r", "mon*", "--tag", "robot="), "named 'mon*', with the tag robot=. The tags"),
+        (("--has", "imy"), "did you mean /imu?"),
+        (("--type", "sensor_msgs/LaserScam"), "Did you mean sensor_msgs/LaserScan, "),
+        (("--type", "x"), f"The store has: {ODD}, {SCAN}, {IMU}"),
+        (("--during", "2030-01-01", "end"), "lie between 2025-06-03T00:00:00Z and 2025-06-07"),
+        (("--with", "/scan: n > 99"), "3 with /scan were asked."),
+        (("-r", "x*"), "named 'x*'. There are: monday-1, monday-2, tuesday, run-1, run1."),
+    ],
+)
+def test_who_chooses_nothing_hears_why(store: hl.Store, words: tuple[str, ...], said: str) -> None:
+    done = call(store, "ls", *words)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("There is no recording ")
+    assert said in done.err
+
+
+def test_all_commands_choose_alike(store: hl.Store) -> None:
+    chosen = ["--tag", "robot=7", "--with", "scan: n > 3"]
+    assert [one["recording"] for one in json.loads(call(store, "ls", *chosen, "--json").out)] == [
+        "tuesday"
+    ]
+    assert [one["recording"] for one in json.loads(call(store, "info", *chosen, "--json").out)] == [
+        "tuesday"
+    ]
+    assert call(store, "fetch", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
+    assert call(store, "intervals", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
+    assert call(store, "changes", "-t", "scan", "--fields", "n", "--count", "-q", *chosen).out
+    assert "/left/scan" in call(store, "schema", "scan", *chosen).out
+    assert "from 1 recording," in call(store, "losses", *chosen).out
+    rows = json.loads(call(store, "du", *chosen, "--json").out)["rows"]
+    assert [row["recording"] for row in rows] == ["tuesday"]
+    assert call(store, "verify", *chosen).out.startswith("1 recording,")
+    assert call(store, "reindex", *chosen).out.startswith("1 recording,")
+    assert call(store, "repair", *chosen).out == "nothing to mend\n"
+    for command in ("info", "losses", "du", "verify", "reindex", "repair", "rm"):
+        assert call(store, command, "--tag", "robot=9").code == 2
+    for command in ("fetch", "intervals", "schema"):
+        topic = ["scan"] if command == "schema" else ["-t", "scan"]
+        assert "robot=9" in call(store, command, *topic, "--tag", "robot=9").err
+
+
+def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
+    # JSON is a list unless one recording is named, however many fit.
+    assert json.loads(call(store, "info", "run[1]", "--json").out)["recording"] == "run-1"
+    found = json.loads(call(store, "info", "tues*", "--json").out)
+    assert [one["recording"] for one in found] == ["tuesday"]
+    assert call(store, "verify", "mon*", "-r", "run1").out.startswith("3 recordings,")
+
+
+def test_tags_of_many_are_changed_at_once(store: hl.Store) -> None:
+    assert (
+        call(store, "tag", "run*", "by=hand").out == "run-1: by=hand\nrun1: by=hand\nrun1: robot=\n"
+    )
+    assert call(store, "tag", "--has", "imu", "by=machine").code == 0
+    store.refresh()
+    assert list(store.recordings(tag="by=machine").labels) == ["monday-2", "run1"]
+    assert call(store, "untag", "--tag", "by", "by").code == 0
+    store.refresh()
+    assert store.recordings(tag="by") == []
+    assert "has no tag 'by'" in call(store, "untag", "tuesday", "by").err
+    assert "Name a recording" in call(store, "tag").err
+    assert "KEY=VALUE" in call(store, "tag", "--has", "imu", "run1").err
+
+
+def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        for day in range(1, 4):
+            write(tmp_path / "log.mcap", day, {"/a": ("t", [day])})
+            store.record(tmp_path / "log.mcap", name=f"r{day}", tags={"day": str(day % 2)})
+        assert "r1, r3" in (asked := call(store, "rm", "--tag", "day=1")).err
+        assert asked.code == 2
+        assert "--yes" in asked.err
+        assert "Name the recordings" in call(store, "rm").err
+        assert call(store, "rm", "-r", "r?", "--with", "a: n > 2", "--yes").out == "deleted r3\n"
+        assert call(store, "rm", "r1", "-r", "r2", "-y").out == "deleted r1\ndeleted r2\n"
+        store.refresh()
+        assert store.recordings() == []
+
+
+def test_who_is_asked_sees_what_goes(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hybridlog.cli import rm
+
+    shown: list[str] = []
+    monkeypatch.setattr(rm.output, "note", shown.append)
+    monkeypatch.setattr(rm.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
+    monkeypatch.setattr(rm.click, "confirm", lambda text, err: shown.append(text) or False)
+    many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
+    with pytest.raises(rm.click.exceptions.Exit):
+        rm._confirm(["twin"], many)
+    assert shown[0] == "  twin: a copy"
+    assert shown[1] == "  r0: 2025-06-03T00:00:00Z, 1 message, 1 B"
+    assert shown[-3:] == [
+        "  and 5 more",
+        "Delete these 26 recordings for good?",
+        "Nothing is deleted.",
+    ]
+
+
+def test_queries_of_chosen_recordings(store: hl.Store) -> None:
+    found = store.recordings(tag="robot=7")
+    assert isinstance(found, Recordings)
+    assert found.topics() == ["/left/scan", "/odd", "/scan"]
+    assert found.all_topics().count() == 5
+    # A short name means one topic of all, and another one of the second recording.
+    assert found.topic("scan").topics == ("/scan",)
+    assert found[1:].topic("scan").topics == ("/left/scan",)
+    assert found[0].label == "monday-1"
+    assert store.topic("/scan").in_recording(tag="robot=8", where="imu: n = 5").count() == 2
+    assert store.topic("/scan").in_recording("mon*").count() == 5
+    with pytest.raises(TopicError, match="robot=9"):
+        store.topic("/scan").in_recording(tag="robot=9")
+    # Whatever takes names takes recordings.
+    assert store.verify(found).recordings == 2
+    assert store.query(["/scan"], found).count() == 3
+    assert {size.recording for size in store.sizes(found).rows} == {"monday-1", "tuesday"}
+    assert store.select(found) == found
+
+
+def test_import_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:
+    path = tmp_path / "copy"
+    words = ["import", str(store.directory.path), "--store", str(path), "--tag", "robot=7"]
+    done = CliRunner().invoke(app, words)
+    assert done.stdout == "imported monday-1\nimported tuesday\n"
+    nothing = CliRunner().invoke(app, [*words[:-1], "robot=9"])
+    assert "robot=7" in str(nothing.exception)
+
+
+def test_completion_of_choices(store: hl.Store) -> None:
+    path = store.directory.path
+
+    def complete(*words: str) -> list[str]:
+        *before, last = words
+        asked = ShellComplete(app, {}, "hybridlog", "_HYBRIDLOG_COMPLETE")
+        found = asked.get_completions([before[0], "--store", str(path), *before[1:]], last)
+        return [item.value for item in found]
+
+    assert complete("ls", "--tag", "ro") == ["robot"]
+    assert complete("ls", "--tag", "robot=7") == ["robot=7"]
+    assert complete("info", "--type", "sensor_msgs/L") == [SCAN]
+    assert complete("info", "--type", "La") == ["LaserScan"]
+    assert complete("du", "--with", "/i") == ["/imu: "]
+    assert complete("du", "--with", "/imu: n") == []
+    assert complete("fetch", "-r", "tues*", "--topic", "/") == ["/left/scan", "/odd"]
+
+
+def test_a_running_recording_reaches_until_now() -> None:
+    now = 100
+    made = [
+        summary(1, (5, 9), ["/a"], status="open", created=4),
+        summary(2, None, ["/a"], status="open", created=50),
+        summary(3, (5, 9), ["/a"]),
+        summary(4, None, ["/a"], created=50),
+    ]
+    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
+
+    def labels(begin: int, end: int) -> set[str]:
+        found = snapshot.during(np.arange(4), begin, end, now)
+        return {snapshot.summaries[place].label for place in found.tolist()}
+
+    assert labels(20, 30) == {"r1"}
+    assert labels(60, 70) == {"r1", "r2"}
+    assert labels(8, 9) == {"r1", "r3"}
+    assert labels(100, 200) == set()
+
+
+def test_globs_mean_what_fnmatch_says() -> None:
+    dice = random.Random(3)
+    names = ["".join(dice.choices("ab[]-*?", k=3)) for _ in range(40)]
+    made = [summary(n, (n, n), ["/a"], label=f"l{n}", name=name) for n, name in enumerate(names)]
+    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
+    for pattern in ("*", "a*", "[ab]*", "?-?", "[!a]*", "*]", "[", "a[", "l1?"):
+        found = [snapshot.summaries[place] for place in snapshot.matching(pattern)]
+        assert [(one.label, one.name) for one in found] == [
+            (f"l{n}", name)
+            for n, name in enumerate(names)
+            if fnmatchcase(name, pattern) or fnmatchcase(f"l{n}", pattern)
+        ]
+
+
+def test_lists_say_how_many_they_leave_out() -> None:
+    assert listed([]) == "none"
+    assert listed("abc") == "a, b, c"
+    assert listed("abcde", 4) == "a, b, c, d, e"  # no room is won by leaving out one
+    assert listed("abcdef", 4) == "a, b, c, d and 2 more"
+    assert Choice.of() == Choice()
+    assert Choice.of().is_everything
+    assert not Choice.of(tag="x").is_everything
