@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner
@@ -18,6 +19,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.choice import Choice
 from hybridlog.cli.app import app
+from hybridlog.query.planner import Planner
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
 from hybridlog.wording import listed
@@ -62,7 +64,7 @@ def write(path: Path, day: int, topics: dict[str, tuple[str, list[int]]]) -> Non
             channel = writer.register_channel(topic, "json", schema)
             for number, n in enumerate(values):
                 time = START + day * DAY + number * 10**9
-                writer.add_message(channel, time, json.dumps({"n": n}).encode(), time)
+                writer.add_message(channel, time, json.dumps({"n": n, "robot": "x"}).encode(), time)
         writer.finish()
 
 
@@ -158,12 +160,21 @@ def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
         assert away.without_database is None, "it was not even asked"
 
 
-def test_a_filter_that_only_the_index_narrows(store: hl.Store) -> None:
-    """MongoDB finds candidates for a pattern, and the messages decide."""
-    assert list(store.recordings(where="scan: n > 3 or header.frame_id ~ 'x+y'").labels) == [
-        "monday-2",
-        "tuesday",
-    ]
+@pytest.mark.parametrize(
+    ("predicate", "labels"),
+    [
+        ("n > 3", ["monday-2", "tuesday"]),
+        ("n = 0", ["run-1"]),
+        # MongoDB narrows down, and the messages decide.
+        ("n > 3 or s ~ 'x+y'", ["monday-2", "tuesday"]),
+    ],
+)
+def test_the_index_chooses_the_same(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, predicate: str, labels: list[str]
+) -> None:
+    store.connect()
+    monkeypatch.setattr(Planner, "_files", lambda *_: ())
+    assert list(store.recordings(where=f"scan: {predicate}").labels) == labels
 
 
 @pytest.mark.parametrize(
@@ -249,7 +260,7 @@ def test_tags_of_many_are_changed_at_once(store: hl.Store) -> None:
     assert call(store, "tag", "--has", "imu", "by=machine").code == 0
     store.refresh()
     assert list(store.recordings(tag="by=machine").labels) == ["monday-2", "run1"]
-    assert call(store, "untag", "--tag", "by", "by").code == 0
+    assert call(store, "untag", "-r", "*", "by").code == 0  # also of those that lack it
     store.refresh()
     assert store.recordings(tag="by") == []
     assert "has no tag 'by'" in call(store, "untag", "tuesday", "by").err
@@ -309,6 +320,80 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     assert store.query(["/scan"], found).count() == 3
     assert {size.recording for size in store.sizes(found).rows} == {"monday-1", "tuesday"}
     assert store.select(found) == found
+
+
+def test_tables_name_recordings_and_their_tags(store: hl.Store) -> None:
+    """A field that is called as a tag is there, too."""
+    query = store.topic("/scan", "/imu").tags("robot", "place")
+    frame = query.to_pandas()
+    assert list(frame.columns) == ["topic", "recording", "robot", "place", "n", "robot_"]
+    assert set(frame["robot_"]) == {"x"}
+    seen = frame.groupby("recording")[["robot", "place"]].first().to_dict("index")
+    assert seen["monday-1"] == {"robot": "7", "place": "lab"}
+    assert seen["monday-2"]["robot"] == "8"
+    assert frame["place"].isna().sum() == len(frame) - 3
+    assert set(frame.loc[frame["recording"] == "run-1", "robot"].isna()) == {True}
+    table = query.to_arrow()
+    assert table.column_names[1:] == list(frame.columns)
+    assert table.schema.field("robot").metadata == {b"hybridlog.tag": b"robot"}
+    assert table.schema.field("robot_").metadata == {b"hybridlog.field": b"robot"}
+    assert table.column("robot").null_count == frame["robot"].isna().sum() == 1
+    rows = [json.loads(line) for lines in query.to_json_lines() for line in lines]
+    assert [list(row) for row in rows[:1]] == [
+        ["log_time_ns", "topic", "recording", "robot", "place", "n", "robot_"]
+    ]
+    assert [row["robot"] for row in rows] == table.column("robot").to_pylist()
+    assert {row["robot_"] for row in rows} == {"x"}
+
+
+def test_one_recording_is_named_on_request(store: hl.Store) -> None:
+    one = store.topic("/scan").in_recording("tues*", "monday-1")
+    assert list(one.to_pandas().columns) == ["n", "robot"]
+    assert list(one.tags("robot").to_pandas().columns) == ["robot", "n", "robot_"]
+    assert one.fields("recording", "n").to_arrow().column("recording").unique().to_pylist() == [
+        "monday-1"
+    ]
+    # Fields keep the order in which they were asked for.
+    asked = one.tags("robot").fields("robot", "n").to_arrow()
+    assert asked.column_names == ["log_time", "robot", "robot_", "n"]
+    with pytest.raises(TopicError, match=r"a tag 'colour'[.] The tags are: place, robot"):
+        one.tags("colour")
+
+
+def test_a_tag_called_as_a_column_of_ours(tmp_path: Path) -> None:
+    tags = {"topic": "t", "log_time": "l", "log_time_ns": "n", "stamp": "s", "n": "tag"}
+    with hl.open(tmp_path / "store", create=True) as store:
+        write(tmp_path / "log.mcap", 0, {"/a": ("t", [1])})
+        store.record(tmp_path / "log.mcap", tags=tags)
+        query = store.topic("a").tags(*tags)
+        wanted = {
+            "topic_": "t", "log_time_": "l", "log_time_ns_": "n", "stamp_": "s", "n": "tag",
+            "n_": 1, "robot": "x",
+        }  # fmt: skip
+        assert query.to_arrow().drop(["log_time"]).to_pylist() == [wanted]
+        (line,) = next(query.to_json_lines())
+        assert json.loads(line) == {"log_time_ns": START, "topic": "/a"} | wanted
+
+
+def test_columns_of_recordings_in_files(store: hl.Store, tmp_path: Path) -> None:
+    fetch = ["fetch", "-t", "/scan", "--tags", "robot,place", "-q"]
+    done = call(store, *fetch, "-r", "mon*", "--fields", "n", "-F", "csv")
+    assert done.out.splitlines()[:2] == [
+        '"log_time","recording","robot","place","n"',
+        '2025-06-03 00:00:00.000000000Z,"monday-1","7","lab",1',
+    ]
+    assert call(store, *fetch, "-o", str(tmp_path / "x.parquet")).code == 0
+    assert parquet.read_table(tmp_path / "x.parquet").column_names == [
+        "log_time", "recording", "robot", "place", "n", "robot_",
+    ]  # fmt: skip
+    assert "mcap has none" in call(store, *fetch, "-o", str(tmp_path / "x.mcap")).err
+    # Each file of an export names the recordings, also that of a topic that only one has.
+    words = ["export", str(tmp_path / "all"), "-F", "csv", "--tags", "robot", "-q"]
+    assert call(store, *words).code == 0
+    for path in (tmp_path / "all").iterdir():
+        with path.open() as file:
+            assert file.readline() == '"log_time","recording","robot","n","robot_"\n', path.name
+    assert "mcap has none" in call(store, "export", "x.mcap", "--tags", "robot").err
 
 
 def test_import_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
     metavar="TOPIC: PREDICATE",
     help="Only messages of this topic that satisfy a predicate. Repeatable.",
 )
-@options.recordings
+@options.choice
 @click.option(
     "--fields",
     multiple=True,
@@ -75,7 +76,7 @@ def command(
     store: Path | None,
     between: tuple[str, str] | None,
     where: tuple[str, ...],
-    recording: tuple[str, ...],
+    choice: Choice,
     fields: tuple[str, ...],
     form: str | None,
     output: Path | None,
@@ -92,7 +93,7 @@ def command(
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        queries = _queries(opened, [base, *topic], recording)
+        queries = _queries(opened, [base, *topic], choice)
         for predicates, add in ((where, _where), (fields, _fields)):
             for text in predicates:
                 add(opened, queries, text)
@@ -107,9 +108,9 @@ def command(
                 print_gaps(query, between if clock == "log" else None)
 
 
-def _queries(store: Store, topics: Sequence[str], recordings: Sequence[str]) -> list[Query]:
+def _queries(store: Store, topics: Sequence[str], choice: Choice) -> list[Query]:
     """A query for each topic; the base is one topic."""
-    found = [query_of(store, [name], recordings) for name in topics]
+    found = [query_of(store, [name], choice) for name in topics]
     return [found[0], *(q.with_topic(topic) for q in found[1:] for topic in q.topics)]
 
 

@@ -12,7 +12,7 @@ from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import latched, print_gaps
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
-from hybridlog.cli.query_options import query_of
+from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import Front, write_answer
 from hybridlog_storage.collection_names import collection_of
@@ -45,6 +45,7 @@ _EXACT = {"mcap", "bag"}
 @options.between
 @options.no_latched
 @options.original_times
+@options.tag_columns
 @options.force
 @options.mongo
 @options.quiet
@@ -58,6 +59,7 @@ def command(
     between: tuple[str, str] | None,
     no_latched: bool,
     original_times: bool,
+    tags: str | None,
     force: bool,
     mongo: str | None,
     quiet: bool,
@@ -66,6 +68,8 @@ def command(
     form = form or _form(target)
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
+    if tags is not None and form in _EXACT:
+        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
     if form in _EXACT:
         check_room(target, form=form, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
@@ -74,6 +78,8 @@ def command(
             raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
         if between is not None:
             query = query.between(*between)
+        if tags is not None:
+            query = query.tags(*parse_fields(tags, "--tags"))
         if form in _EXACT:
             _write_file(query, form, target, front, force=force, quiet=quiet)
         else:

@@ -38,6 +38,7 @@ _SUFFIXES = {
     ".bag": "bag",
 }
 _TEXT = {"jsonl", "csv"}
+_EXACT = {"mcap", "bag", "raw"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,7 @@ class _Choices:
     every: int
     reverse: bool
     fields: str | None
+    tags: str | None
     event: tuple[str, str] | None
     before: str | None
     after: str | None
@@ -101,6 +103,7 @@ class _Choices:
 )
 @click.option("--reverse", is_flag=True, help="Latest first.")
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
+@options.tag_columns
 @click.option(
     "--event",
     nargs=2,
@@ -199,6 +202,8 @@ def _query(store: Store, choices: _Choices) -> Query:
         query = query.where(predicate)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
+    if choices.tags is not None:
+        query = query.tags(*parse_fields(choices.tags, "--tags"))
     if choices.every > 1:
         query = query.every(choices.every)
     if choices.reverse:
@@ -230,6 +235,8 @@ def _form(choices: _Choices) -> str:
     options.check_latched(
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
+    if choices.tags is not None and form in _EXACT:
+        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
     return form

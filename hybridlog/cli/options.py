@@ -204,6 +204,9 @@ near = click.option(
     metavar="DURATION",
     help="Greatest distance in time, such as 20ms; without, any.",
 )
+tag_columns = click.option(
+    "--tags", metavar="A,B", help="Tags of the recordings as columns, with commas between them."
+)
 at_least = click.option(
     "--at-least",
     metavar="DURATION",

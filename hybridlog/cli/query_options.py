@@ -89,13 +89,13 @@ def _name_open_recordings(
         ) from error
 
 
-def parse_fields(text: str) -> list[str]:
-    """The fields of --fields, each once.
+def parse_fields(text: str, option: str = "--fields") -> list[str]:
+    """The names of --fields or a similar option, each once.
 
     Raises:
         UsageError: A name is empty.
     """
     names = [name.strip() for name in text.split(",")]
     if not all(names):
-        raise UsageError(f"--fields takes names with commas between them, not {text!r}.")
+        raise UsageError(f"{option} takes names with commas between them, not {text!r}.")
     return list(dict.fromkeys(names))

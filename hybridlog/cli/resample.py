@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +15,9 @@ from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
+
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
 
 
 @click.command()
@@ -32,7 +36,7 @@ from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 @options.store
 @options.between
 @options.where
-@options.recordings
+@options.choice
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
 @table_options
 def command(
@@ -44,7 +48,7 @@ def command(
     store: Path | None,
     between: tuple[str, str] | None,
     where: tuple[str, ...],
-    recording: tuple[str, ...],
+    choice: Choice,
     fields: str | None,
     form: str | None,
     output: Path | None,
@@ -57,7 +61,7 @@ def command(
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        query = query_of(opened, topic, recording)
+        query = query_of(opened, topic, choice)
         if between is not None:
             query = query.between(*between)
         for predicate in where:

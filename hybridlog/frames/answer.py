@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.frames.builder import Block, TableBuilder
-from hybridlog.frames.names import is_summary, own_columns, summary_of
+from hybridlog.frames.names import is_summary, own_columns, summary_of, tag_columns
 from hybridlog.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
+    from hybridlog_storage.catalog import RecordingEntry
 
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
@@ -55,7 +56,7 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
 
 def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
-    builder = TableBuilder(question.fields)
+    builder = _builder(question)
     decoder = Decoder(planner)
     for block in decoder.empty():
         builder.append(block)
@@ -85,19 +86,23 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
     else:
         groups = (decoder.blocks(run) for run in planner.runs())
     groups = chain([decoder.empty()], groups)
-    builder, size = TableBuilder(question.fields), 0
+    builder, size = _builder(question), 0
     given = False
     for group in groups:
         # Blocks of one group overlap in time, so no table ends between them.
         if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
             yield _finished(builder, question)
             given = True
-            builder, size = TableBuilder(question.fields), 0
+            builder, size = _builder(question), 0
         for block in group:
             builder.append(block)
             size += block.size
     if len(builder) or not given:
         yield _finished(builder, question)
+
+
+def _builder(question: Question) -> TableBuilder:
+    return TableBuilder(question.fields, tag_columns(question.tags))
 
 
 def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
@@ -106,7 +111,8 @@ def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
     if not question.returns_all or not parts:
         return False
     fields = _fields_of(planner)
-    if not set(_own(planner)) <= {"topic", "recording"} or (fields is not None and not fields):
+    from_messages = set(_own(planner)) - {"topic", "recording"}
+    if from_messages or (fields is not None and not fields):
         return False
     return all(planner.reads_tables(part, fields) for part in parts)
 
@@ -131,6 +137,7 @@ def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
         planner.counters.messages += rows
         names = {"topic": part.topic, "recording": part.recording.label}
         own = {name: _text(names[name], rows) for name in _own(planner)}
+        own |= _tags_of(part.recording, tag_columns(planner.question.tags), rows)
         yield Block(part.topic, found.log_time, found.seq + rank, own, found.records.cast(kind), 0)
 
 
@@ -178,6 +185,7 @@ class Decoder:
         self._counters = planner.counters
         self._chosen = planner.question.fields
         self._own = _own(planner)
+        self._tags = tag_columns(planner.question.tags)
         self._takes_reduced = _are_single(planner)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
         self._fields: list[frozenset[str] | None] = []
@@ -236,7 +244,8 @@ class Decoder:
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
         channel = self.channels[number]
-        return {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
+        own = {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
+        return own | _tags_of(channel.recording, self._tags, len(batch))
 
 
 def _are_single(planner: Planner) -> bool:
@@ -256,7 +265,7 @@ def _own(planner: Planner) -> list[str]:
     unasked = []
     if len(question.topics) > 1:
         unasked.append("topic")
-    if len(planner.session.chosen(question)) > 1:
+    if question.names_recording or len(planner.session.chosen(question)) > 1:
         unasked.append("recording")
     return [name for name in dict.fromkeys([*unasked, *asked]) if name != "log_time"]
 
@@ -281,6 +290,17 @@ def _own_column(
         known = channel.channel.has_publish_time
         return numbers(batch.publish_time, "time") if known else pa.nulls(rows, TIME)
     return pa.nulls(rows, TIME) if stamps is None else stamps
+
+
+def _tags_of(
+    recording: RecordingEntry, tags: Mapping[str, str], rows: int
+) -> dict[str, pa.Array[Any]]:
+    """Columns with tags of a recording, by name; null where it lacks the tag."""
+    values = {name: recording.tags.get(key) for name, key in tags.items()}
+    return {
+        name: pa.nulls(rows, pa.string()) if value is None else _text(value, rows)
+        for name, value in values.items()
+    }
 
 
 def _text(text: str, rows: int) -> pa.Array[Any]:

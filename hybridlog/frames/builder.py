@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.frames.columns import chunked, flat, in_order, with_summaries
-from hybridlog.frames.names import FIELD, arranged, free_name
+from hybridlog.frames.names import FIELD, TAG, arranged, free_name
 from hybridlog.schema.arrow_columns import TIME, numbers
 from hybridlog.schema.arrow_types import common_type, converted
 
@@ -63,10 +63,14 @@ class TableBuilder:
 
     Args:
         fields: Requested paths; None for all fields.
+        tags: Keys of tags, by the names of their columns.
     """
 
-    def __init__(self, fields: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, fields: Sequence[str] | None = None, tags: Mapping[str, str] | None = None
+    ) -> None:
         self._fields = fields
+        self._tags = tags or {}
         self._blocks: list[Block] = []
         self._rows = 0
 
@@ -91,11 +95,13 @@ class TableBuilder:
         names: list[pa.Field] = []
         columns = []
         for name, field, values in self._columns():
-            metadata = None if field is None else {FIELD: field}
+            metadata: dict[bytes, str] | None = None if field is None else {FIELD: field}
+            if name in self._tags:
+                metadata = {TAG: self._tags[name]}
             names.append(pa.field(name, values.type, metadata=metadata))
             columns.append(values)
         table = pa.Table.from_arrays(columns, schema=pa.schema(names))
-        return table.select(arranged(table.column_names, self._fields))
+        return table.select(arranged(table.column_names, self._fields, self._tags))
 
     def to_pandas(self) -> pd.DataFrame:
         """The frame, sorted by log time and order; see `frame.py` for its types."""
@@ -105,7 +111,7 @@ class TableBuilder:
         log_time = next(columns).values
         frame = frame_of(log_time, ((name, values) for name, _, values in columns))
         names = list(frame.columns)
-        wanted = arranged(names, self._fields)
+        wanted = arranged(names, self._fields, self._tags)
         return frame if wanted == names else frame[wanted]
 
     def _columns(self) -> Iterator[Named]:

@@ -117,10 +117,10 @@ def _of_objects(
     for first, message in zip(firsts, decoded.objects, strict=True):
         row = dict(first)
         leaves = _flat(_chosen(message, wanted))
+        if fields is not None:
+            _summarise(leaves, fields)
         for path in _by_fields(leaves, fields):
             row[free_name(path, row)] = leaves[path]
-        if fields is not None:
-            _summarise(row, fields)
         yield json_line(row)
 
 
@@ -151,17 +151,21 @@ def _chosen(value: Any, wanted: Sequence[Sequence[str]] | None) -> Any:
     return value
 
 
-def _summarise(row: dict[str, Any], fields: Sequence[str]) -> None:
-    """Add requested summaries to a row, and remove their arrays from it."""
+def _summarise(leaves: dict[str, Any], fields: Sequence[str]) -> None:
+    """Add requested summaries to the values of a message, and remove their arrays."""
     arrays: dict[str, Any] = {}
     for path in fields:
         summary = summary_of(path)
-        if summary is None or path in row or not isinstance(row.get(summary[0]), list | bytes):
+        if (
+            summary is None
+            or path in leaves
+            or not isinstance(leaves.get(summary[0]), list | bytes)
+        ):
             continue
-        arrays[summary[0]] = row[summary[0]]
-        made = summary_array(values_array([row[summary[0]]]), summary[1])
+        arrays[summary[0]] = leaves[summary[0]]
+        made = summary_array(values_array([leaves[summary[0]]]), summary[1])
         if made is not None:
-            row[path] = made[0].as_py()
+            leaves[path] = made[0].as_py()
     for path in arrays:
         if path not in fields:
-            del row[path]
+            del leaves[path]

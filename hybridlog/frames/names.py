@@ -3,7 +3,8 @@
 Every table has `log_time`. Tables of several topics also have `topic`, and tables of
 several recordings `recording`. A field of one of these names always gets a trailing
 underscore. The other built-in columns are present on request; a field of that name gets an
-underscore then.
+underscore then. So does a field with the name of a requested tag, and a tag with the name of
+a built-in column.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ OPTIONAL: Final = ("publish_time", "stamp", "seq", "sequence")
 the recording, and the sender's sequence number."""
 FIELD: Final = b"hybridlog.field"
 """Arrow metadata of a column that was renamed: the path of its field."""
+TAG: Final = b"hybridlog.tag"
+"""Arrow metadata of a column with a tag of the recordings: the key of the tag."""
 
 _SUMMARIES = ("n", "min", "max", "mean")
 
@@ -36,6 +39,18 @@ def own_columns(asked: Sequence[str] | None, defined: Collection[str]) -> list[s
     return [n for n in names if n in RESERVED or (n in OPTIONAL and n not in defined)]
 
 
+def tag_columns(keys: Sequence[str]) -> dict[str, str]:
+    """Names of the columns of tags, and the keys of the tags."""
+    taken = {*RESERVED, *OPTIONAL, "log_time_ns"}
+    found: dict[str, str] = {}
+    for key in keys:
+        name = key
+        while name in taken or name in found:
+            name += "_"
+        found[name] = key
+    return found
+
+
 def is_own(name: str) -> bool:
     """True if a name that is no field is a built-in column."""
     return name in RESERVED or name in OPTIONAL
@@ -48,18 +63,28 @@ def free_name(path: str, taken: Collection[str]) -> str:
     return path
 
 
-def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
+def arranged(
+    names: Sequence[str], fields: Sequence[str] | None, tags: Collection[str] = ()
+) -> list[str]:
     """Column names in the order in which their fields were requested.
 
-    Columns that were not requested come first: log time, topic, recording.
+    Columns that were not requested come first: log time, topic, recording, tags.
+
+    Args:
+        names: Names of columns.
+        fields: Requested paths; None for all fields.
+        tags: Names of columns of tags.
     """
     if fields is None:
         return list(names)
     asked = [path.replace("[]", "") for path in fields]
 
     def place(name: str) -> int:
-        # A field with the name of a built-in column has an extra underscore.
-        same = {name, name.rstrip("_")} if is_own(name.rstrip("_")) else {name}
+        if name in tags:
+            return -1
+        # A field with the name of a built-in column or a tag has an extra underscore.
+        plain = name.rstrip("_")
+        same = {name, plain} if is_own(plain) or plain in tags else {name}
         exact = (number for number, path in enumerate(asked) if path in same)
         near = (number for number, path in enumerate(asked) if _is_part(name, path))
         return next(exact, next(near, -1))

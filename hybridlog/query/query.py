@@ -25,6 +25,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import parse_time
+from hybridlog.wording import listed
 from hybridlog_storage.errors import IndexChangedError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -187,6 +188,26 @@ class Query:
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
+    def tags(self, *keys: str) -> Query:
+        """Tags of the recordings as columns of tables, behind `topic` and `recording`.
+
+        A field with the name of such a column gets a trailing underscore. A recording without
+        the tag has null.
+
+        Raises:
+            TopicError: no recording of the query has such a tag.
+        """
+        snapshot = self._session.snapshot()
+        places = self._session.chosen(self.question).tolist()
+        known = {key for place in places for key in snapshot.summaries[place].tags}
+        for key in keys:
+            if key not in known:
+                raise TopicError(
+                    f"No recording of this query has a tag {key!r}. The tags are: "
+                    f"{listed(sorted(known))}."
+                )
+        return self._with(tags=tuple(dict.fromkeys(keys)))
+
     def in_recording(
         self,
         *names: str,
@@ -211,8 +232,13 @@ class Query:
         return self._on(self.topics, [summaries[n].id for n in chosen.places.tolist()])
 
     def with_topic(self, topic: str) -> Query:
-        """The same question about one of its topics."""
-        return self._on([topic], self.question.recordings)
+        """The same question about one of its topics.
+
+        If the question is about several recordings, tables of each topic name them.
+        """
+        several = self.question.names_recording or len(self._session.chosen(self.question)) > 1
+        topics, chosen = self._session.having([topic], self.question.recordings)
+        return self._with(topics=topics, recordings=chosen, names_recording=several)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
