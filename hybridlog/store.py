@@ -18,7 +18,6 @@ from hybridlog.maintenance.report import Progress, RepairReport, being_written
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
-from hybridlog.recordings import Recordings
 from hybridlog.session import Session
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.recorder import RecordOptions, RecordReport
+    from hybridlog.recordings import Recordings
     from hybridlog.sources.base import Source
     from hybridlog_storage.database import Database
     from hybridlog_storage.summary import RecordingSummary
@@ -274,6 +274,7 @@ class Store:
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
         from hybridlog.choosing import choose
+        from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice)
         summaries = self.session.snapshot().summaries
