@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.message import Message
+    from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import RecordedChannel
@@ -459,6 +460,72 @@ class Query:
         from hybridlog.query.answers.interval_queries import IntervalQueries
 
         return IntervalQueries(self._session, self.question, self.counters)
+
+    def gaps(
+        self, longer_than: DurationLike | None = None, periods: float | None = None
+    ) -> Intervals:
+        """Times without messages of a topic, in its recordings.
+
+        A gap lasts from one message to the next, from the beginning of the recording (or of
+        the range) to the first message, or from the last message to the end. The usual period
+        is the median time from one message to the next in the recording.
+
+        Args:
+            longer_than: Only gaps longer than this, a duration.
+            periods: Only gaps longer than so many usual periods; without both, 5.
+
+        Returns:
+            Intervals; their `messages` are 0.
+
+        Raises:
+            UsageError: several topics, `limit`, `every`, `reverse`, another clock than the
+                log's, or no number of periods.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.query.answers.rates import Rates
+
+        with self.counters.timed():
+            return Rates(self._session, self.question, self.counters).gaps(longer_than, periods)
+
+    def rate(self, window: DurationLike | None = None) -> pa.Table:
+        """How many messages of each topic there are, and how many in a second.
+
+        Args:
+            window: Length of the windows, a duration; the first begins with the recording or
+                the range, the last may be shorter. None for all messages in one.
+
+        Returns:
+            `begin`, `end`, `recording` (label), `topic`, `messages` and `rate`, messages a
+            second. Without windows: from the first message to the last, and the mean rate
+            from one to the next, null if there is none.
+
+        Raises:
+            UsageError: `limit`, `every`, `reverse`, another clock than the log's, or too many
+                windows.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.query.answers.rates import Rates
+
+        with self.counters.timed():
+            return Rates(self._session, self.question, self.counters).rate(window)
+
+    def stats(self, *fields: str) -> list[FieldStatistics]:
+        """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
+
+        Args:
+            fields: Paths; also summaries (`ranges.min`), and arrays, for all their elements.
+                None for every field that is a number.
+
+        Raises:
+            TopicError: no such field exists.
+            UsageError: `limit`, `every`, `reverse`, or no field is a number.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.field_statistics import statistics
+
+        query = self.fields(*fields) if fields else self
+        with self.counters.timed():
+            return statistics(self._session, query.question, self.counters)
 
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Test which spans of log time of a recording contain any message.

@@ -108,7 +108,7 @@ def _write(path: Path, seed: int) -> list[Said]:
         any_json = writer.register_schema("Any", "jsonschema", b"{}")
         channels = {
             topic: writer.register_channel(topic, "ros1", schema)
-            for topic in ("/base", "/left/pose", "/right/pose")
+            for topic in dict.fromkeys(one.topic for one in said)
         }
         weather = writer.register_channel("/weather", "json", any_json)
         for one in said:

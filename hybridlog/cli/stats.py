@@ -1,0 +1,101 @@
+"""`hybridlog stats`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.answer_notes import print_cost, print_gaps
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import parse_fields, query_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hybridlog.choice import Choice
+    from hybridlog.query.answers.field_statistics import FieldStatistics
+
+_NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
+
+
+@click.command()
+@click.option(
+    "--topic",
+    "-t",
+    required=True,
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+)
+@click.option(
+    "--fields",
+    metavar="A,B.C",
+    help="Only these fields, also summaries and arrays; without, all that are numbers.",
+)
+@options.store
+@options.between
+@options.where
+@options.choice
+@options.mongo
+@options.as_json
+@options.quiet
+def command(
+    *,
+    topic: tuple[str, ...],
+    fields: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    choice: Choice,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Show count, least, greatest, mean and deviation of the numeric fields of topics."""
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet or as_json) as opened:
+        query = query_of(opened, topic, choice)
+        if between is not None:
+            query = query.between(*between)
+        for predicate in where:
+            query = query.where(predicate)
+        found = query.stats(*([] if fields is None else parse_fields(fields)))
+        if as_json:
+            from hybridlog.schema.plain import without_nan
+
+            output.print_json(without_nan([asdict(row) for row in found]))
+        elif found:
+            _print(found)
+        else:
+            output.note("No field is a number.")
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(query.counters, time.monotonic() - started, count=True)
+            print_gaps(query, between)
+
+
+def _print(found: Sequence[FieldStatistics]) -> None:
+    several = len({row.topic for row in found}) > 1
+    columns: list[output.Column] = [("field", "left"), *((name, "right") for name in _NAMES)]
+    if several:
+        columns.insert(0, ("topic", "left"))
+    rows = [
+        ([row.topic] if several else [])
+        + [row.field, *(_number(getattr(row, name)) for name in _NAMES)]
+        for row in found
+    ]
+    output.print_table(columns, rows)
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return str(value) if isinstance(value, int) else f"{value:.6g}"

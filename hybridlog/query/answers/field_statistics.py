@@ -1,0 +1,155 @@
+"""Statistics of the numeric fields of messages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from hybridlog.query.question import Question
+    from hybridlog.session import Session
+
+_NUMBERS = {
+    "float32",
+    "float64",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FieldStatistics:
+    """Statistics of one numeric field of a topic, over all messages of a question.
+
+    Attributes:
+        topic: Full name of the topic.
+        field: Path of the field.
+        count: Number of finite numbers; the next four are of these.
+        nan: Number of values that are NaN.
+        infinite: Number of values that are infinite.
+        min: Least number, exactly; None without any.
+        max: Greatest number, exactly; None without any.
+        mean: Mean; None without any.
+        std: Standard deviation of the sample (n - 1); None of fewer than two.
+    """
+
+    topic: str
+    field: str
+    count: int
+    nan: int
+    infinite: int
+    min: int | float | None
+    max: int | float | None
+    mean: float | None
+    std: float | None
+
+
+class _Running:
+    """Statistics of the values so far, joined block by block."""
+
+    def __init__(self) -> None:
+        self.count = self.nan = self.infinite = 0
+        self.least: int | float | None = None
+        self.most: int | float | None = None
+        self._mean = self._squares = 0.0
+
+    def add(self, column: pa.ChunkedArray[Any]) -> None:
+        values = column.drop_null().to_numpy()
+        if values.dtype.kind == "f":
+            is_finite = np.isfinite(values)
+            nan = int(np.isnan(values).sum())
+            self.nan += nan
+            self.infinite += len(values) - int(is_finite.sum()) - nan
+            values = values[is_finite]
+        if not len(values):
+            return
+        low, high = values.min().item(), values.max().item()
+        self.least = low if self.least is None else min(self.least, low)
+        self.most = high if self.most is None else max(self.most, high)
+        numbers = values.astype(np.float64)
+        count = len(numbers)
+        with np.errstate(invalid="ignore", over="ignore"):
+            mean = float(numbers.mean())
+            squares = float(np.square(numbers - mean).sum())
+            total = self.count + count
+            step = mean - self._mean if self.count else 0.0
+            self._mean = self._mean if self.count else mean
+            self._mean += step * count / total
+            self._squares += squares + step * step * self.count * count / total
+        self.count = total
+
+    def result(self, topic: str, field: str) -> FieldStatistics:
+        few = self.count < 2
+        return FieldStatistics(
+            topic,
+            field,
+            self.count,
+            self.nan,
+            self.infinite,
+            self.least,
+            self.most,
+            self._mean if self.count else None,
+            None if few else math.sqrt(self._squares / (self.count - 1)),
+        )
+
+
+def statistics(session: Session, question: Question, counters: Counters) -> list[FieldStatistics]:
+    """Statistics of numeric fields; see `Query.stats`."""
+    if not question.returns_all or question.reverse:
+        raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
+    recordings = [row.summary.id for row in RangeResolver(session, question).resolve()]
+    found = []
+    for topic in question.topics:
+        one = replace(question, topics=(topic,))
+        known = session.field_types((topic,), question.recordings)
+        if question.fields is None and known is not None:
+            numeric = tuple(path for path, kind in known.items() if kind in _NUMBERS)
+            if not numeric:
+                continue
+            one = replace(one, fields=numeric)
+        snapshot = session.snapshot()
+        having = {snapshot.summaries[place].id for place in session.chosen(one).tolist()}
+        running: dict[str, _Running] = {}
+        for recording in recordings:
+            if recording in having:
+                part = replace(one, recordings=(recording,))
+                for name, column in _columns(session, part, counters):
+                    running.setdefault(name, _Running()).add(column)
+        found += [values.result(topic, name) for name, values in running.items()]
+    if question.fields is not None and not found:
+        raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")
+    return found
+
+
+def _columns(
+    session: Session, question: Question, counters: Counters
+) -> Iterator[tuple[str, pa.ChunkedArray[Any]]]:
+    """The numeric columns of an answer, a block at a time; elements of arrays that are named."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    from hybridlog.frames.answer import stream
+    from hybridlog.schema.arrow_types import is_list
+
+    def is_number(kind: pa.DataType) -> bool:
+        return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+    counted = Counters()
+    for table in stream(Planner(session, question, counted)):
+        for field in table.schema:
+            column = table[field.name]
+            if question.fields is not None and is_list(field.type):
+                column = pc.list_flatten(column)
+            if is_number(column.type):
+                yield field.name, column
+    counters.add(counted)

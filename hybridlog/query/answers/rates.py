@@ -1,0 +1,201 @@
+"""How often messages came, and when none came for long."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from hybridlog.query.intervals import MOST_PIECES, Intervals
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
+
+_Columns = dict[str, list["NDArray[Any]"]]
+
+
+class _Stretch(NamedTuple):
+    """The messages of one topic in one span of one recording.
+
+    Attributes:
+        summary: The recording.
+        topic: Full name.
+        span: Log time `[begin, end)`, ns.
+        part: The part of the question, without a range where that is the whole recording.
+    """
+
+    summary: RecordingSummary
+    topic: str
+    span: Span
+    part: Part
+
+
+class Rates:
+    """Answers about the times of messages.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Count what the answer costs.
+
+    Raises:
+        UsageError: the question has limit, every or reverse.
+    """
+
+    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+        if not question.returns_all or question.reverse:
+            raise UsageError(
+                "A rate is of all messages; it cannot be combined with limit, every or reverse."
+            )
+        self._session = session
+        self._question = question
+        self._planner = Planner(session, question, counters)
+
+    def rate(self, window: DurationLike | None) -> pa.Table:
+        """Messages and their rate; see `Query.rate`."""
+        size = None if window is None else parse_duration(window)
+        if size == 0:
+            raise UsageError("A window of 0 holds nothing: name a duration, such as 1s.")
+        labels: list[tuple[str, str, int]] = []
+        columns: _Columns = defaultdict(list)
+        rows = 0
+        for stretch in self._stretches():
+            begin, end, messages, rate = (
+                self._overall(stretch) if size is None else self._by_window(stretch, size)
+            )
+            rows += len(begin)
+            if rows > MOST_PIECES:
+                raise UsageError(f"There are {rows} windows; use a longer one or a time range.")
+            labels.append((stretch.summary.label, stretch.topic, len(begin)))
+            for name, values in (
+                ("begin", begin),
+                ("end", end),
+                ("messages", messages),
+                ("rate", rate),
+            ):
+                columns[name].append(values)
+        return _table(labels, columns)
+
+    def gaps(self, longer_than: DurationLike | None, periods: float | None) -> Intervals:
+        """Times without messages; see `Query.gaps`."""
+        if len(self._question.topics) != 1:
+            raise UsageError(
+                f"A gap is one topic's; this question has {len(self._question.topics)}: name one "
+                f"of {', '.join(self._question.topics[:10])}."
+            )
+        least = 0 if longer_than is None else parse_duration(longer_than)
+        if periods is None and longer_than is None:
+            periods = 5.0
+        if periods is not None and not 0 < periods < float("inf"):
+            raise UsageError(f"A number of periods is more than 0, not {periods}.")
+        found: list[tuple[str, NDArray[np.int64]]] = []
+        periods_of = self._periods() if periods is not None else {}
+        for stretch in self._stretches():
+            limit = float(least)
+            if periods is not None:
+                median = periods_of.get(stretch.summary.id)
+                if median is None:
+                    continue  # of one message nobody knows when the next one was due
+                limit = max(limit, periods * median)
+            times = self._times(stretch)
+            edges = np.concatenate([[stretch.span[0]], times, [stretch.span[1]]])
+            rows = np.stack([edges[:-1], edges[1:], np.zeros(len(edges) - 1, np.int64)], axis=1)
+            found.append((stretch.summary.id, rows[(edges[1:] - edges[:-1]) > limit]))
+        return Intervals.of(found)
+
+    def _periods(self) -> dict[str, float]:
+        """Median time from one message to the next in each recording, ns, where there are two."""
+        steps: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+        for stretch in self._stretches():
+            steps[stretch.summary.id].append(np.diff(self._times(stretch)))
+        joined = {name: np.concatenate(parts) for name, parts in steps.items()}
+        return {name: float(np.median(found)) for name, found in joined.items() if len(found)}
+
+    def _stretches(self) -> Iterator[_Stretch]:
+        """Topics and spans of the question, by recording."""
+        for summary, span in RangeResolver(self._session, self._question).spans():
+            is_whole = self._question.is_unbounded
+            for part in self._planner.parts_in(summary, None, None):
+                inner = part if is_whole else replace(part, bounds=span, clock="log")
+                yield _Stretch(summary, part.topic, span, inner)
+
+    def _overall(self, stretch: _Stretch) -> tuple[NDArray[Any], ...]:
+        """First and last time, messages and mean rate."""
+        part = stretch.part
+        if part.predicate is None and part.is_unbounded and stretch.summary.status != "open":
+            stats = [s for s in part.stats if s.first is not None and s.last is not None]
+            count = part.messages
+            first = min((s.first for s in stats if s.first is not None), default=0)
+            last = max((s.last for s in stats if s.last is not None), default=0)
+        else:
+            times = self._times(stretch)
+            count = len(times)
+            first, last = (int(times[0]), int(times[-1])) if count else (0, 0)
+        if not count:
+            first, last = stretch.span[0], stretch.span[1] - 1
+        rate = (count - 1) * 1e9 / (last - first) if count > 1 and last > first else np.nan
+        return (
+            np.array([first], np.int64),
+            np.array([last + 1], np.int64),
+            np.array([count], np.int64),
+            np.array([rate if count else 0.0]),
+        )
+
+    def _by_window(self, stretch: _Stretch, size: int) -> tuple[NDArray[Any], ...]:
+        low, high = stretch.span
+        if (high - low) // size > MOST_PIECES:
+            raise UsageError(
+                f"There are {(high - low) // size} windows; use a longer one or a time range."
+            )
+        begin = np.arange(low, high, size, dtype=np.int64)
+        end = np.append(begin[1:], high)
+        times = self._times(stretch)
+        places = np.searchsorted(times, np.append(begin, high))
+        messages = np.diff(places)
+        return begin, end, messages, messages * 1e9 / (end - begin)
+
+    def _times(self, stretch: _Stretch) -> NDArray[np.int64]:
+        """Log times of the matching messages, ns, ascending."""
+        found = [np.empty(0, np.int64)]
+        found += [one.log_time[one.holds] for one in self._planner.outcomes(stretch.part)]
+        times: NDArray[np.int64] = np.concatenate(found)
+        return times
+
+
+def _table(labels: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:
+    import pyarrow as pa
+
+    from hybridlog.schema.arrow_columns import numbers
+
+    def joined(name: str, kind: Any) -> NDArray[Any]:
+        return np.concatenate([np.empty(0, kind), *columns[name]])
+
+    def texts(place: int) -> pa.Array[Any]:
+        codes = np.repeat(np.arange(len(labels)), [row[2] for row in labels])
+        names = [str(row[place]).encode("utf-8", "replace").decode() for row in labels]
+        return pa.array(names, pa.string()).take(numbers(codes.astype(np.int64)))
+
+    rate = joined("rate", np.float64)
+    return pa.table(
+        {
+            "begin": numbers(joined("begin", np.int64), "time"),
+            "end": numbers(joined("end", np.int64), "time"),
+            "recording": texts(0),
+            "topic": texts(1),
+            "messages": numbers(joined("messages", np.int64)),
+            "rate": pa.array(rate, mask=np.isnan(rate)),
+        }
+    )

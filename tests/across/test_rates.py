@@ -1,0 +1,236 @@
+"""Rates, gaps and statistics against loops over what was written."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from tests.cli.running import run
+
+from .conftest import BASE, MS, Logs
+
+
+def ends(logs: Logs, label: str) -> tuple[int, int]:
+    times = [m.time for m in logs.said[label]]
+    return min(times), max(times) + 1
+
+
+def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
+    query = logs.store.topic("/base", "**/pose")
+    found = query.rate().to_pylist()
+    assert query.counters.bytes_read == query.counters.documents_read == 0
+    want = []
+    for label in logs.said:
+        for topic in ("/base", "/left/pose", "/right/pose"):
+            times = [m.time for m in logs.of(label, topic)]
+            if times:
+                mean = (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
+                want.append((label, topic, len(times), times[0], times[-1] + 1, mean))
+    rows = [
+        (r["recording"], r["topic"], r["messages"], r["begin"].value, r["end"].value, r["rate"])
+        for r in found
+    ]
+    assert [row[:5] for row in sorted(rows)] == [row[:5] for row in sorted(want)]
+    assert [row[5] for row in sorted(rows)] == pytest.approx([row[5] for row in sorted(want)])
+
+
+@pytest.mark.parametrize(
+    ("window", "between", "where"),
+    [("100ms", None, None), ("70ms", ("+95ms", "+800ms"), None), ("250ms", None, "on == true")],
+)
+def test_rates_by_window(
+    logs: Logs, window: str, between: tuple[str, str] | None, where: str | None
+) -> None:
+    query = logs.store.topic("left/pose")
+    query = query if between is None else query.between(*between)
+    query = query if where is None else query.where(where)
+    size = int(window.removesuffix("ms")) * MS
+    want = []
+    for label in logs.said:
+        low, high = ends(logs, label)
+        if between is not None:
+            low, high = low + 95 * MS, low + 800 * MS
+        for begin in range(low, high, size):
+            end = min(begin + size, high)
+            inside = [
+                m
+                for m in logs.of(label, "/left/pose")
+                if begin <= m.time < end and (where is None or m.fields["on"])
+            ]
+            want.append((label, begin, end, len(inside), len(inside) / ((end - begin) / 1e9)))
+    rows = [
+        (r["recording"], r["begin"].value, r["end"].value, r["messages"], r["rate"])
+        for r in query.rate(window).to_pylist()
+    ]
+    assert [row[:4] for row in rows] == [row[:4] for row in want]
+    assert [row[4] for row in rows] == pytest.approx([row[4] for row in want])
+    assert sum(row[3] for row in rows) == query.count()
+    # Message indexes or columns of the table, and no payload.
+    assert query.counters.chunks_read == 0
+
+
+@pytest.mark.parametrize(
+    ("longer", "periods"), [("12ms", None), (None, 2.5), (None, None), ("9ms", 2.0), ("0s", None)]
+)
+@pytest.mark.parametrize("between", [None, ("+100ms", "+700ms")])
+def test_gaps(
+    logs: Logs, longer: str | None, periods: float | None, between: tuple[str, str] | None
+) -> None:
+    query = logs.store.topic("right/pose")
+    query = query if between is None else query.between(*between)
+    found = query.gaps(longer, periods)
+    want = []
+    for label in ("b",):  # the other one does not have the topic
+        low, high = ends(logs, label)
+        if between is not None:
+            low, high = low + 100 * MS, low + 700 * MS
+        times = [m.time for m in logs.of(label, "/right/pose") if low <= m.time < high]
+        limit = 0.0 if longer is None else float(longer.rstrip("ms")) * MS
+        if periods is not None or longer is None:
+            if len(times) < 2:
+                continue
+            usual = statistics.median(b - a for a, b in pairwise(times))
+            limit = max(limit, (periods or 5.0) * usual)
+        want += [(a, b) for a, b in pairwise([low, *times, high]) if b - a > limit]
+    assert [(gap.begin_ns, gap.end_ns) for gap in found] == sorted(want)
+    assert query.counters.chunks_read == 0
+
+
+def test_a_topic_that_fell_silent(tmp_path: Path) -> None:
+    """A recording without any message of a topic is one gap, and so is its silent end."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Any", "jsonschema", b"{}")
+        loud, shy = (writer.register_channel(n, "json", schema) for n in ("/loud", "/shy"))
+        for n in range(100):
+            writer.add_message(loud, BASE + n * 10 * MS, b'{"n": 1}', 0)
+            if n in {30, 32, 34, 36}:
+                writer.add_message(shy, BASE + n * 10 * MS, b'{"v": 1e300, "w": [1, 2]}', 0)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(path)
+        gaps = [
+            ((g.begin_ns - BASE) // MS, (g.end_ns - BASE) // MS) for g in store.topic("shy").gaps()
+        ]
+        assert gaps == [(0, 300), (360, 990)]
+        none = store.topic("shy").where("v == 0")
+        assert len(none.gaps("100ms")) == 1
+        assert len(none.gaps()) == 0
+        shy = store.topic("shy").rate().to_pylist()
+        assert shy[0]["rate"] == pytest.approx(50)
+        (v,) = store.topic("shy").stats("v")
+        assert (v.count, v.min, v.std) == (4, 1e300, 0.0)
+        (w,) = store.topic("shy").stats("w")
+        assert (w.count, w.min, w.max, w.mean) == (8, 1, 2, 1.5)
+
+
+def test_statistics_are_those_of_pandas(logs: Logs) -> None:
+    for label, query in (
+        (None, logs.store.topic("left/pose", "base")),
+        ("b", logs.store.topic("base").in_recording("b")),
+    ):
+        found = {(row.topic, row.field): row for row in query.stats()}
+        assert query.counters.bytes_read > 0
+        for topic in query.topics:
+            said = [m for name in logs.said if label in {None, name} for m in logs.of(name, topic)]
+            for field in ("x", "y", "ticks", "distance"):
+                values = pd.Series([float(m.fields[field]) for m in said])  # type: ignore[arg-type]
+                row = found[topic, field]
+                assert row.count == values.count()
+                assert row.nan == values.isna().sum()
+                assert (row.min, row.max) == (values.min(), values.max())
+                assert row.mean == pytest.approx(values.mean())
+                assert row.std == pytest.approx(values.std())
+        assert ("/base", "list") not in found
+        assert ("/base", "on") not in found
+    with_arrays = {row.field: row for row in logs.store.topic("base").stats("list", "list.n", "x")}
+    lists: list[Any] = [m.fields["list"] for name in logs.said for m in logs.of(name, "/base")]
+    assert with_arrays["list.n"].max == 40
+    assert with_arrays["list"].count == sum(map(len, lists))
+    assert with_arrays["list"].mean == pytest.approx(
+        statistics.fmean(v for one in lists for v in one)
+    )
+
+
+def test_numbers_of_statistics_are_exact(tmp_path: Path) -> None:
+    values = ["9007199254740993", "9007199254740995", "-9007199254740993"]
+    floats = ["1e400", "2.5", "1e400"]
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Any", "jsonschema", b"{}")
+        channel = writer.register_channel("/n", "json", schema)
+        for n, (value, other) in enumerate(zip(values, floats, strict=True)):
+            text = f'{{"v": {value}, "f": {other}}}'
+            writer.add_message(channel, BASE + n, text.encode(), 0)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(path)
+        rows = {row.field: row for row in store.topic("n").stats()}
+        assert (rows["v"].min, rows["v"].max) == (-9007199254740993, 9007199254740995)
+        assert (rows["f"].count, rows["f"].infinite, rows["f"].nan) == (1, 2, 0)
+        assert (rows["f"].mean, rows["f"].std) == (2.5, None)
+        assert not math.isinf(rows["f"].max or 0)
+
+
+def test_what_is_refused(logs: Logs) -> None:
+    store = logs.store
+    base = store.topic("base")
+    for query in (base.limit(3), base.every(2), base.reverse()):
+        for ask in (query.rate, query.gaps, query.stats):
+            with pytest.raises(UsageError, match="limit, every"):
+                ask()
+    with pytest.raises(UsageError, match="one topic's"):
+        store.topic("**/pose").gaps()
+    with pytest.raises(UsageError, match="more than 0"):
+        base.gaps(periods=0)
+    with pytest.raises(UsageError, match="window of 0"):
+        base.rate("0s")
+    with pytest.raises(UsageError, match="longer one"):
+        base.rate("10ns")
+    with pytest.raises(UsageError, match="log time"):
+        base.between("+1ms", None).clock("header").rate()
+    with pytest.raises(TopicError, match="no field"):
+        base.stats("nothing")
+    with pytest.raises(UsageError, match="no field with numbers"):
+        base.stats("state")
+    with pytest.raises(TimeError, match="Nothing was recorded"):
+        base.between("2001-01-01", "2001-01-02").stats()
+
+
+def test_the_commands(logs: Logs) -> None:
+    store = logs.store.directory.path
+    rates = run("rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
+    assert rates.lines[0] == '"begin","end","recording","topic","messages","rate"'
+    assert "0 index documents" in rates.err
+    assert run("gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store).out == (
+        f"{len(logs.store.topic('right/pose').in_recording('b').gaps())}\n"
+    )
+    rows = run("stats", "-t", "base", "--fields", "x,list.n", "--json", store=store).json
+    (x, n) = logs.store.topic("base").stats("x", "list.n")
+    assert [(r["field"], r["count"], r["min"], r["std"]) for r in rows] == [
+        (s.field, s.count, s.min, s.std) for s in (x, n)
+    ]
+    shown = run("stats", "-t", "base", store=store)
+    assert shown.lines[0].split() == [
+        "field",
+        "count",
+        "nan",
+        "infinite",
+        "min",
+        "max",
+        "mean",
+        "std",
+    ]
