@@ -215,6 +215,7 @@ def describe(
         entry.stored_bytes += summary.size
         entry.chunks += len(summary.table.chunks)
     entry.segments = len(inventory.summaries)
+    entry.stored_bytes += sum(file["bytes"] for file in entry.payloads)
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_crash(inventory)
@@ -314,6 +315,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
     if state is not None:
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
+        entry.payloads = [asdict(file) for file in state.payloads.values()]
     return entry
 
 
@@ -446,6 +448,9 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
             journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
         ]
         lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
+        if state.payloads:
+            listed_files = [asdict(file) for file in state.payloads.values()]
+            lines.append(journal.event(journal.COMPACTED, files=listed_files))
     if inventory.end is not None:
         lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial, wraps
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.across.sync import Synced
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
+    from hybridlog.maintenance.compact import CompactedTopic
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
@@ -650,6 +652,59 @@ class Store:
             labels=labels,
             progress=progress,
         )
+
+    def compact(
+        self,
+        recordings: Names | None = None,
+        topics: Sequence[str] | None = None,
+        *,
+        older_than_ns: int = 0,
+        dry_run: bool = False,
+        progress: Progress | None = None,
+    ) -> list[CompactedTopic]:
+        """Write payloads of ended recordings into columns (Parquet), exact to the byte.
+
+        Args:
+            recordings: The recordings; None for all that have ended.
+            topics: Topics, as for `topic`; None for those that consist of arrays mostly: laser
+                scans, point clouds, images and other arrays of numbers.
+            older_than_ns: Only recordings whose last message is at least as old, ns.
+            dry_run: True to say what would be done, and write nothing.
+            progress: Called after each chunk.
+
+        Returns:
+            Each topic that was chosen, by recording.
+
+        Raises:
+            TopicError: A recording or a topic does not exist.
+            StoreError: A named recording is being written.
+        """
+        from hybridlog.maintenance import index
+        from hybridlog.maintenance.compact import compact
+
+        self.refresh()
+        wanted = None if topics is None else set(self.topic(*topics).topics)
+        before = time.time_ns() - older_than_ns
+        found: list[CompactedTopic] = []
+        for entry in self.select(recordings):
+            if recordings is None and entry.status in {"open", "unfinished"}:
+                continue
+            if older_than_ns and (entry.span is None or entry.span[1] > before):
+                continue
+            found += compact(
+                self.directory,
+                self.catalog,
+                entry,
+                topics=wanted,
+                dry_run=dry_run,
+                progress=progress,
+            )
+            connected = self.session.connected
+            if not dry_run and connected is not None and self.session.connection.may_write:
+                with suppress(ConnectionLostError):  # the next connection mirrors it
+                    index.mirror(self.catalog, connected, entry.id)
+        self.refresh()
+        return found
 
     def remove(self, recording: str) -> None:
         """Delete a recording.

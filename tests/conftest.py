@@ -70,6 +70,7 @@ SLOW = frozenset(
         "benchmarks/test_live.py",
         "benchmarks/test_queries.py",
         "benchmarks/test_throughput.py",
+        "payloads/test_compact.py",
         "cli/test_coverage.py",
         "cli/test_export.py",
         "cli/test_fetch.py",

@@ -58,6 +58,7 @@ ALLOWED = {
         "hybridlog.cli",
         "hybridlog.export",
         "hybridlog.frames",
+        "hybridlog.payloads",
         "hybridlog.schema.arrow_columns",
         "hybridlog.schema.arrow_objects",
         "hybridlog.schema.arrow_protobuf",

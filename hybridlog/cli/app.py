@@ -40,6 +40,7 @@ COMMANDS: Final = (
     "reindex",
     "verify",
     "repair",
+    "compact",
     "rm",
     "trust",
     "demo",

@@ -36,7 +36,9 @@ def print_sizes(
     columns: list[output.Column] = [("recording", "left")] if recordings else []
     if topics:
         columns.append(("topic", "left"))
-    headings = ("messages", "payload", "segments", "tables", "MongoDB", "total")
+    has_columns = bool(total.column_bytes)
+    columns_too = ("columns",) if has_columns else ()
+    headings = ("messages", "payload", "segments", *columns_too, "tables", "MongoDB", "total")
     names: list[output.Column] = [(heading, "right") for heading in headings]
     if output.is_narrow():
         del names[:2]
@@ -47,11 +49,12 @@ def print_sizes(
         if topics:
             name = row.topic or NO_TOPIC
             named.append(name if not is_total else "" if recordings else "total")
-        cells.append([*named, *_numbers(row)[-len(names) :]])
+        cells.append([*named, *_numbers(row, has_columns=has_columns)[-len(names) :]])
     output.print_table([*columns, *names], cells)
 
 
-def _numbers(row: Size) -> list[str]:
+def _numbers(row: Size, *, has_columns: bool) -> list[str]:
     index = "-" if row.index_bytes is None else output.size(row.index_bytes)
-    sizes = [row.payload_bytes, row.segment_bytes, row.table_bytes]
+    columns = [row.column_bytes] if has_columns else []
+    sizes = [row.payload_bytes, row.segment_bytes, *columns, row.table_bytes]
     return [str(row.messages), *map(output.size, sizes), index, output.size(row.total_bytes)]

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
+from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.layout import IN_PAYLOADS, PAYLOADS
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.directory import IMPORTING
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.journal import JournalState
 
 _PIECE = 8 << 20  # bytes copied at once
 
@@ -121,6 +124,8 @@ def _import_one(
             )
         clear_away(target, hidden)
         _copy_segments(source, path, inventory, report, progress)
+        if inventory.state is not None:
+            _copy_payloads(source.recording(inventory.label), path, inventory.state, report)
         data = files.read_file(source.recording(entry.label) / JOURNAL, journal.MAX_JOURNAL)
         whole = data[: data.rfind(b"\n") + 1]
         durability.write_new(path / JOURNAL, whole, depth=files.IN_RECORDING)
@@ -155,6 +160,42 @@ def _copy_segments(
             progress(inventory.label, done, total)
 
 
+def _copy_payloads(source: Path, path: Path, state: JournalState, report: ImportReport) -> None:
+    """Copy the columns of payloads that the journal lists, and nothing else.
+
+    Raises:
+        StoreError: A file is damaged.
+    """
+    listed = state.payloads
+    if not listed:
+        return
+    from hybridlog.payloads.reader import PayloadReader
+
+    try:
+        for name in payload_files.names_of(path):
+            if name not in listed:  # an import was interrupted
+                files.unlink(path / PAYLOADS / name, depth=IN_PAYLOADS)
+        for file in listed.values():
+            target = path / PAYLOADS / file.file
+            files.make_folders(target.parent, depth=IN_PAYLOADS - 1)
+            if not _is_file(target):
+                _copy(source / PAYLOADS / file.file, target, depth=IN_PAYLOADS)
+                report.bytes_copied += file.bytes
+            PayloadReader(path / PAYLOADS, file).check()
+            files.sync_folder(target.parent, depth=IN_PAYLOADS - 1)
+        files.sync_folder(path / PAYLOADS)
+    except OSError as error:
+        raise durability.explain(error, path / PAYLOADS, "importing into") from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        files.status(path, depth=IN_PAYLOADS)
+    except FileNotFoundError:
+        return False
+    return True
+
+
 def _is_there(path: Path, digest: str, size: int) -> bool:
     """True if a copy is complete, byte for byte."""
     try:
@@ -169,19 +210,24 @@ def _is_there(path: Path, digest: str, size: int) -> bool:
         return False
 
 
-def _copy(source: Path, target: Path) -> None:
+def _copy(source: Path, target: Path, *, depth: int = files.IN_RECORDING) -> None:
     """Copy a file, which gets its name when it is complete and on the disk.
+
+    Args:
+        source: The file.
+        target: Its copy.
+        depth: Parts of both paths that lie inside their stores.
 
     Raises:
         StoreError: The source cannot be read.
         DiskFullError: There is no room.
     """
     try:
-        fd = files.open_file(source, os.O_RDONLY | os.O_NONBLOCK)
+        fd = files.open_file(source, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
     except OSError as error:
         raise durability.explain(error, source, "reading") from error
     try:
-        with durability.new_file(target, depth=files.IN_RECORDING) as out:
+        with durability.new_file(target, depth=depth) as out:
             while piece := os.read(fd, _PIECE):
                 durability.write_all(out, [piece])
     finally:

@@ -19,6 +19,8 @@ from hybridlog.entries import (
     sealed_event,
     take_inventory,
 )
+from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.layout import PARTS
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.catalog import Catalog
@@ -293,6 +295,8 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         return ""
     if state is not None and state.torn:
         Journal(path).append()
+    if PARTS in listing.others:
+        payload_files.publish(path, state.payloads if state is not None else {})
     recovered = _recover_segments(directory, label, listing, state)
     inventory = take_inventory(directory, label)
     is_empty = not inventory.summaries and not (state is not None and state.sealed)
@@ -323,7 +327,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    return bool(_LEFT_OVER.fullmatch(name) or _MOVING.fullmatch(name))
+    return name == PARTS or bool(_LEFT_OVER.fullmatch(name) or _MOVING.fullmatch(name))
 
 
 def clear_away(directory: StoreDirectory, label: str) -> None:

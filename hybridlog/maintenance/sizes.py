@@ -54,6 +54,7 @@ class Size:
         messages: Number of messages.
         payload_bytes: Their payloads, uncompressed.
         segment_bytes: Their share of the segments.
+        column_bytes: Their columns of payloads.
         table_bytes: Their share of the tables.
         index_bytes: Their share of MongoDB, estimated; None if it is unavailable.
     """
@@ -63,13 +64,14 @@ class Size:
     messages: int = 0
     payload_bytes: int = 0
     segment_bytes: int = 0
+    column_bytes: int = 0
     table_bytes: int = 0
     index_bytes: int | None = 0
 
     @property
     def total_bytes(self) -> int:
-        """Sum of segments, tables and MongoDB."""
-        return self.segment_bytes + self.table_bytes + (self.index_bytes or 0)
+        """Sum of segments, columns, tables and MongoDB."""
+        return self.segment_bytes + self.column_bytes + self.table_bytes + (self.index_bytes or 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +127,9 @@ def sizes_of(
     for entry in entries:
         segments = _segment_bytes(directory, catalog, entry)
         tables = _table_bytes(directory.path, entry)
+        columns: Counter[str] = Counter()
+        for file in entry.payloads:
+            columns[file["topic"]] += file["bytes"]
         messages = entry.messages_by_topic()
         payload: Counter[str] = Counter()
         for channel in entry.channels:
@@ -136,6 +141,7 @@ def sizes_of(
                 messages[topic],
                 payload[topic],
                 segments[topic],
+                columns[topic],
                 tables[topic],
                 None if database is None else index.get((entry.id, topic), 0),
             )
@@ -152,6 +158,7 @@ def _sum(recording: str, topic: str, rows: Sequence[Size]) -> Size:
         sum(row.messages for row in rows),
         sum(row.payload_bytes for row in rows),
         sum(row.segment_bytes for row in rows),
+        sum(row.column_bytes for row in rows),
         sum(row.table_bytes for row in rows),
         sum(index) if index or not rows else None,
     )

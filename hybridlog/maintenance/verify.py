@@ -11,6 +11,8 @@ from hybridlog.entries import take_inventory
 from hybridlog.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
+from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.layout import PAYLOADS
 from hybridlog_storage.directory import LOCK
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.index_documents import recording_key, with_prefix
@@ -32,7 +34,8 @@ if TYPE_CHECKING:
 
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
-_KNOWN = frozenset({LOCK, "journal.old"})
+_RESTORE_COLUMNS = "restore the file from a copy"
+_KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +208,7 @@ class _Check:
         self._indexer = ChunkIndexer(inventory.id)
         self._journal(inventory)
         self._files(inventory, is_held=is_held)
+        self._payloads(inventory)
         total = sum(summary.size for summary in inventory.summaries.values())
         before = 0
         for number, name in inventory.listing.sealed.items():
@@ -256,6 +260,30 @@ class _Check:
         for name in inventory.listing.others:
             if name not in _KNOWN and not name.endswith(".damaged"):
                 self.found(name, "it is not a file of a recording", "move it out of the store")
+
+    def _payloads(self, inventory: Inventory) -> None:
+        """Check every byte of the columns of payloads."""
+        listed = inventory.state.payloads if inventory.state is not None else {}
+        if not listed and PAYLOADS not in inventory.listing.others:
+            return
+        from hybridlog.payloads.reader import RecordingPayloads
+
+        payloads = RecordingPayloads(self._path, list(listed.values()))
+        for file in listed.values():
+            try:
+                payloads.reader(file).check()
+                self._result.bytes_read += file.bytes
+            except StoreError as error:
+                self.found(f"{PAYLOADS}/{file.file}", str(error), _RESTORE_COLUMNS)
+        try:
+            names = payload_files.names_of(self._path)
+        except OSError as error:
+            self.found(PAYLOADS, error.strerror or str(error), _RESTORE_COLUMNS)
+            return
+        for name in names:
+            if name not in listed:
+                cure = "move it out of the store"
+                self.found(f"{PAYLOADS}/{name}", "the journal does not list it", cure)
 
     def _segment(
         self,

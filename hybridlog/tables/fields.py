@@ -10,7 +10,7 @@ has no column for it. A column renamed from its field has the field's name in it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ import pyarrow as pa
 from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import Scalars
 from hybridlog.schema.summary import summarise
-from hybridlog.tables.layout import ORIGINAL, column_names
+from hybridlog.tables.layout import ORIGINAL, RESERVED, column_names
 
 LIMIT: Final = 32
 """Maximum number of elements of an array stored in full."""
@@ -38,9 +38,15 @@ class FieldShape:
     """Turns fields of one topic's messages into columns, consistently.
 
     Once an array was too long, all later ones become summaries.
+
+    Args:
+        limit: Most elements of an array that is kept in full; None for no limit.
+        reserved: Names that no field may have.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit: int | None = LIMIT, reserved: Collection[str] = RESERVED) -> None:
+        self._limit = limit
+        self._reserved = reserved
         self._summarised: set[tuple[str, ...]] = set()
         self._plain: dict[tuple[str, ...], Any] = {}
 
@@ -53,7 +59,10 @@ class FieldShape:
         Returns:
             A struct array; its fields are the columns.
         """
-        return self._struct(records, (), column_names)
+        return self._struct(records, (), self._outer_names)
+
+    def _outer_names(self, names: list[str]) -> Iterator[tuple[str, str]]:
+        return column_names(names, self._reserved)
 
     def _column(self, array: Array, path: tuple[str, ...]) -> Array:
         kind = array.type
@@ -92,8 +101,10 @@ class FieldShape:
         return _struct_of(columns, fields, len(array), _missing(array))
 
     def _is_long(self, array: Array, path: tuple[str, ...]) -> bool:
+        if self._limit is None:
+            return False
         if path not in self._summarised:
-            if not len(array) or int(_lengths(array).max()) <= LIMIT:
+            if not len(array) or int(_lengths(array).max()) <= self._limit:
                 return False
             self._summarised.add(path)
         return True

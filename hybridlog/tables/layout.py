@@ -66,7 +66,8 @@ ORIGINAL: Final = b"hybridlog.name"
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
 VERSION: Final = 1
-_RESERVED: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN, "recording"})
+RESERVED: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN, "recording"})
+"""Names that no column of a field has."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -126,7 +127,7 @@ def small_file(type_name: str, schema: str) -> str:
 
 
 def column_names(
-    names: Iterable[str], reserved: Collection[str] = _RESERVED
+    names: Iterable[str], reserved: Collection[str] = RESERVED
 ) -> Iterator[tuple[str, str]]:
     """Fields of a message, and the name of the column for each.
 
@@ -168,6 +169,7 @@ class About:
         body: Bytes before the footer.
         checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
+        payloads: What a file of payloads needs besides; empty in a table.
     """
 
     recording: str
@@ -181,6 +183,7 @@ class About:
     body: int = 0
     checksums: str = field(default="", repr=False)
     version: int = VERSION
+    payloads: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def rows(self) -> int:

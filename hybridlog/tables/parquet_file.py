@@ -8,10 +8,11 @@ Files are read with `pread`: truncation of a mapped file would kill the process.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
@@ -29,6 +30,8 @@ from hybridlog_storage.errors import StoreError
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
+DICTIONARY: Final = "dictionary"
+"""Encoding of a column with a dictionary."""
 BLOCK: Final = 32 << 10
 """Bytes of the body with one checksum."""
 _WRITTEN: Final = 1 << 20  # bytes buffered before a write
@@ -49,31 +52,44 @@ class ParquetFileWriter:
         path: The file, in the folder of a recording's unfinished tables.
         sample: Example rows; their schema is the file's.
         depth: Parts of the path that lie inside the store.
+        encodings: Encoding of columns, by their dotted paths: `dictionary` or a name of
+            Parquet's. Those of the other columns follow from the example rows.
+        level: Level of zstd.
 
     Raises:
         OSError: the file cannot be created.
     """
 
-    def __init__(self, path: Path, sample: pa.Table, *, depth: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        sample: pa.Table,
+        *,
+        depth: int,
+        encodings: Mapping[str, str] | None = None,
+        level: int = 1,
+    ) -> None:
         self.path = path
         self._depth = depth
         self._sink = _Sink(path, depth)
-        leaves = list(_leaves(sample.schema))
-        running = [leaf for leaf, kind in leaves if _runs(leaf, kind)]
+        leaves = list(leaf_paths(sample.schema))
+        chosen = dict(encodings or {})
+        for leaf, kind in leaves:
+            if _runs(leaf, kind):
+                chosen.setdefault(leaf, "DELTA_BINARY_PACKED")
+        for leaf, array in _leaf_values(sample):
+            if leaf not in chosen and _repeats(array):
+                chosen[leaf] = DICTIONARY
         try:
             self._writer = pq.ParquetWriter(
                 pa.PythonFile(self._sink, mode="w"),
                 sample.schema,
                 compression="zstd",
-                compression_level=1,
-                use_dictionary=[
-                    leaf
-                    for leaf, array in _leaf_values(sample)
-                    if leaf not in running and _repeats(array)
-                ],
-                column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
+                compression_level=level,
+                use_dictionary=[leaf for leaf, how in chosen.items() if how == DICTIONARY],
+                column_encoding={leaf: how for leaf, how in chosen.items() if how != DICTIONARY},
                 # DuckDB answers wrongly from statistics of floats with NaN among them.
-                write_statistics=[leaf for leaf, kind in leaves if not pa.types.is_floating(kind)],
+                write_statistics=[leaf for leaf, kind in leaves if _has_statistics(kind)],
             )
         except BaseException:
             self.discard()
@@ -196,20 +212,21 @@ class ParquetFileReader:
 
     Args:
         path: The file.
+        depth: Parts of the path that lie inside the store.
 
     Raises:
         FileNotFoundError: the file does not exist.
         StoreError: the file cannot be read, or is damaged.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, depth: int = IN_TOPIC) -> None:
         self.path = path
         self.number = next(_NUMBERS)
         """Unique number of this reader."""
         self._lock = threading.Lock()
         self._fd = -1
         try:
-            self._fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=IN_TOPIC)
+            self._fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
             self._source = _Source(self._fd)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
@@ -232,6 +249,16 @@ class ParquetFileReader:
     def __del__(self) -> None:
         if self._fd >= 0:
             os.close(self._fd)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the file."""
+        return self._source.size
+
+    @property
+    def digest(self) -> str:
+        """Digest of the footer, which has checksums of all other bytes."""
+        return f"sha256:{hashlib.sha256(self._source.footer).hexdigest()}"
 
     @property
     def groups(self) -> int:
@@ -271,7 +298,7 @@ class ParquetFileReader:
         Raises:
             StoreError: a part is damaged.
         """
-        leaves = range(len(list(_leaves(self.schema))))
+        leaves = range(len(list(leaf_paths(self.schema))))
         try:
             self._source.check()
         except (OSError, StoreError) as error:
@@ -291,13 +318,13 @@ class _Source:
         self.closed = False
         self._fd = fd
         self._position = 0
-        self._size = os.fstat(fd).st_size
+        self.size = os.fstat(fd).st_size
         self._checksums: list[bytes] = []
-        tail = self._raw(self._size - _TAIL, _TAIL) if self._size > 2 * _TAIL else b""
+        tail = self._raw(self.size - _TAIL, _TAIL) if self.size > 2 * _TAIL else b""
         length = int.from_bytes(tail[:4], "little") + _TAIL
-        if tail[4:] != b"PAR1" or length > min(self._size - 4, _MAX_FOOTER):
+        if tail[4:] != b"PAR1" or length > min(self.size - 4, _MAX_FOOTER):
             raise StoreError("its end is missing")
-        self._body = self._size - length
+        self._body = self.size - length
         self.footer = self._raw(self._body, length)
         found = list(_SEAL.finditer(self.footer))
         if len(found) != 1:
@@ -322,7 +349,7 @@ class _Source:
     def read(self, size: int = -1) -> bytes:
         """Read from the current position."""
         begin = self._position
-        end = self._size if size < 0 else min(begin + size, self._size)
+        end = self.size if size < 0 else min(begin + size, self.size)
         self._position = max(begin, end)
         if begin >= self._body:
             return self.footer[begin - self._body : end - self._body]
@@ -349,7 +376,7 @@ class _Source:
         return data
 
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
         self._position = base + position
         return self._position
 
@@ -366,6 +393,10 @@ class _Source:
         """Do nothing: the file remains open as long as its reader."""
 
 
+def _has_statistics(kind: pa.DataType) -> bool:
+    return not (pa.types.is_floating(kind) or pa.types.is_binary(kind))
+
+
 def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]]:
     """Columns in Parquet's order, each as the names on its path, without lists."""
     for top in schema:
@@ -373,7 +404,7 @@ def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]
             yield names, kind
 
 
-def _leaves(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
+def leaf_paths(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
     """The columns of `leaves_of` by their dotted paths in the file."""
     for top in schema:
         for _, path, kind in _walk(top):

@@ -196,7 +196,7 @@ class RecordingEntry:
             the recording), or `unproven` (the journal was lost).
         end: The state at its end: losses, damage.
         channels: Its channels.
-        stored_bytes: Size of its segments.
+        stored_bytes: Size of its segments and of its columns of payloads.
         segments: Number of segments.
         chunks: Number of chunks.
         notes: Notes of users: `at` (ns) and `text`.
@@ -205,6 +205,7 @@ class RecordingEntry:
         digests: Digest of each valid segment, by its number as text.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
+        payloads: Files with columns of payloads: `file`, `bytes`, `digest`, `topic`, `messages`.
     """
 
     id: str
@@ -224,6 +225,7 @@ class RecordingEntry:
     spans: list[tuple[int, int, int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
+    payloads: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def key(self) -> str:

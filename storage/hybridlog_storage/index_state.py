@@ -41,7 +41,16 @@ _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be aw
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
 _OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
-_SHOWN: Final = ("label", "name", "tags", "status", "notes", "marks")
+_SHOWN: Final = (
+    "label",
+    "name",
+    "tags",
+    "status",
+    "notes",
+    "marks",
+    "payloads",
+    "stored_bytes",
+)
 """Values of an entry that may change while its segments stay."""
 
 

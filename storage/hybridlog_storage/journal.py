@@ -41,7 +41,8 @@ MARKED: Final = "marked"
 ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
-RESERVED: Final = ("compacted", "expired", "signature")
+COMPACTED: Final = "compacted"
+RESERVED: Final = ("expired", "signature")
 """Events of later versions; this version preserves and ignores them."""
 
 Event = Mapping[str, Any]
@@ -100,6 +101,25 @@ class SealedSegment:
         return sum(int(c["messages"]) for c in self.channels)
 
 
+@dataclass(frozen=True, slots=True)
+class PayloadFile:
+    """A file with payloads of a topic as columns.
+
+    Attributes:
+        file: Its path below the recording's `payloads`.
+        bytes: Its size.
+        digest: Digest of its footer: `sha256:` and hexadecimal digits.
+        topic: The topic.
+        messages: Number of messages in it.
+    """
+
+    file: str
+    bytes: int
+    digest: str
+    topic: str
+    messages: int
+
+
 @dataclass(slots=True)
 class JournalState:
     """The state of a recording after all events of its journal.
@@ -114,6 +134,7 @@ class JournalState:
         marks: Marks set after the end: `time`, `text`, `tags`, `segment`.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
+        payloads: Files of payloads, by path.
         end: The end of the recording; None while it is running.
         moving: Old and new label of a rename that is not finished, else None.
         removing: Whether a removal began.
@@ -133,6 +154,7 @@ class JournalState:
     marks: list[dict[str, Any]] = field(default_factory=list)
     sealed: dict[int, SealedSegment] = field(default_factory=dict)
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
+    payloads: dict[str, PayloadFile] = field(default_factory=dict)
     end: dict[str, Any] | None = None
     moving: tuple[str, str] | None = None
     removing: bool = False
@@ -161,9 +183,7 @@ class JournalState:
         elif name == ENDED:
             self.end = dict(line["end"])
         elif name == RENAMED:
-            labels = line.get("from"), line.get("to")
-            moving = (_text(labels[0]), _text(labels[1])) if any(labels) else None
-            self.name, self.moving = _text(line["name"]), moving
+            self._rename(line)
         elif name == TAGGED:
             self.tags[_text(line["key"])] = _text(line["value"])
         elif name == UNTAGGED:
@@ -171,21 +191,14 @@ class JournalState:
         elif name == NOTED:
             self.notes.append({"at": int(line["at"]), "text": _text(line["text"])})
         elif name == MARKED:
-            mark = {
-                "time": int(line["time"]),
-                "text": _text(line["text"]),
-                "tags": _tags(line["tags"]),
-                "segment": int(line["segment"]),
-            }
-            # A mark whose segment a crash kept from being listed does not exist.
-            self.marks = [m for m in self.marks if m["segment"] in self.sealed]
-            self.marks.append(mark)
+            self._mark(line)
         elif name == ADOPTED:
             self.store = _text(line["store"])
-        elif name == REMOVING:
-            self.removing = True
-        elif name == REBUILT:
-            self.rebuilt = _text(line["reason"])
+        elif name == COMPACTED:
+            self._compact(line)
+        elif name in {REMOVING, REBUILT}:
+            self.removing |= name == REMOVING
+            self.rebuilt = _text(line["reason"]) if name == REBUILT else self.rebuilt
 
     def _begin(self, line: Event) -> None:
         if self.begun:
@@ -196,6 +209,22 @@ class JournalState:
         said = _text(line["store"]), _text(line["name"]), _tags(line["tags"])
         self.store, self.name, self.tags = said
         self.id, self.begun = recording, dict(line)
+
+    def _rename(self, line: Event) -> None:
+        labels = line.get("from"), line.get("to")
+        moving = (_text(labels[0]), _text(labels[1])) if any(labels) else None
+        self.name, self.moving = _text(line["name"]), moving
+
+    def _mark(self, line: Event) -> None:
+        mark = {
+            "time": int(line["time"]),
+            "text": _text(line["text"]),
+            "tags": _tags(line["tags"]),
+            "segment": int(line["segment"]),
+        }
+        # A mark whose segment a crash kept from being listed does not exist.
+        self.marks = [m for m in self.marks if m["segment"] in self.sealed]
+        self.marks.append(mark)
 
     def _seal(self, line: Event) -> None:
         channels = tuple(
@@ -218,6 +247,19 @@ class JournalState:
         if before is not None and before.digest != sealed.digest:
             self.replaced.append((before, sealed))
         self.sealed[number] = sealed
+
+    def _compact(self, line: Event) -> None:
+        found = [
+            PayloadFile(
+                _inner_path(value["file"]),
+                int(value["bytes"]),
+                _text(value["digest"]),
+                _text(value["topic"]),
+                int(value["messages"]),
+            )
+            for value in line["files"]
+        ]
+        self.payloads.update({file.file: file for file in found})
 
 
 def read_lines(data: bytes) -> Iterator[tuple[int, dict[str, Any] | None]]:
@@ -343,6 +385,15 @@ def _whole(fd: int, size: int) -> int:
             return start + found + 1
         at = start
     return 0
+
+
+def _inner_path(value: object) -> str:
+    """A path of a folder and a file in it."""
+    path = _text(value)
+    names = path.split("/")
+    if len(names) != 2 or any(name in {"", ".", ".."} or "\0" in name for name in names):
+        raise ValueError("a path that leads elsewhere")
+    return path
 
 
 def _text(value: object) -> str:

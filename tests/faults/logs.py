@@ -36,14 +36,17 @@ Content = Mapping[str, tuple[Said, ...]]
 """What a log holds, by topic."""
 
 
-def content(first: int, count: int) -> Content:
+def content(first: int, count: int, *, scans: bool = False) -> Content:
     """Messages of three topics: numbers, JSON, and such with a header stamp.
 
     Args:
         first: Number of the first message of each topic.
         count: Of how many there are of each.
+        scans: True for a fourth topic, of long arrays.
     """
     found: dict[str, list[Said]] = {"/number": [], "/text": [], "/stamped": []}
+    if scans:
+        found["/scan"] = []
     for n in range(first, first + count):
         time = BEGIN_NS + n * STEP_NS
         stamp = struct.pack("<II", (time - 1000) // 10**9, (time - 1000) % 10**9)
@@ -52,6 +55,9 @@ def content(first: int, count: int) -> Content:
             "/text": json.dumps({"n": n, "s": "x" * (n % 5)}).encode(),
             "/stamped": struct.pack("<I", n) + stamp + struct.pack("<I2si", 2, b"ab", n),
         }
+        if scans:
+            ranges = [(n + i) / 8 for i in range(300 + n % 3)]
+            payloads["/scan"] = struct.pack(f"<iI{len(ranges)}f", n, len(ranges), *ranges)
         for place, (topic, payload) in enumerate(payloads.items()):
             found[topic].append(Said(time + place, payload, n))
     return {topic: tuple(said) for topic, said in found.items()}
@@ -65,11 +71,14 @@ def write(path: Path, said: Content) -> Path:
         number = writer.register_schema("a/Number", "ros1msg", b"int32 n\nfloat64 x\n")
         stamped = writer.register_schema("a/Stamped", "ros1msg", HEADER.encode())
         text = writer.register_schema("a/Text", "jsonschema", b'{"type":"object"}')
+        scan = writer.register_schema("a/Scan", "ros1msg", b"int32 n\nfloat32[] ranges\n")
         channels = {
             "/number": writer.register_channel("/number", "ros1", number),
             "/text": writer.register_channel("/text", "json", text),
             "/stamped": writer.register_channel("/stamped", "ros1", stamped),
         }
+        if "/scan" in said:
+            channels["/scan"] = writer.register_channel("/scan", "ros1", scan)
         everything = [(one, channels[topic]) for topic, part in said.items() for one in part]
         for one, channel in sorted(everything, key=lambda item: item[0].time):
             writer.add_message(channel, one.time, one.payload, one.time)

@@ -27,6 +27,7 @@ CHANGES: Final = {
     "mark": 60,
     "import": 85,
     "repair": 220,
+    "compact": 50,
 }
 INDEX: Final = {
     "reindex": 290,

@@ -21,7 +21,8 @@ from tests.faults.stores import Prepared, State
 FIRST = logs.content(0, 40)
 SECOND = logs.content(15, 12)
 THIRD = logs.content(100, 24)
-_LOGS = {"a": FIRST, "b": SECOND, "c": THIRD}
+SCANS = logs.content(0, 24, scans=True)
+_LOGS = {"a": FIRST, "b": SECOND, "c": THIRD, "d": SCANS}
 
 
 def scenario(bench: Bench, name: str) -> Scenario:
@@ -132,6 +133,13 @@ def _record(bench: Bench) -> Scenario:
     )
 
 
+def _compact(bench: Bench) -> Scenario:
+    path, uri = bench.path / "scans", bench.server.new()
+    logs.record(path, uri, _log(bench, "d"), "d")
+    prepared = Prepared.of(bench.server, path, uri)
+    return bench.scenario("compact", ["compact", "/scan"], prepared, truth={"d": SCANS})
+
+
 def _crashed(bench: Bench, name: str, step: str, number: int) -> Prepared:
     """A store with a recording that died before a step: the n-th of its kind, from 0."""
     recorded = scenario(bench, "record")
@@ -209,6 +217,7 @@ SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
     "tag": _simple("tag", "a", "x", "y", a=FIRST, b=SECOND),
     "mark": _simple("mark", "a", "+0.1s", "here", b=SECOND),
     "import": _import,
+    "compact": _compact,
     "repair": _repair,
     "reindex": _simple("reindex", a=FIRST, b=SECOND),
     "reindex one": _simple("reindex", "a", a=FIRST, b=SECOND),

@@ -426,6 +426,7 @@ COMMANDS: Mapping[str, Command] = {
     "import": _on_store(lambda store, args: store.import_from(args[0])),
     "repair": _on_store(_repair),
     "record": _on_store(_record),
+    "compact": _on_store(lambda store, args: store.compact(topics=args)),
 }
 
 

@@ -270,7 +270,7 @@ def _look_at(store: hl.Store, entry: RecordingEntry) -> Seen:
 
 def number_of(topic: str, payload: bytes) -> int | None:
     """What stands in the field `n` of a message."""
-    if topic == "/number":
+    if topic in {"/number", "/scan"}:
         return int.from_bytes(payload[:4], "little", signed=True)
     if topic == "/stamped":
         return int.from_bytes(payload[-4:], "little", signed=True)

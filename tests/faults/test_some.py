@@ -1,4 +1,4 @@
-"""Fifteen of all points, which are quick: at least one of each command and of each fault."""
+"""Some of all points, which are quick: at least one of each command and of each fault."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("mark", "ENOSPC", "sync journal", 0, False),
     ("import", "torn", "write .00000", 0, False),
     ("repair", "die", "rename 000000.mcap", 0, True),
+    ("compact", "die", "write journal", 0, False),
+    ("compact", "die", "write journal", 0, True),
+    ("compact", "ENOSPC", "write", 1, False),
     ("record", "die", "rename 000000.mcap.open", 0, True),
     ("open after a crash", "EIO", "sync journal", 0, True),
     ("open without a journal", "torn", "write .journal", 0, False),

@@ -42,6 +42,13 @@ from tests.storage.steps import Steps, name_of, through
 
 ID = "0123456789abcdef" * 2
 STORE = "5" * 32
+PAYLOADS: dict[str, Any] = {
+    "file": "topic=a/b.parquet",
+    "bytes": 90,
+    "digest": "sha256:b",
+    "topic": "/a",
+    "messages": 7,
+}
 
 
 def begun(**other: Any) -> dict[str, Any]:
@@ -84,7 +91,8 @@ def whole_life() -> list[dict[str, Any]]:
         event(MARKED, time=-7, text="slipped", tags={"a": "b"}, segment=2),
         sealed(2),
         event(ADOPTED, store="6" * 32),
-        event("compacted", anything=[1, {"b": None}]),
+        event("expired", anything=[1, {"b": None}]),
+        event("compacted", files=[PAYLOADS]),
         event("of another version"),
         event(REMOVING, by=5),
     ]

@@ -1,0 +1,388 @@
+"""Copies payloads of ended recordings into columns, and proves that they come back.
+
+The steps are: write the files in a folder of their own; force them to the disk; rebuild
+every message from them and compare it with its segment; list them in the journal; give them
+their names. A crash before the journal's line leaves a folder that the next opening
+removes; after it, the next opening finishes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import count, pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.entries import take_inventory
+from hybridlog.maintenance.opening import put_entry
+from hybridlog.maintenance.report import being_written
+from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
+from hybridlog.tables.layout import table_schema_of, topic_folder
+from hybridlog_storage import durability, files, journal
+from hybridlog_storage.errors import DefinitionError, SegmentError, StoreError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.segment_reader import SegmentReader
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress
+    from hybridlog.payloads.columns import TopicColumns
+    from hybridlog.payloads.reader import RecordingPayloads
+    from hybridlog.payloads.writer import TopicWriter
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.journal import PayloadFile
+    from hybridlog_storage.messages import Channel
+
+_MIN_SHARE = 0.5  # of the sequences in the bytes of a topic's messages
+_MIN_BYTES = 128 << 10  # of a topic's messages: the footer of a file takes some kilobytes
+
+
+@dataclass(slots=True)
+class CompactedTopic:
+    """What `compact` did with a topic of a recording.
+
+    Attributes:
+        recording: Label of the recording.
+        topic: The topic.
+        messages: Messages whose payloads are in columns now.
+        payload_bytes: Bytes of these payloads.
+        column_bytes: Bytes of the files of columns; 0 in a dry run.
+        kept: Messages that stay in segments alone.
+        reason: Why they do; empty if there are none.
+    """
+
+    recording: str
+    topic: str
+    messages: int = 0
+    payload_bytes: int = 0
+    column_bytes: int = 0
+    kept: int = 0
+    reason: str = ""
+
+
+@dataclass(slots=True)
+class _Topic:
+    """A topic of one type that is being compacted."""
+
+    name: str
+    channels: dict[int, Channel]
+    columns: TopicColumns
+    report: CompactedTopic
+    writer: TopicWriter | None = None
+    files: list[PayloadFile] = field(default_factory=list)
+
+    def rows_of(self, chunk: StoredChunk) -> NDArray[np.intp]:
+        return np.flatnonzero(np.isin(chunk.batch.channel, list(self.channels)))
+
+    def keep(self, messages: int, reason: str) -> None:
+        self.report.kept += messages
+        self.report.reason = reason
+
+
+def compact(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    *,
+    topics: Collection[str] | None = None,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> list[CompactedTopic]:
+    """Write columns of payloads of a recording that has ended.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording.
+        topics: Full names of the topics; None for those that consist of arrays mostly.
+        dry_run: True to write nothing.
+        progress: Called after each chunk.
+
+    Returns:
+        The topics; those that have columns already are left out.
+
+    Raises:
+        StoreError: The recording is being written, or files cannot be read or written.
+        DiskFullError: There is no room; the recording is as it was.
+    """
+    if entry.status in {"open", "unfinished"}:
+        raise being_written(entry.label)
+    with directory.writing(entry.label) as mine:
+        if not mine:
+            raise being_written(entry.label)
+        work = _Compaction(directory, entry.label, progress)
+        chosen = work.choose(topics)
+        reports = [*work.refused, *(topic.report for topic in chosen)]
+        if dry_run or not chosen:
+            return reports
+        try:
+            work.write(chosen)
+            work.prove(chosen)
+            listed = work.announce(chosen)
+            payload_files.publish(work.path, listed)
+        except OSError as error:
+            work.take_back()
+            raise durability.explain(error, work.path, "writing columns of") from error
+        except BaseException:
+            work.take_back()
+            raise
+        put_entry(directory, catalog, entry.label)
+        return reports
+
+
+class _Compaction:
+    """The steps for one recording, which this process has locked."""
+
+    def __init__(self, directory: StoreDirectory, label: str, progress: Progress | None) -> None:
+        self.path: Path = directory.recording(label)
+        self.refused: list[CompactedTopic] = []
+        self._label = label
+        self._progress = progress
+        self._inventory: Inventory = take_inventory(directory, label)
+        state = self._inventory.state
+        if state is None or state.end is None:
+            raise StoreError(f"Recording {label!r} has no journal: run `hybridlog repair` first.")
+        self._state = state
+        self._total = 2 * sum(len(s.chunks) for s in self._inventory.summaries.values())
+        self._done = 0
+
+    def choose(self, topics: Collection[str] | None) -> list[_Topic]:
+        """The topics whose payloads can be moved.
+
+        Args:
+            topics: Full names of the wanted ones; those that cannot are `refused` by name.
+        """
+        from hybridlog.payloads.columns import TopicColumns
+
+        have = {file.topic for file in self._state.payloads.values()}
+        found: dict[tuple[str, str], _Topic] = {}
+        refused: dict[str, CompactedTopic] = {}
+        for number, channel, messages in self._channels():
+            name = channel.topic
+            if name in have or (topics is not None and name not in topics):
+                continue
+            key = name, table_schema_of(channel)
+            try:
+                topic = found.get(key) or _Topic(
+                    name, {}, TopicColumns(channel), CompactedTopic(self._label, name)
+                )
+            except DefinitionError as error:
+                report = refused.setdefault(name, CompactedTopic(self._label, name))
+                report.kept, report.reason = report.kept + messages, str(error)
+                continue
+            found[key] = topic
+            topic.channels[number] = channel
+            topic.report.messages += messages
+        if topics is not None:
+            self.refused = list(refused.values())
+        chosen = [t for t in found.values() if topics is not None or self._is_worth(t)]
+        return sorted(chosen, key=lambda topic: topic.name)
+
+    def _channels(self) -> Iterator[tuple[int, Channel, int]]:
+        """Id, channel and number of messages of each channel in each segment."""
+        for summary in self._inventory.summaries.values():
+            for number, channel in summary.channels.items():
+                if messages := summary.counts.get(number, 0):
+                    yield number, channel, messages
+
+    def _is_worth(self, topic: _Topic) -> bool:
+        """True if a topic is large, and the sequences of its first messages are most of it."""
+        totals = [
+            row
+            for summary in self._inventory.summaries.values()
+            for row in summary.table.by_channel()
+        ]
+        size = sum(int(r["payload_bytes"]) for r in totals if int(r["channel"]) in topic.channels)
+        if size < _MIN_BYTES:
+            return False
+        for chunk, _ in self._chunks([topic]):
+            batch = chunk.batch.take(topic.rows_of(chunk))
+            return topic.columns.share_of_sequences(batch) >= _MIN_SHARE
+        return False
+
+    def write(self, chosen: Sequence[_Topic]) -> None:
+        """Write the files; what does not fit its definition stays where it is."""
+        from hybridlog.payloads.writer import TopicWriter
+
+        files.remove_tree(self.path / PARTS, depth=files.IN_RECORDING)
+        numbers: defaultdict[str, count[int]] = defaultdict(count)
+        for topic in chosen:
+            topic.report.messages = 0
+            topic.writer = TopicWriter(
+                self.path / PARTS,
+                self._inventory.id,
+                next(iter(topic.channels.values())),
+                topic.columns,
+                partial(next, numbers[topic_folder(topic.name)]),
+            )
+        for chunk, digest in self._chunks(chosen, report=True, tell=True):
+            for topic in chosen:
+                rows = topic.rows_of(chunk)
+                if len(rows):
+                    self._add(topic, chunk, rows, digest)
+        for topic in chosen:
+            assert topic.writer is not None
+            topic.writer.close()
+            topic.files = topic.writer.written
+            topic.report.column_bytes = sum(file.bytes for file in topic.files)
+
+    def _add(self, topic: _Topic, chunk: StoredChunk, rows: NDArray[np.intp], digest: str) -> None:
+        channels = chunk.batch.channel[rows].tolist()
+        has_publish_time = np.array([topic.channels[c].has_publish_time for c in channels])
+        piece = topic.columns.piece(chunk, rows, has_publish_time=has_publish_time)
+        if piece is None:
+            topic.keep(len(rows), "a message of the chunk does not fit its definition")
+            return
+        assert topic.writer is not None
+        topic.writer.add(piece, chunk.segment, chunk.number, digest)
+        topic.report.messages += len(rows)
+        topic.report.payload_bytes += int(chunk.batch.length[rows].sum())
+
+    def prove(self, chosen: Sequence[_Topic]) -> None:
+        """Rebuild every message from the files and compare it with its segment.
+
+        The files of a topic that differs are removed.
+        """
+        from hybridlog.payloads.reader import RecordingPayloads
+
+        left = {
+            number: (topic, RecordingPayloads(self.path, topic.files, PARTS), Counter[str]())
+            for number, topic in enumerate(chosen)
+            if topic.files
+        }
+        for chunk, _ in self._chunks([topic for topic, _, _ in left.values()], report=True):
+            for number, (topic, payloads, seen) in list(left.items()):
+                problem = _difference(payloads, chunk, topic.rows_of(chunk), seen)
+                if problem:
+                    del left[number]
+                    self._refuse(topic, problem)
+        for topic, _, seen in left.values():
+            if seen != {file.file: file.messages for file in topic.files}:
+                self._refuse(topic, "its columns hold messages that no segment has")
+
+    def _refuse(self, topic: _Topic, problem: str) -> None:
+        """Remove the files of a topic that did not come back exactly."""
+        report = topic.report
+        topic.keep(report.messages, problem)
+        report.messages = report.payload_bytes = report.column_bytes = 0
+        for file in topic.files:
+            files.unlink(self.path / PARTS / file.file, depth=IN_PAYLOADS)
+        topic.files = []
+
+    def announce(self, chosen: Sequence[_Topic]) -> Mapping[str, PayloadFile]:
+        """List the files in the journal; return all that it lists."""
+        made = [file for topic in chosen for file in topic.files]
+        if made:
+            # Names have to be on the disk before the journal refers to them.
+            for folder in {(self.path / PARTS / file.file).parent for file in made}:
+                files.sync_folder(folder, depth=IN_PAYLOADS - 1)
+            files.sync_folder(self.path / PARTS, depth=files.IN_RECORDING)
+            files.sync_folder(self.path)
+            line = journal.event(journal.COMPACTED, files=[asdict(file) for file in made])
+            Journal(self.path).append(line)
+        return {**self._state.payloads, **{file.file: file for file in made}}
+
+    def take_back(self) -> None:
+        """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
+        with suppress(StoreError, OSError):
+            state = journal.read(self.path)
+            if state is not None and state.payloads.keys() == self._state.payloads.keys():
+                files.remove_tree(self.path / PARTS, depth=files.IN_RECORDING)
+
+    def _chunks(
+        self, topics: Sequence[_Topic], *, report: bool = False, tell: bool = False
+    ) -> Iterator[tuple[StoredChunk, str]]:
+        """Chunks with messages of some topics, with the digest of their segment, in order.
+
+        Args:
+            topics: The topics.
+            report: True to report progress.
+            tell: True to count the messages of damaged chunks as kept.
+        """
+        wanted = {number for topic in topics for number in topic.channels}
+        for number, summary in self._inventory.summaries.items():
+            name = self._inventory.listing.sealed[number]
+            with SegmentReader(self.path / name, number) as reader:
+                for place in summary.chunks:
+                    if report:
+                        self._done += 1
+                    if wanted.isdisjoint(place.channels):
+                        continue
+                    try:
+                        chunk = reader.read_chunk(place)
+                    except SegmentError:
+                        if tell:
+                            _keep_damaged(topics, summary.table, place.number)
+                    else:
+                        yield chunk, summary.digest
+                    if report and self._progress is not None:
+                        self._progress(self._label, min(self._done, self._total), self._total)
+
+
+def _keep_damaged(topics: Sequence[_Topic], table: ChunkTable, number: int) -> None:
+    """Count the messages of a chunk that cannot be read."""
+    bounds = table.part_bounds()
+    for part in table.parts[bounds[number] : bounds[number + 1]]:
+        for topic in topics:
+            if int(part["channel"]) in topic.channels:
+                topic.keep(int(part["messages"]), "a chunk is damaged; run `hybridlog verify`")
+
+
+def _difference(
+    payloads: RecordingPayloads, chunk: StoredChunk, rows: NDArray[np.intp], seen: Counter[str]
+) -> str:
+    """Compare messages of a chunk with those in columns, byte for byte.
+
+    Args:
+        payloads: The columns of their topic.
+        chunk: The chunk.
+        rows: The messages of the topic in it.
+        seen: Counts compared messages by file.
+
+    Returns:
+        The difference; empty if there is none, or if the chunk is not in the columns.
+    """
+    from hybridlog.payloads.columns import column_at
+
+    try:
+        readers = payloads.having(chunk.segment, chunk.number)
+        if not readers or not len(rows):
+            return ""
+        (reader,) = readers
+        place = reader.places[chunk.segment, chunk.number]
+        rebuilt = reader.rebuilt(place.group)
+        seq = column_at(reader.table(place.group, ["seq"]), "seq").to_numpy()
+    except StoreError as error:
+        return str(error)
+    inside = slice(place.begin, place.begin + place.rows)
+    begin = chunk.batch.offset[rows] - MESSAGE_HEAD.itemsize
+    end = chunk.batch.offset[rows] + chunk.batch.length[rows]
+    is_same = place.rows == len(rows) and bool(
+        (seq[inside] == chunk.seq[rows]).all()
+        and (rebuilt.place[inside] == begin).all()
+        and (np.diff(rebuilt.offset)[inside] == end - begin).all()
+    )
+    if not is_same:
+        return "its columns hold other messages"
+    content = memoryview(chunk.batch.buffer)
+    start = rebuilt.offset[place.begin : place.begin + place.rows + 1].tolist()
+    data = rebuilt.data.data
+    pieces = zip(begin.tolist(), end.tolist(), pairwise(start), strict=True)
+    if any(content[a:b] != data[c:d] for a, b, (c, d) in pieces):
+        return "a message does not come back from its columns byte for byte"
+    seen[reader.listed.file] += len(rows)
+    return ""

@@ -1,0 +1,39 @@
+"""Names of files and columns of payloads.
+
+```
+recordings/<label>/payloads/topic=<collection>/<schema8>-<number>.parquet
+recordings/<label>/payloads.part/    files that are being written
+```
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hybridlog.tables.layout import RESERVED
+
+PAYLOADS: Final = "payloads"
+"""Folder of a recording that holds its files of payloads."""
+PARTS: Final = "payloads.part"
+"""Folder of a recording that holds files that are being written."""
+IN_PAYLOADS: Final = 5
+"""Depth of a file of payloads below the store."""
+RECIPE: Final = "recipe"
+"""Column with what the original bytes need besides the arrays."""
+POINTS: Final = "points"
+"""Column of the points of clouds, in place of their `data`."""
+OWN_COLUMNS: Final = ("log_time", "t", "seq", "pub", "channel", "sequence", "ref")
+"""Columns of every file, before the fields of the messages."""
+PAYLOAD_RESERVED: Final = RESERVED | {"sequence", RECIPE, POINTS}
+"""Names that no column of a field has."""
+
+
+def payload_file(folder: str, schema: str, number: int) -> str:
+    """Path of a file below `payloads`.
+
+    Args:
+        folder: Folder of the topic.
+        schema: Hash of what determines the columns.
+        number: Number of files of the topic before.
+    """
+    return f"{folder}/{schema[:8]}-{number:06d}.parquet"
