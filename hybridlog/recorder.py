@@ -18,6 +18,7 @@ import numpy as np
 from hybridlog.capture import Capture
 from hybridlog.entries import text
 from hybridlog.latched_front import LatchedFront
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -26,6 +27,7 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segment_format import OUR_NAMES
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, safe_point
 
@@ -37,8 +39,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
-
-OUR_NAMES = "hybridlog."
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,7 @@ class RecordReport:
         elapsed_s: Wall time, seconds.
         latched: Latched messages from before the time range.
         latched_left_out: Those that were in force and did not fit in memory.
+        attachments_left_out: Attachments from behind the time range.
     """
 
     entry: RecordingEntry
@@ -93,6 +94,7 @@ class RecordReport:
     elapsed_s: float
     latched: int = 0
     latched_left_out: int = 0
+    attachments_left_out: int = 0
 
 
 @at_safe_points()
@@ -146,7 +148,8 @@ def record(
         check=refuse_known,
     )
     try:
-        skipped, front = _copy(source, capture.writer, options, progress)
+        copy = _Copy(source, capture.writer, options)
+        copy.run(progress)
         _check_result(source, capture.writer, options)
         failure = capture.close(_end_of(source))
     except BaseException:
@@ -159,47 +162,63 @@ def record(
         capture.indexed,
         capture.index.missed,
         failure,
-        skipped,
+        copy.skipped,
         time.monotonic() - started,
-        latched=front.messages if front is not None else 0,
-        latched_left_out=front.left_out if front is not None else 0,
+        latched=copy.front.messages if copy.front is not None else 0,
+        latched_left_out=copy.front.left_out if copy.front is not None else 0,
+        attachments_left_out=copy.attachments_left_out,
     )
 
 
-def _copy(
-    source: Source,
-    writer: RecordingWriter,
-    options: RecordOptions,
-    progress: Callable[[int, int], None] | None,
-) -> tuple[int, LatchedFront | None]:
-    """Copy every wanted message from the source to the writer.
+class _Copy:
+    """Copies everything wanted from a source to a writer.
 
-    Returns:
-        The number of messages left out, and the latched messages in front of a slice.
+    Attributes:
+        front: The latched messages in front of a slice; None for none.
+        skipped: Messages left out.
+        attachments_left_out: Attachments left out.
     """
-    front = None
-    if options.between is not None and options.latched:
-        front = LatchedFront(options.between[0], original_times=options.original_times)
-    choice = _Choice(options, front)
-    read = 0
-    for batch in source.batches():
-        safe_point()
-        _copy_extras(source, writer)
-        read += len(batch)
-        writer.append(choice.of(batch, source.channels), source.channels)
-        if progress is not None:
-            progress(source.bytes_read, writer.totals.messages)
-    for batch in front.batches() if front is not None else ():
-        writer.append(batch, source.channels)
-    _copy_extras(source, writer)
-    return read - writer.totals.messages, front
 
+    def __init__(self, source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
+        self.front: LatchedFront | None = None
+        if options.between is not None and options.latched:
+            self.front = LatchedFront(options.between[0], original_times=options.original_times)
+        self.skipped = 0
+        self.attachments_left_out = 0
+        self._source = source
+        self._writer = writer
+        self._between = options.between
+        self._choice = _Choice(options, self.front)
 
-def _copy_extras(source: Source, writer: RecordingWriter) -> None:
-    for extra in source.extras:
-        if not extra.name.startswith(OUR_NAMES):
-            writer.add_extra(extra)
-    source.extras.clear()
+    def run(self, progress: Callable[[int, int], None] | None) -> None:
+        """Copy the source from its beginning to its end."""
+        source, writer = self._source, self._writer
+        read = 0
+        for batch in source.batches():
+            safe_point()
+            self._copy_extras()
+            read += len(batch)
+            writer.append(self._choice.of(batch, source.channels), source.channels)
+            if progress is not None:
+                progress(source.bytes_read, writer.totals.messages)
+        for batch in self.front.batches() if self.front is not None else ():
+            writer.append(batch, source.channels)
+        self._copy_extras()
+        for channel in self._choice.channels(source.channels):
+            writer.declare(channel)
+        self.skipped = read - writer.totals.messages
+
+    def _copy_extras(self) -> None:
+        """Store attachments and metadata records; a slice holds the attachments up to its end."""
+        for extra in self._source.extras:
+            if isinstance(extra, Attachment):
+                if self._between is not None and extra.log_time >= self._between[1]:
+                    self.attachments_left_out += 1
+                    continue
+            elif extra.name.startswith(OUR_NAMES):
+                continue
+            self._writer.add_extra(extra)
+        self._source.extras.clear()
 
 
 class _Choice:
@@ -210,6 +229,12 @@ class _Choice:
         self._between = options.between
         self._front = front
         self._wanted: list[bool] = []
+
+    def channels(self, channels: list[Channel]) -> list[Channel]:
+        """The wanted ones of some channels."""
+        if self._matcher is None:
+            return channels
+        return [channel for channel in channels if self._matcher(channel.topic)]
 
     def of(self, batch: Batch, channels: list[Channel]) -> Batch:
         """The wanted messages of a batch."""

@@ -141,8 +141,8 @@ MUTANTS = [
         "hybridlog/recorder.py",
         (
             "nothing-behind-the-last-message",
-            "writer.totals.messages)\n    for extra in source.extras:",
-            "writer.totals.messages)\n    for extra in ():",
+            "        self._copy_extras()\n        for channel in",
+            "        for channel in",
             "tests/sources/test_mcap.py::test_what_stands_behind_the_last_message_is_recorded",
         ),
     ),
@@ -531,7 +531,7 @@ FORMAT_2 = [
         ),
         (
             "metadata-is-believed",
-            "        if crc32(data) != crc:\n",
+            "        if self.checksum(start, length) != crc:\n",
             "        if False:\n",
             SEGMENTS,
         ),

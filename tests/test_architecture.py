@@ -41,6 +41,7 @@ ALLOWED = {
     "mcap": (
         "hybridlog.export.mcap",
         "hybridlog.sources",
+        "hybridlog_storage.attachments",
         "hybridlog_storage.chunk_builder",
         "hybridlog_storage.mcap_content",
         "hybridlog_storage.mcap_scan",

@@ -95,7 +95,8 @@ def line_of(loss: dict[str, Any]) -> str:
     if loss["cause"] == Cause.THROTTLE:
         return f"{count}{topic} left out by a throttle"
     said = f"{file} {loss['reason']}".rstrip()
-    return f"{count}{topic} lost, {loss['cause']}{':' if said else ''}{said}"
+    lost = "" if loss["count"] == 0 else f"{count}{topic} lost, "
+    return f"{lost}{loss['cause']}{':' if said else ''}{said}"
 
 
 def gaps(

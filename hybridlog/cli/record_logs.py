@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from hybridlog.cli import output
+from hybridlog.cli import coverage, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
@@ -157,10 +157,13 @@ def _check_not_empty(
 
 
 def _between(source: Source, choices: RecordChoices) -> tuple[int, int] | None:
-    from hybridlog.query.times import parse_range
+    from hybridlog.query.times import is_relative, parse_range
+    from hybridlog.sources.detect import read_time_range
 
     if choices.between is None:
         return None
+    if source.time_range is None and any(map(is_relative, choices.between)):
+        source.time_range = read_time_range(source.path)
     start, end = source.time_range or (None, None)
     between = parse_range(*choices.between, start=start, end=end)
     if start is not None and end is not None and (between[1] <= start or between[0] >= end):
@@ -375,11 +378,8 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
         )
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
-        lost = (
-            ""
-            if damage.messages_lost is None
-            else f"; {output.counted(damage.messages_lost, 'message')} lost"
-        )
+        count = damage.messages_lost
+        lost = f"; {output.counted(count, 'message')} lost" if count else ""
         output.note(f"{damage.file}{place}: {damage.reason}{lost}")
     if report.failure is not None:
         output.note(
@@ -388,9 +388,10 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
         )
         problems.append(DatabaseError(str(report.failure)))
     if report.damage:
+        losses = coverage.losses_of(report.entry)
         output.note(
-            f"{path} is damaged: {output.stored(report.entry.messages)}, "
-            f"{output.counted(len(report.damage), 'place')} could not be read."
+            f"{path} is damaged: {output.stored(report.entry.messages)}; "
+            f"{coverage.describe(report.entry, losses)}."
         )
         problems.append(SourceDamagedError(str(path)))
     return problems

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from mcap.records import Attachment, Metadata
+    from mcap.records import Metadata
 
+    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Channel
 
 BATCH_BYTES = 2 << 20
@@ -40,6 +41,9 @@ MAX_PLACES = 10_000
 
 TOO_MANY_CHANNELS = f"messages of further channels; a recording can have {MAX_CHANNELS}"
 """Reason of the damage that counts messages on further channels."""
+
+TOO_MANY_SILENT = f"channels without messages are left out; a recording can have {MAX_CHANNELS}"
+"""Reason of the damage that counts such channels, behind their number."""
 
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 
@@ -83,10 +87,11 @@ class Source(ABC):
         files: The files that hold messages, in reading order.
         size_bytes: Sum of the sizes of `files`.
         channels: Channels found so far; `Batch.channel` indexes it. It only grows, and holds
-            every channel of a batch before that batch is yielded.
+            every channel of a batch before that batch is yielded. After the last batch it
+            holds the channels without messages, too.
         damage: Damaged places found so far. It only grows.
         extras: Metadata and attachments found so far (MCAP only). The consumer removes them
-            as it stores them.
+            as it stores them. Attachments can still be read when the source is closed.
         message_count: Number of messages as stated by the log, None if it states none.
         time_range: Log time `[start, end)`, ns, by the log's own index, None without an index
             or without messages.

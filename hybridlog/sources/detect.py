@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
+from itertools import pairwise
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
 
 from hybridlog.sources import spool
 from hybridlog.sources.base import Damage, Source, cannot_open
-from hybridlog.sources.joined import JoinedSource, Part
-from hybridlog.sources.rosbag2 import locate, read_metadata
+from hybridlog.sources.joined import JoinedSource, Part, Total
+from hybridlog.sources.rosbag2 import locate, plain, read_metadata
 from hybridlog.sources.rosbag2_metadata import NAME, BagMetadata
 from hybridlog_storage.errors import SourceError
 
@@ -60,11 +61,27 @@ def open_source(path: Path) -> Source:
     if not S_ISREG(mode):
         raise SourceError(f"{path}: neither a file nor a directory; give the path of a log")
     metadata = read_metadata(path.parent)
-    if isinstance(metadata, BagMetadata) and path.name in metadata.files:
-        found = sniff(path)
-        if found[0] in {Format.SQLITE, Format.MCAP}:
-            return _join(path, [path], metadata)
+    if isinstance(metadata, BagMetadata) and sniff(path)[0] in {Format.SQLITE, Format.MCAP}:
+        files, _ = locate(path.parent, metadata) if metadata.files else ({}, [])
+        if path in files:
+            return _join(path, {path: files[path]}, metadata)
     return _open_file(path)
+
+
+def read_time_range(path: Path) -> tuple[int, int] | None:
+    """Read a log to find its log time `[start, end)`, ns; None without messages.
+
+    Raises:
+        SourceError: As `open_source`.
+    """
+    first, last = 1 << 63, -1
+    with open_source(path) as source:
+        for batch in source.batches():
+            if len(batch):
+                first = min(first, int(batch.log_time.min()))
+                last = max(last, int(batch.log_time.max()))
+            source.extras.clear()
+    return (first, last + 1) if first <= last else None
 
 
 def sniff(path: Path) -> tuple[Format, bool]:
@@ -98,13 +115,7 @@ def _open_file(path: Path) -> Source:
     found, is_packed = sniff(path)
     if found is Format.OTHER:
         raise _unknown(path, is_packed=is_packed)
-    if is_packed:
-        return _join(path, [path], None)
-    source = _open_plain(path)
-    if not source.packed_messages:
-        return source
-    source.close()
-    return _join(path, [path], None)
+    return _join(path, {path: None}, None)
 
 
 def _open_plain(path: Path) -> Source:
@@ -145,8 +156,7 @@ def _unknown(path: Path, *, is_packed: bool) -> SourceError:
 def _open_directory(folder: Path) -> Source:
     metadata = read_metadata(folder)
     if isinstance(metadata, BagMetadata):
-        files, missing = locate(folder, metadata)
-        return _join(folder, files, metadata, missing)
+        return _open_bag(folder, metadata)
     damage = [metadata] if isinstance(metadata, Damage) else []
     logs = _logs_in(folder)
     if not logs:
@@ -160,40 +170,99 @@ def _open_directory(folder: Path) -> Source:
             f"{folder}: {len(logs)} logs that are not parts of one ({names}); give the path of "
             "one of them"
         )
-    return _join(folder, logs, None, damage)
+    empty = [path for path in _empty_in(folder) if _continues(logs[0], path)]
+    parts = sorted([*logs, *empty], key=_natural)
+    return _join(folder, dict.fromkeys(parts), None, damage, gaps=_gaps(parts))
+
+
+def _open_bag(folder: Path, metadata: BagMetadata) -> Source:
+    """Open a ROS 2 bag with its metadata, which need not list all parts."""
+    files, damage = locate(folder, metadata)
+    names = {plain(path) for path in files}
+    first = next((path for path in files if path.stat().st_size), None)
+    more = [path for path in _empty_in(folder) if _continues(first, path)]
+    unread: list[Damage] = []
+    for path in _logs_in(folder):
+        if path in files:
+            continue
+        if plain(path) in names:
+            unread.append(_unread(path, f"it is another form of {plain(path)}", 0))
+        elif _continues(first, path):
+            more.append(path)
+        else:
+            reason = f"{NAME} does not list it, and its name is not that of a part of the bag"
+            unread.append(_unread(path, f"{reason}; record it by its own path", _count_of(path)))
+    if more:
+        files = {path: files.get(path) for path in sorted({*files, *more}, key=_natural)}
+    lost = {damaged.file for damaged in damage}
+    gaps = [gap for gap in _gaps(list(files)) if gap.file not in lost]
+    return _join(folder, files, metadata, damage, gaps=gaps, unread=unread)
+
+
+def _continues(first: Path | None, path: Path) -> bool:
+    """True if a file is another part of the log that the first one is a part of."""
+    return first is not None and _is_split([first, path])
+
+
+def _unread(path: Path, reason: str, lost: int | None) -> Damage:
+    return Damage(path, None, None, f"the file is not read: {reason}", lost)
+
+
+def _count_of(path: Path) -> int | None:
+    """Number of messages of a log by its own index, None if unknown."""
+    if sniff(path)[1]:
+        return None
+    try:
+        with _open_plain(path) as source:
+            return source.message_count
+    except SourceError:
+        return None
 
 
 def _join(
     path: Path,
-    files: Sequence[Path],
+    files: Mapping[Path, int | None],
     metadata: BagMetadata | None,
     damage: Sequence[Damage] = (),
+    *,
+    gaps: Sequence[Damage] = (),
+    unread: Sequence[Damage] = (),
 ) -> Source:
-    """Open several files, or one that needs more than its plain reader, as one source.
+    """Open the files of one log as one source.
+
+    Args:
+        path: The opened path.
+        files: The files in order, with their number of messages as listed.
+        metadata: Metadata of the log.
+        damage: Damage known beforehand.
+        gaps: Files that may be missing, by the numbers of the others.
+        unread: Files that are left out.
 
     Raises:
         SourceError: None of the files is a log.
     """
     parts: list[Part] = []
     formats: list[Format] = []
-    for file in files:
+    for file, count in files.items():
         try:
             found, is_packed = sniff(file)
         except SourceError:
             # Reading reports the damage; other files may be readable.
             found, is_packed = Format.OTHER, False
-        count = None if metadata is None else _listed(metadata, file)
         has_packed = metadata is not None and metadata.packed_messages
         parts.append(Part(file, count, is_packed, has_packed))
         formats.append(found)
     known = [found for found in formats if found is not Format.OTHER]
     if not known:
-        sniff(files[0])
-        raise _unknown(files[0], is_packed=parts[0].packed)
+        sniff(parts[0].path)
+        raise _unknown(parts[0].path, is_packed=parts[0].packed)
     # Only the reader of an MCAP file knows its profile.
     is_mcap = known[0] is Format.MCAP
     is_bag = metadata is not None
     profiles = {Format.BAG: "ros1", Format.SQLITE: "ros2", Format.MCAP: "ros2" if is_bag else ""}
+    total = None
+    if metadata is not None and metadata.message_count is not None and path.is_dir():
+        total = Total(path / NAME, metadata.message_count)
     source = JoinedSource(
         path,
         kind=("ROS 2 bag (mcap)" if is_bag else "") if is_mcap else known[0].value,
@@ -201,30 +270,32 @@ def _join(
         parts=parts,
         opener=_open_plain,
         damage=damage,
+        gaps=gaps,
+        unread=unread,
+        total=total,
     )
-    whole = metadata is not None and path.is_dir() and metadata.message_count is not None
-    if metadata is not None and whole:
-        source.message_count = metadata.message_count
-        source.time_range = metadata.time_range
-    else:
-        source.look()
+    source.look()
     source.kind = source.kind or known[0].value
     return source
 
 
-def _listed(metadata: BagMetadata, file: Path) -> int | None:
-    """The metadata's message count of a file, by its name with or without `.zstd`."""
-    names = (file.name, file.name + ".zstd", file.name.removesuffix(".zstd"))
-    return next((metadata.counts[name] for name in names if name in metadata.counts), None)
+def _files_in(folder: Path) -> list[tuple[Path, int]]:
+    """The files directly in a folder, and their sizes in bytes."""
+    try:
+        names = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        return [(path, path.stat().st_size) for path in names if path.is_file()]
+    except OSError as error:
+        raise cannot_open(folder, error) from error
+
+
+def _empty_in(folder: Path) -> list[Path]:
+    """The empty files directly in a folder."""
+    return [path for path, size in _files_in(folder) if not size]
 
 
 def _logs_in(folder: Path) -> list[Path]:
     """The logs directly in a folder, in natural order of their names."""
-    try:
-        names = [path for path in folder.iterdir() if not path.name.startswith(".")]
-        files = [path for path in names if path.is_file() and path.stat().st_size]
-    except OSError as error:
-        raise cannot_open(folder, error) from error
+    files = [path for path, size in _files_in(folder) if size]
     refused: SourceError | None = None
     logs = []
     for path in files:
@@ -245,15 +316,36 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     ]
 
 
-# Names of the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`.
-_PART = re.compile(r"(?P<stem>.*)_(?P<number>[0-9]{1,9})(?P<end>\.[A-Za-z0-9.]*)")
+# Names of the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`, `3.mcap`.
+_PART = re.compile(r"(?P<stem>|.*_)(?P<number>[0-9]{1,9})(?P<end>\.[A-Za-z0-9.]*)")
 _DATE = re.compile(r"[0-9]{4}(?:[-_][0-9]{2}){5}")
 
 
 def _is_split(logs: Sequence[Path]) -> bool:
     """True if files are the parts of one log, by their names and formats."""
-    found = [_PART.fullmatch(path.name) for path in logs]
+    found = [_PART.fullmatch(plain(path)) for path in logs]
     series = {(_DATE.sub("", each["stem"]), each["end"]) for each in found if each is not None}
     numbers = {int(each["number"]) for each in found if each is not None}
-    formats = {sniff(path) for path in logs}
+    formats = {sniff(path)[0] for path in logs if path.stat().st_size}
     return None not in found and len(series) == len(formats) == 1 and len(numbers) == len(logs)
+
+
+def _gaps(parts: Sequence[Path]) -> list[Damage]:
+    """The damage for parts that are missing between others, by their numbers."""
+    found = {
+        int(part["number"]): (path, part)
+        for path in parts
+        if (part := _PART.fullmatch(plain(path))) is not None
+    }
+    if len(found) < len(parts):
+        return []
+    damage: list[Damage] = []
+    for before, after in pairwise(sorted(found)):
+        if after == before + 1:
+            continue
+        path, part = found[before]
+        stem, number = _DATE.sub("*", part["stem"]), str(before + 1).zfill(len(part["number"]))
+        what = "the file is" if after == before + 2 else f"parts {before + 1} to {after - 1} are"
+        reason = f"{what} missing between {path.name} and {found[after][0].name}"
+        damage.append(Damage(path.with_name(stem + number + part["end"]), None, None, reason, None))
+    return damage

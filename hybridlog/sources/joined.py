@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import zstandard
@@ -17,6 +17,10 @@ from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_CDR = frozenset({"cdr", ""})  # encodings of ROS 2 messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,18 @@ class Part:
     packed_messages: bool = False
 
 
+class Total(NamedTuple):
+    """The number of messages in all files, by the log's metadata.
+
+    Attributes:
+        path: File of the metadata.
+        messages: Number of messages.
+    """
+
+    path: Path
+    messages: int
+
+
 class JoinedSource(Source):
     """Files of one log, read one after the other; only one is open at a time.
 
@@ -49,6 +65,9 @@ class JoinedSource(Source):
         parts: The files in order, at least one.
         opener: Opens one uncompressed file by its content.
         damage: Damage known beforehand (missing files).
+        gaps: Files that seem to be missing; damage unless all messages of `total` are there.
+        unread: Files that are left out.
+        total: Number of messages in all files by the log's metadata.
     """
 
     def __init__(
@@ -60,10 +79,17 @@ class JoinedSource(Source):
         parts: Sequence[Part],
         opener: Callable[[Path], Source],
         damage: Sequence[Damage] = (),
+        gaps: Sequence[Damage] = (),
+        unread: Sequence[Damage] = (),
+        total: Total | None = None,
     ) -> None:
         super().__init__(path, kind=kind, profile=profile, files=[part.path for part in parts])
         self._parts = list(parts)
         self._opener = opener
+        self._gaps = list(gaps)
+        self._unread = list(unread)
+        self._total = total
+        self._got = 0
         self.damage.extend(damage)
         self._numbers: dict[tuple[object, ...], int] = {}
         self._inner: Source | None = None
@@ -129,6 +155,8 @@ class JoinedSource(Source):
             self.bytes_read = done
         if first is not None and failed == len(self._parts):
             raise first
+        self._check_total()
+        self.damage.extend(self._unread)
 
     def _sizes(self) -> list[int]:
         sizes = []
@@ -161,9 +189,9 @@ class JoinedSource(Source):
         numbers = np.empty(0, np.int32)
         got = 0
         found_before = len(self.damage)
-        batches = inner.batches()
+        batches = self._unpacked(part, inner, inner.batches())
         if part.packed_messages or inner.packed_messages:
-            batches = regroup(self._unpacked(part, batches))
+            batches = regroup(batches)
         for batch in batches:
             got += len(batch)
             if len(numbers) < len(inner.channels):
@@ -185,21 +213,31 @@ class JoinedSource(Source):
         for channel in inner.channels:
             self._number(channel)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
-        self._check_count(part, got, found_before)
+        self._got += got
+        if part.message_count is not None:
+            self._check_count(Total(part.path, part.message_count), got, found_before)
 
-    def _check_count(self, part: Part, got: int, found_before: int) -> None:
-        """Compare with the file's message count in the metadata."""
+    def _check_total(self) -> None:
+        """Compare with the number of all messages in the metadata."""
+        lost = sum(damage.messages_lost or 0 for damage in self.damage)
+        if self._total is None or self._got + lost < self._total.messages:
+            self.damage.extend(self._gaps)
+        if self._total is not None:
+            self._check_count(self._total, self._got, 0)
+
+    def _check_count(self, total: Total, got: int, found_before: int) -> None:
+        """Compare with a number of messages in the metadata."""
         found = self.damage[found_before:]
-        if part.message_count is None or got >= part.message_count:
+        if got >= total.messages:
             return
-        missing = part.message_count - got - sum(damage.messages_lost or 0 for damage in found)
+        missing = total.messages - got - sum(damage.messages_lost or 0 for damage in found)
         unknown = [row for row, damage in enumerate(found) if damage.messages_lost is None]
         if len(unknown) == 1:
             row = found_before + unknown[0]
             self.damage[row] = replace(self.damage[row], messages_lost=max(0, missing))
         elif not unknown and missing > 0:
-            reason = f"the log's metadata lists {part.message_count} messages, {got} are there"
-            self.damage.append(Damage(part.path, None, None, reason, missing))
+            reason = f"the log's metadata lists {total.messages} messages, {got} are there"
+            self.damage.append(Damage(total.path, None, None, reason, missing))
 
     def _take_extras(self, inner: Source) -> None:
         self.extras.extend(inner.extras)
@@ -221,44 +259,68 @@ class JoinedSource(Source):
             self.channels.append(channel)
         return number
 
-    def _unpacked(self, part: Part, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """Unpack payloads that are zstd frames; omit damaged ones."""
+    def _unpacked(self, part: Part, inner: Source, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """Unpack payloads that are zstd frames; the others stay as they are.
+
+        In a log that does not say so only CDR is unpacked, which never begins like a frame.
+        """
+        is_stated = part.packed_messages or inner.packed_messages
+        may_be = np.empty(0, np.bool_)
         unpacker = zstandard.ZstdDecompressor()
         broken = plain = 0
         for batch in batches:
+            if len(may_be) < len(inner.channels):
+                may_be = np.array(
+                    [is_stated or c.message_encoding in _CDR for c in inner.channels], np.bool_
+                )
+            packed = may_be[batch.channel] & _is_frame(batch)
+            plain += len(batch) - int(packed.sum())
+            if not packed.any():
+                yield batch
+                continue
             start = 0
             while start < len(batch):
                 payloads: list[bytes] = []
-                kept: list[int] = []
                 size = 0
                 row = start
                 while row < len(batch) and size < BATCH_BYTES:
                     payload = bytes(batch.payload(row))
-                    is_packed = payload.startswith(ZSTD_MAGIC)
-                    plain += not is_packed
-                    data = _unpack_payload(unpacker, payload) if is_packed else payload
-                    if data is None:
-                        broken += 1
-                    else:
-                        payloads.append(data)
-                        kept.append(row)
-                        size += len(data)
+                    data = _unpack_payload(unpacker, payload) if packed[row] else payload
+                    broken += data is None
+                    payloads.append(payload if data is None else data)
+                    size += len(payloads[-1])
                     row += 1
-                rows = batch.take(np.array(kept, np.intp))
+                rows = batch.take(np.arange(start, row, dtype=np.intp))
                 rows.buffer = b"".join(payloads)
                 rows.length = np.fromiter(map(len, payloads), np.int64, len(payloads))
                 rows.offset = np.cumsum(rows.length) - rows.length
                 yield rows
                 start = row
-        if broken:
-            reason = "payloads that do not unpack, although the bag says they are compressed"
-            self.damage.append(Damage(part.path, None, None, reason, broken))
-        if plain:
-            reason = (
-                f"{plain} payloads are not compressed, although the bag says so; they are "
-                "taken as they are"
-            )
-            self.damage.append(Damage(part.path, None, None, reason, 0))
+        if not is_stated:
+            return
+        for count, problem in ((broken, "do not unpack"), (plain, "are not compressed")):
+            if count:
+                reason = (
+                    f"{count} payloads {problem}, although the bag says they are compressed; they "
+                    "are taken as they are"
+                )
+                self.damage.append(Damage(part.path, None, None, reason, 0))
+
+
+def _is_frame(batch: Batch) -> NDArray[np.bool_]:
+    """Test which payloads begin like a zstd frame.
+
+    Returns:
+        bool[n].
+    """
+    found = batch.length >= len(ZSTD_MAGIC)
+    if found.any():
+        size = len(batch.buffer) - len(ZSTD_MAGIC) + 1
+        # A view of four bytes at every byte of the buffer; only the needed ones are read.
+        starts = np.ndarray((size,), "<u4", batch.buffer, strides=(1,))
+        magic = int.from_bytes(ZSTD_MAGIC, "little")
+        found[found] = starts[batch.offset[found]] == magic
+    return found
 
 
 def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes | None:

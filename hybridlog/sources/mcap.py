@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,10 +14,12 @@ from hybridlog.sources.base import (
     BATCH_MESSAGES,
     MAX_CHUNK,
     TOO_MANY_CHANNELS,
+    TOO_MANY_SILENT,
     Damage,
     Source,
     cannot_open,
 )
+from hybridlog_storage.attachments import Attachment, FileHandle
 from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError, SourceError
 from hybridlog_storage.mcap_scan import (
@@ -98,6 +100,7 @@ class McapSource(Source):
         except BaseException:
             self._file.close()
             raise
+        self._handle: FileHandle | None = None  # for attachments, which outlive this reader
         self._definitions = _Definitions(self.channels, self._summary)
         self._given = 0
         self._lost = 0
@@ -105,6 +108,7 @@ class McapSource(Source):
         self._uncounted: list[_Open] = []
         self._end_is_noted = False
         self._too_many = 0
+        self._unpublished = 0
         # Channels of the message indexes since the last chunk, None before the first.
         self._indexed: set[int] | None = None
 
@@ -121,17 +125,15 @@ class McapSource(Source):
             self.profile = first[1].profile
             if self.profile == "ros2":
                 self.kind = "ROS 2 bag (mcap)"
-        statistics = summary.statistics if summary is not None else None
-        if statistics is not None:
-            self.message_count = statistics.message_count
-            start, last = statistics.message_start_time, statistics.message_end_time
-            if statistics.message_count and start <= last < (1 << 63) - 1:
-                self.time_range = start, last + 1
+        if summary is not None and summary.statistics is not None:
+            self.message_count = summary.statistics.message_count
+            self.time_range = _time_range(summary)
         return summary
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+        self._handle = None
 
     def batches(self) -> Iterator[Batch]:
         """Yield all readable messages once, in file order.
@@ -162,8 +164,11 @@ class McapSource(Source):
             yield from self._damaged(item)
         elif isinstance(item, records.Schema | records.Channel):
             self._define(offset, item)
-        elif isinstance(item, records.Metadata | records.Attachment):
+        elif isinstance(item, records.Metadata):
             self.extras.append(item)
+        elif isinstance(item, Attachment):
+            self._handle = self._handle or FileHandle(self._file.fileno())
+            self.extras.append(replace(item, data=item.data.through(self._handle)))
         elif isinstance(item, End):
             self._end(item)
 
@@ -215,6 +220,7 @@ class McapSource(Source):
         self, content: ChunkContent, offset: int, *, relative: bool = False
     ) -> Iterator[Batch]:
         """Yield the messages of one chunk or run, split where a definition changes."""
+        self._unpublished += content.unpublished
         for damage in content.damage:
             self._note(offset, None, damage.reason, damage.messages)
         if len(content.invalid):
@@ -222,7 +228,7 @@ class McapSource(Source):
             self._note(
                 offset + first if relative else offset,
                 None,
-                f"{len(content.invalid)} messages have a time beyond 2^63 - 1 ns or no head "
+                f"{len(content.invalid)} messages have a log time beyond 2^63 - 1 ns or no head "
                 f"(the first at byte {first} of the content)",
                 len(content.invalid),
             )
@@ -295,8 +301,16 @@ class McapSource(Source):
 
     def _end(self, end: End) -> None:
         self.bytes_read = self.size_bytes
+        if left_out := self._definitions.use_rest():
+            self._note(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
         if self._too_many:
             self._note(None, None, TOO_MANY_CHANNELS, self._too_many)
+        if self._unpublished:
+            reason = (
+                f"{self._unpublished} messages have a publish time beyond 2^63 - 1 ns; their log "
+                "time is stored in its place"
+            )
+            self._note(None, None, reason, 0)
         missing = None
         if self.message_count is not None:
             missing = max(self.message_count - self._given - self._lost, 0)
@@ -317,6 +331,23 @@ class McapSource(Source):
         if not end.clean and not self._end_is_noted:
             reason = "the file was not closed: its end is missing; all before it was read"
             self._note(end.offset, 0, reason, 0)
+
+
+def _time_range(summary: Summary) -> tuple[int, int] | None:
+    """The log time by the summary, if its parts agree."""
+    statistics = summary.statistics
+    if statistics is None or not statistics.message_count:
+        return None
+    start, last = statistics.message_start_time, statistics.message_end_time
+    indexes = [i for i in summary.chunk_indexes if i.message_start_time or i.message_end_time]
+    if indexes:
+        by_chunks = (
+            min(index.message_start_time for index in indexes),
+            max(index.message_end_time for index in indexes),
+        )
+        if by_chunks != (start, last):
+            return None
+    return (start, last + 1) if start <= last < (1 << 63) - 1 else None
 
 
 def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
@@ -416,6 +447,13 @@ class _Definitions:
                 "defined; its messages are kept without one"
             )
         return ""
+
+    def use_rest(self) -> int:
+        """Enter the channels without messages; returns how many there is no room for."""
+        rest = [number for number in self._records if self.table[number] == _UNDEFINED]
+        for number in rest:
+            self.use(number)
+        return int((self.table[rest] == _TOO_MANY).sum())
 
     def _share(self, record: records.Schema | None) -> Schema | None:
         if record is None:

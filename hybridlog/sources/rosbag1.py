@@ -13,7 +13,7 @@ from __future__ import annotations
 import bz2
 from bisect import bisect_left
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
 from tempfile import SpooledTemporaryFile
@@ -22,7 +22,14 @@ from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, Protocol
 import lz4.frame
 import numpy as np
 
-from hybridlog.sources.base import TOO_MANY_CHANNELS, Damage, Source, cannot_open, regroup
+from hybridlog.sources.base import (
+    TOO_MANY_CHANNELS,
+    TOO_MANY_SILENT,
+    Damage,
+    Source,
+    cannot_open,
+    regroup,
+)
 from hybridlog.sources.rosbag1_records import (
     MAX_HEADER,
     OP_BAG_HEADER,
@@ -52,6 +59,8 @@ MAGIC = b"#ROSBAG V2.0\n"
 
 _UNDEFINED = -1
 _TOO_MANY = -2  # one more channel than a recording can have
+
+_ENTRY_BYTES = {OP_INDEX_DATA: 12, OP_CHUNK_INFO: 8}  # of the lists in index records
 
 _WINDOW = 4 << 20
 _SEARCH = 1 << 20
@@ -222,6 +231,7 @@ class Rosbag1Source(Source):
         self._fallback: dict[int, _Connection] = {}
         self._undefined: Counter[int] = Counter()
         self._undefined_at: int | None = None
+        self._refused: set[int] = set()  # connections that there is no room for
         self._too_many = 0
         self._chunk_positions: list[int] = []
         self._chunk_counts: list[int] = []
@@ -334,8 +344,23 @@ class Rosbag1Source(Source):
         return self._file.read(count)
 
     def _record(self, pos: int) -> _Record | None:
-        """The valid record at a position of the file, see `_record_in`."""
-        return _record_in(self._space, pos)
+        """The valid record at a position of the file, see `_record_in`.
+
+        Some recorders state a wrong length for the list in an index record. Its number of
+        entries then says where the next record starts.
+        """
+        record = _record_in(self._space, pos)
+        entry = None if record is None else _ENTRY_BYTES.get(record.header.op)
+        if record is None or entry is None:
+            return record
+        end = record.start + entry * record.header.u32(record.raw, b"count")
+        is_last = record.end == self.size_bytes
+        if record.end == end or (not is_last and self._starts_record(record.end)):
+            return record
+        return replace(record, end=end) if self._starts_record(end) else record
+
+    def _starts_record(self, pos: int) -> bool:
+        return _is_sound(self._space, 0, pos)
 
     def _pieces(self) -> Iterator[Batch]:
         """Walk the file record by record and chunk by chunk."""
@@ -366,6 +391,7 @@ class Rosbag1Source(Source):
                 0,
             )
         self._report_undefined()
+        self._add_silent()
 
     def _step(self) -> Iterator[Batch]:
         """Read one record, chunk or run of loose messages at `_pos` and advance it."""
@@ -409,8 +435,7 @@ class Rosbag1Source(Source):
             self._pos = place.end = self.size_bytes
             return
         place.reasons.append(f"bytes that are no record at byte {pos}")
-        self._pos = found
-        place.end = max(place.end, found)
+        self._pos = place.end = found
 
     def _search(self, space: _Space, pos: int) -> int | None:
         """First position at or behind `pos` that looks like a record."""
@@ -668,11 +693,20 @@ class Rosbag1Source(Source):
             return _UNDEFINED
         number = self._numbers.get(connection)
         if number is None and len(self.channels) >= MAX_CHANNELS:
+            self._refused.add(connection.conn)
             return _TOO_MANY
         if number is None:
             number = self._numbers[connection] = len(self.channels)
             self.channels.append(connection.channel())
         return number
+
+    def _add_silent(self) -> None:
+        """Add the channels of connections without messages."""
+        used = {connection.conn for connection in self._numbers} | self._refused
+        known = {**self._fallback, **self._meaning}
+        numbers = [self._number(known[conn]) for conn in known if conn not in used]
+        if left_out := numbers.count(_TOO_MANY):
+            self._report(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
 
     # Losses.
 

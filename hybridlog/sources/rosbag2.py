@@ -36,29 +36,35 @@ def read_metadata(folder: Path) -> BagMetadata | Damage | None:
         return Damage(path, 0, len(data), reason, 0)
 
 
-def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage]]:
+def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None], list[Damage]]:
     """Find the files that the metadata lists.
 
     Returns:
-        The existing files, in order, and the damage for missing ones.
+        The existing files, in order, with their number of messages as listed; and the damage
+        for missing ones.
 
     Raises:
         SourceError: None of them exists.
     """
-    files: list[Path] = []
+    files: dict[Path, int | None] = {}
     absent: list[str] = []
     for name in metadata.files:
         path = folder / name
-        # Some recorders list compressed files under their name before compression.
-        choices = (path, path.with_name(path.name + ".zstd"), path.with_suffix(""))
+        # Some recorders list compressed files under their name before compression, and early
+        # ones with the folder's name before it.
+        choices = [
+            choice
+            for each in dict.fromkeys((path, folder / path.name))
+            for choice in (each, each.with_name(f"{each.name}.zstd"), each.with_name(plain(each)))
+        ]
         try:
             found = next((choice for choice in choices if choice.is_file()), None)
         except OSError as error:
             raise cannot_open(path, error) from error
         if found is not None:
-            files.append(found)
-            continue
-        absent.append(name)
+            files.setdefault(found, metadata.counts.get(name))
+        else:
+            absent.append(name)
     if not files:
         listed = ", ".join(metadata.files[:5]) or "no file"
         raise SourceError(
@@ -66,6 +72,11 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage
             "beside it, or give the path of the file itself"
         )
     return files, _missing(folder, metadata, absent)
+
+
+def plain(path: Path) -> str:
+    """Name of a file before it was compressed."""
+    return path.name.removesuffix(".zstd")
 
 
 def _missing(folder: Path, metadata: BagMetadata, names: list[str]) -> list[Damage]:

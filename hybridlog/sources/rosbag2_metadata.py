@@ -24,16 +24,12 @@ _NO_FILES = {"", ".", ".."}
 _WANTED = frozenset(
     {
         "compression_mode",
-        "duration",
         "files",
         "message_count",
-        "nanoseconds",
-        "nanoseconds_since_epoch",
         "path",
         "relative_file_paths",
         "ros_distro",
         "rosbag2_bagfile_information",
-        "starting_time",
         "storage_identifier",
     }
 )
@@ -44,10 +40,9 @@ class BagMetadata:
     """The used part of a bag's metadata.
 
     Attributes:
-        files: Names of its files in order, without folders.
+        files: Paths of its files in order, below the bag's folder.
         counts: Number of messages of each file, if stated.
         message_count: Total number of messages, None if unknown.
-        time_range: Log time `[start, end)`, ns, None if unknown.
         packed_messages: Whether each payload is a zstd frame.
         ros_distro: Name of the ROS release, empty if unknown.
     """
@@ -55,7 +50,6 @@ class BagMetadata:
     files: list[str] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     message_count: int | None = None
-    time_range: tuple[int, int] | None = None
     packed_messages: bool = False
     ros_distro: str = ""
 
@@ -84,26 +78,15 @@ def parse_metadata(text: str) -> BagMetadata:
     if len(files) > MAX_FILES:
         raise YamlError(f"it lists more than {MAX_FILES} files")
     total = _count(bag.get("message_count"))
-    if len(files) == 1 and total is not None:
-        counts.setdefault(files[0], total)
     mode = bag.get("compression_mode")
     distro = bag.get("ros_distro")
     return BagMetadata(
         files=list(dict.fromkeys(name for name in files if name not in _NO_FILES)),
         counts=counts,
         message_count=total,
-        time_range=_time_range(bag, total),
         packed_messages=isinstance(mode, str) and mode.lower() == "message",
         ros_distro=distro if isinstance(distro, str) else "",
     )
-
-
-def _time_range(bag: Mapping[object, object], total: int | None) -> tuple[int, int] | None:
-    start = _count(_mapping(bag.get("starting_time")).get("nanoseconds_since_epoch"))
-    duration = _count(_mapping(bag.get("duration")).get("nanoseconds"))
-    if not total or start is None or duration is None or start + duration >= 2**63 - 1:
-        return None
-    return start, start + duration + 1
 
 
 def _mapping(value: object) -> Mapping[object, object]:
@@ -121,5 +104,7 @@ def _count(value: object) -> int | None:
 
 
 def _name(path: str) -> str:
-    """The last part of a path; early versions included the folder's name."""
-    return PureWindowsPath(path).name
+    """A path below the bag's folder; only the last part of any other path."""
+    parts = PureWindowsPath(path)  # splits at both kinds of slashes
+    is_below = not parts.anchor and ".." not in parts.parts
+    return "/".join(parts.parts) if is_below else parts.name

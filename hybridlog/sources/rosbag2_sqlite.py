@@ -208,7 +208,9 @@ class SqliteSource(Source):
         # Two queries: SQLite answers each from one end of the index.
         first = self._optional(f"SELECT min({log_time}) FROM messages")  # noqa: S608
         last = self._optional(f"SELECT max({log_time}) FROM messages")  # noqa: S608
-        if first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int):
+        if not (first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int)):
+            return
+        if first[0][0] >= 0:  # earlier ones are not read
             self.time_range = (first[0][0], last[0][0] + 1)
 
     def _indexes(self) -> list[str]:

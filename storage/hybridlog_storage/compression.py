@@ -8,7 +8,7 @@ compressed form; `Compressor` keeps to that, too.
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal, Protocol, cast
 
 import lz4.frame
 import zstandard
@@ -17,7 +17,7 @@ from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from typing import IO, BinaryIO
+    from typing import IO
 
     from hybridlog_storage.messages import Buffer
 
@@ -107,6 +107,16 @@ def is_implausible(uncompressed_size: int, size: int) -> bool:
     return uncompressed_size > MAX_FREE and uncompressed_size > size * MAX_RATIO
 
 
+class Readable(Protocol):
+    """An open file that is read by position."""
+
+    def seek(self, offset: int, /) -> int:
+        """Set the position of the next read."""
+
+    def read(self, size: int, /) -> bytes:
+        """The next bytes; fewer at the end."""
+
+
 class FilePart:
     """A part of a file that is read piece by piece.
 
@@ -116,7 +126,7 @@ class FilePart:
         size: Number of bytes, all of them in the file.
     """
 
-    def __init__(self, file: BinaryIO, start: int, size: int) -> None:
+    def __init__(self, file: Readable, start: int, size: int) -> None:
         self._file = file
         self._start = start
         self._size = size
@@ -128,6 +138,14 @@ class FilePart:
     def again(self) -> FilePart:
         """The same part from its start."""
         return FilePart(self._file, self._start, self._size)
+
+    def section(self, start: int, size: int) -> FilePart:
+        """Some of its bytes, as a part of the same file."""
+        return FilePart(self._file, self._start + start, size)
+
+    def through(self, file: Readable) -> FilePart:
+        """The same part, read through another handle of the file."""
+        return FilePart(file, self._start, self._size)
 
     def read(self, size: int = -1) -> bytes:
         """The next bytes: at most `size`, all without it; none at the end."""

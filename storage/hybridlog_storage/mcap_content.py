@@ -143,7 +143,9 @@ class ChunkContent(NamedTuple):
         channels: Channels defined inside, the last of each id.
         definitions: All of them in order, each with the first row that it applies to.
         invalid: int64, offset in the buffer of each omitted message record: too short, or
-            with a time beyond 2^63 - 1 ns.
+            with a log time beyond 2^63 - 1 ns.
+        unpublished: Number of messages whose publish time is beyond 2^63 - 1 ns; their log
+            time replaces it.
         damage: Definitions that could not be read; offsets are into the buffer.
         end: Byte of the buffer behind the last record.
         records: Number of all records.
@@ -154,6 +156,7 @@ class ChunkContent(NamedTuple):
     channels: dict[int, records.Channel]
     definitions: list[Definition]
     invalid: NDArray[np.int64]
+    unpublished: int
     damage: list[ScanDamage]
     end: int
     records: int
@@ -194,7 +197,7 @@ def parse_content(
     if not (torn or messages_only or loose) and walk.end != len(buffer):
         problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
         raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
-    batch, good = _batch(buffer, starts)
+    batch, good, unpublished = _batch(buffer, starts)
     # Rows count valid messages only.
     kept = None if good is None else np.concatenate(([0], np.cumsum(good)))
     definitions: list[Definition] = []
@@ -216,6 +219,7 @@ def parse_content(
         {d.record.id: d.record for d in definitions if isinstance(d.record, records.Channel)},
         definitions,
         starts[:0] if good is None else starts[~good],
+        unpublished,
         damage,
         walk.end,
         walk.records,
@@ -371,8 +375,10 @@ class _Walk:
         self.end, self.records = at, row + skipped
 
 
-def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_] | None]:
-    """The messages at `starts`, and a mask of the valid ones (None: all)."""
+def _batch(
+    buffer: Buffer, starts: NDArray[np.int64]
+) -> tuple[Batch, NDArray[np.bool_] | None, int]:
+    """The messages at `starts`, a mask of the valid ones (None: all), and `unpublished`."""
     size = len(buffer)
     good: NDArray[np.bool_] | None = None
     # With a last record shorter than a head, the gather below would read over the end.
@@ -386,27 +392,25 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
         heads = every[chosen]
     else:
         heads = np.empty(0, MESSAGE_HEAD)
-    wrong = (
-        (heads["length"] < _FIELDS)
-        | (heads["log_time"] >= _TIME_LIMIT)
-        | (heads["publish_time"] >= _TIME_LIMIT)
-    )
+    wrong = (heads["length"] < _FIELDS) | (heads["log_time"] >= _TIME_LIMIT)
     if wrong.any():
         heads, chosen = heads[~wrong], chosen[~wrong]
         if good is None:
             good = ~wrong
         else:
             good[np.flatnonzero(good)[wrong]] = False
+    late = heads["publish_time"] >= _TIME_LIMIT
+    publish_time = np.where(late, heads["log_time"], heads["publish_time"]).astype(np.int64)
     batch = Batch(
         buffer,
         chosen + _PAYLOAD,
         heads["length"].astype(np.int64) - _FIELDS,
         heads["channel"].astype(np.int32),
         heads["log_time"].astype(np.int64),
-        heads["publish_time"].astype(np.int64),
+        publish_time,
         heads["sequence"].astype(np.uint32),
     )
-    return batch, good
+    return batch, good, int(late.sum())
 
 
 class _Fields(ReadDataStream):

@@ -18,6 +18,7 @@ from mcap import records
 from mcap.opcode import Opcode
 from mcap.summary import Summary
 
+from hybridlog_storage.attachments import MAX_HEAD, Attachment, parse_attachment
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import (
     MAX_UNCOMPRESSED,
@@ -74,6 +75,7 @@ _DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
 _WINDOW = 1 << 20
 _MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
+_ANOTHER = MAGIC + bytes([Opcode.HEADER])  # the beginning of another file
 _AT_ONCE = 64 << 20  # content of a chunk that is decompressed at once
 
 _DATA_OPCODES = frozenset(
@@ -222,7 +224,7 @@ class End(NamedTuple):
     clean: bool
 
 
-Item: TypeAlias = Record | ScannedChunk | PrivateRecord | Loose | ScanDamage | End
+Item: TypeAlias = Record | Attachment | ScannedChunk | PrivateRecord | Loose | ScanDamage | End
 """An item of `scan`."""
 
 
@@ -336,7 +338,7 @@ class _Window:
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self.size = size
-        self._file = file
+        self.file = file
         self._start = 0
         self._data = memoryview(b"")
 
@@ -345,9 +347,9 @@ class _Window:
         length = min(length, self.size - offset)
         begin = offset - self._start
         if begin < 0 or begin + length > len(self._data):
-            self._file.seek(offset)
+            self.file.seek(offset)
             wanted = min(max(length, _WINDOW), self.size - offset)
-            self._data = memoryview(self._file.read(wanted))
+            self._data = memoryview(self.file.read(wanted))
             self._start, begin = offset, 0
             if len(self._data) < wanted:  # the file was truncated meanwhile
                 self.size = offset + len(self._data)
@@ -361,7 +363,7 @@ class _Window:
     def part(self, offset: int, length: int) -> FilePart:
         """A part that is read later, piece by piece; in memory if it is small."""
         if length > _WINDOW:
-            return FilePart(self._file, offset, length)
+            return FilePart(self.file, offset, length)
         data = self.at(offset, length)
         return FilePart(BytesIO(data), 0, len(data))
 
@@ -372,8 +374,8 @@ class _Window:
         begin = offset - self._start
         if begin >= 0 and begin + length <= len(self._data):
             return bytes(self._data[begin : begin + length])
-        self._file.seek(offset)
-        return self._file.read(min(length, self.size - offset))
+        self.file.seek(offset)
+        return self.file.read(min(length, self.size - offset))
 
 
 class _ChunkHead(NamedTuple):
@@ -509,7 +511,9 @@ class _Scanner:
         footer = False
         while self._at < self._window.size:
             if footer and self._window.at(self._at, len(MAGIC)) == MAGIC:
-                break
+                if self._window.peek(self._at + len(MAGIC), len(_ANOTHER)) != _ANOTHER:
+                    break
+                self._begin_another(self._at + len(MAGIC))
             before = self._at
             for offset, item in self._step():
                 footer = isinstance(item, records.Footer)
@@ -521,12 +525,28 @@ class _Scanner:
             yield self._at, ScanDamage(self._at, rest, "bytes follow the end of the log", 0)
         yield self._window.size, End(self._window.size, clean)
 
+    def _begin_another(self, at: int) -> None:
+        """Go on with another file whose bytes follow those of this one.
+
+        Its summary counts from its own beginning, so positions are not known from it.
+        """
+        self._at = self._behind = at + len(MAGIC)
+        self._places = _Places(self._window, None)
+        self._summary_start = self._crc = None
+        self._chunked = False
+        self._in_data = True
+
     def _step(self) -> Iterator[tuple[int, Item]]:
         """Read one record, one run of messages, or one place of damage."""
         at = self._at
         head = self._window.peek(at, _HEAD)
         if len(head) < _HEAD:
             yield from self._torn(at, "the file ends in the middle of a record")
+            return
+        if head == _ANOTHER:
+            reason = "another log begins before the end of this one"
+            yield at, ScanDamage(at, 0, reason, 0)
+            self._begin_another(at)
             return
         opcode, length = RECORD_HEAD.unpack(head)
         if opcode in _DEFINITIONS and self._in_data:
@@ -689,7 +709,10 @@ class _Scanner:
             return
         self._at = end
         known = opcode <= _LAST_KNOWN
-        if length > (MAX_PAYLOAD if opcode == Opcode.ATTACHMENT else _MAX_PLAIN):
+        if opcode == Opcode.ATTACHMENT:
+            yield from self._attachment(at, end)
+            return
+        if length > _MAX_PLAIN:
             if known:
                 yield at, self._too_large(at, end, opcode)
             return
@@ -698,6 +721,17 @@ class _Scanner:
             yield at, PrivateRecord(opcode, at, content)
         elif known:
             yield from self._known(at, opcode, end)
+
+    def _attachment(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
+        start = at + _HEAD
+        part = FilePart(self._window.file, start, end - start)
+        try:
+            found, used = parse_attachment(self._window.at(start, min(end - start, MAX_HEAD)), part)
+        except SegmentError as error:
+            yield at, ScanDamage(at, end - at, str(error), 0)
+            return
+        self._behind = start + used
+        yield at, found
 
     def _known(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         try:
@@ -750,7 +784,8 @@ class _Scanner:
 
     def _too_large(self, at: int, end: int, opcode: int) -> ScanDamage:
         messages = None if opcode == Opcode.CHUNK else int(opcode == Opcode.MESSAGE)
-        limit = self._limit if opcode == Opcode.CHUNK else MAX_PAYLOAD
+        limits: dict[int, int] = {Opcode.CHUNK: self._limit, Opcode.MESSAGE: MAX_PAYLOAD}
+        limit = limits.get(opcode, _MAX_PLAIN)
         reason = f"a record of {end - at} bytes is above the limit of {limit}"
         return ScanDamage(at, end - at, reason, messages, opcode=opcode)
 

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
-from mcap.records import Attachment, DataEnd, Header, MessageIndex, Metadata
 from mcap.records import Channel as ChannelRecord
+from mcap.records import DataEnd, Header, MessageIndex, Metadata
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage import durability, files
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import parts_of
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -205,10 +206,12 @@ class _Rebuilder:
         elif isinstance(item, Metadata):
             self._take_metadata(item)
             self.segment.note_metadata(item.name, offset, length)
-        elif isinstance(item, Attachment):
+        self._cover(offset)
+        if isinstance(item, Attachment):
             self.is_empty = False
             self.segment.note_attachment(item, offset, length)
-        self._cover(offset)
+            self.segment.table.stretch(length, _crc_of(self._fd, offset, length))
+            return
         record = os.pread(self._fd, length, offset)
         self.segment.table.other(record, alone=isinstance(item, Metadata))
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     DataEnd,
     Footer,
@@ -25,6 +24,7 @@ from mcap.records import (
 
 from hybridlog_storage import durability, files
 from hybridlog_storage.append_file import AppendFile
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.chunk_table import ChunkTable, TableBuilder
@@ -244,26 +244,20 @@ class SegmentFile:
         """Note a metadata record that is in the file already."""
         self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
 
-    def add_attachment(self, record: Attachment) -> None:
-        """Append an attachment."""
-        data = record_bytes(record)
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment, piece by piece."""
         offset = self.position
-        self._write([data])
-        self.note_attachment(record, offset, len(data))
+        crc = 0
+        for piece in attachment.record():
+            self._append([piece])
+            crc = crc32(piece, crc)
+        length = self.position - offset
+        self.table.stretch(length, crc)
+        self.note_attachment(attachment, offset, length)
 
-    def note_attachment(self, record: Attachment, offset: int, length: int) -> None:
+    def note_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
         """Note an attachment that is in the file already."""
-        self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=offset,
-                length=length,
-                create_time=record.create_time,
-                log_time=record.log_time,
-                data_size=len(record.data),
-                name=record.name,
-                media_type=record.media_type,
-            )
-        )
+        self._attachment_indexes.append(attachment.index(offset, length))
 
     def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
         """Append chunks with their message indexes and arrival numbers in one write.

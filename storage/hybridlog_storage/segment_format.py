@@ -44,6 +44,8 @@ PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
 FORMAT_VERSION: Final = 2
 
+OUR_NAMES: Final = "hybridlog."
+"""Beginning of the names of the store's own metadata records and channel metadata."""
 RECORDING_METADATA: Final = "hybridlog.recording"
 END_METADATA: Final = "hybridlog.end"
 LOSSES_METADATA: Final = "hybridlog.losses"

@@ -17,17 +17,18 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Metadata, MetadataIndex, Statistics
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage import files
 from hybridlog_storage.append_file import BLOCK, DIRECT
+from hybridlog_storage.attachments import MAX_HEAD, Attachment, FileHandle, parse_attachment
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.chunk_table import ChunkTable
-from hybridlog_storage.compression import decompress
+from hybridlog_storage.compression import FilePart, decompress
 from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content, read_record
@@ -40,6 +41,7 @@ from hybridlog_storage.segment_format import (
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
+    OUR_NAMES,
     RECORDING_METADATA,
     arrivals_of,
     channel_of,
@@ -103,6 +105,8 @@ class SegmentSummary:
         chunks: Chunks in file order.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
+        attachments: Attachments of the source, in file order.
+        metadata: Metadata records of the source, in file order.
         table: The chunk table.
         digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
@@ -115,6 +119,8 @@ class SegmentSummary:
     chunks: list[ChunkPlace]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
+    attachments: list[AttachmentIndex]
+    metadata: list[MetadataIndex]
     table: ChunkTable
     digest: str
     size: int
@@ -126,6 +132,7 @@ class _Records:
 
     schemas: dict[int, SchemaRecord]
     channels: dict[int, ChannelRecord]
+    attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
     statistics: Statistics | None
     table: Buffer | None
@@ -280,11 +287,11 @@ class SegmentReader:
         losses: list[dict[str, Any]] = []
         for index in records.metadata:
             if index.name in {RECORDING_METADATA, END_METADATA}:
-                found[index.name] = json_of(self._checked_metadata(table, index))
+                found[index.name] = json_of(self.metadata(table, index))
                 if index.name == RECORDING_METADATA:
                     check_format(found[index.name], self.path)
             elif index.name == LOSSES_METADATA:
-                losses += loss_rows(json_of(self._checked_metadata(table, index)))
+                losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         totals = table.by_channel()
@@ -302,25 +309,54 @@ class SegmentReader:
             chunks=places_of(table),
             counts=counts,
             losses=losses,
+            attachments=records.attachments,
+            metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
             table=table,
             digest=digest,
             size=self.size,
         )
 
-    def _checked_metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
-        """A metadata record, after checking the stretch that holds it."""
-        stretch = table.stretch(index.offset, index.length)
-        if stretch is None:
-            raise _NoSummaryError(f"no metadata record lies at byte {index.offset}")
-        start, length, crc = stretch
+    def metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
+        """A metadata record, after checking the stretch that holds it.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        what = f"metadata record {index.name!r}"
+        start, length = self._check_stretch(table, index, what)
         data = self.read(start, length)
-        if crc32(data) != crc:
-            raise SegmentError(
-                f"{self.path}: bytes {start} to {start + length} are damaged, and with them the "
-                f"metadata record {index.name!r} at byte {index.offset}. Restore the file."
-            )
         at = index.offset - start
         return _metadata(data[at : at + index.length], index.offset, self.path)
+
+    def attachment(self, table: ChunkTable, index: AttachmentIndex) -> Attachment:
+        """An attachment, after checking all its bytes; they are read again later.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        self._check_stretch(table, index, f"attachment {index.name!r}")
+        start, size = index.offset + RECORD_HEAD.size, index.length - RECORD_HEAD.size
+        head = self.read(start, max(min(size, MAX_HEAD), 0))
+        part = FilePart(FileHandle(self._fd), start, size)
+        found, _ = parse_attachment(head, part, check_crc=False)
+        if found.index(index.offset, index.length) != index:
+            raise SegmentError(f"{self.path}: another attachment is at byte {index.offset}.")
+        return found
+
+    def _check_stretch(
+        self, table: ChunkTable, index: MetadataIndex | AttachmentIndex, what: str
+    ) -> tuple[int, int]:
+        """Start and length of the stretch that holds a record, after checking it."""
+        stretch = table.stretch(index.offset, index.length)
+        if stretch is None:
+            raise _NoSummaryError(f"no {what} lies at byte {index.offset}")
+        start, length, crc = stretch
+        if self.checksum(start, length) != crc:
+            raise SegmentError(
+                f"{self.path}: bytes {start} to {start + length} are damaged, and with them the "
+                f"{what} at byte {index.offset}. Restore the file."
+            )
+        return start, length
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """Read, decompress and check one chunk.
@@ -451,7 +487,7 @@ class _NoSummaryError(SegmentError):
 
 def _records(summary: memoryview) -> _Records:
     """Parse a checked summary."""
-    found = _Records({}, {}, [], None, None)
+    found = _Records({}, {}, [], [], None, None)
     at = 0
     while at < len(summary):
         if at + RECORD_HEAD.size > len(summary):
@@ -474,6 +510,8 @@ def _records(summary: memoryview) -> _Records:
             found.schemas[record.id] = record
         elif isinstance(record, ChannelRecord):
             found.channels[record.id] = record
+        elif isinstance(record, AttachmentIndex):
+            found.attachments.append(record)
         elif isinstance(record, MetadataIndex):
             found.metadata.append(record)
         elif isinstance(record, Statistics):
@@ -481,7 +519,15 @@ def _records(summary: memoryview) -> _Records:
     return found
 
 
-_WANTED = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA_INDEX, Opcode.STATISTICS})
+_WANTED = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+    }
+)
 
 
 def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:

@@ -20,8 +20,9 @@ from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
-from mcap.records import Attachment, Metadata
+from mcap.records import Metadata
 
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
@@ -272,6 +273,11 @@ class RecordingWriter:
         known = self._known
         return len({known[c].cluster if c in known else c for c in channels})
 
+    def declare(self, channel: Channel) -> None:
+        """Store a channel even if it has no message."""
+        if channel not in self._known:
+            self._meet(channel, 0)
+
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Store an attachment or a metadata record of the source."""
         self._storing.append(self._disk.submit(self._add, record))
@@ -299,6 +305,7 @@ class RecordingWriter:
         """
         try:
             self.flush()
+            self._disk.submit(self._define_rest).result()
             if end is not None:
                 self.add_extra(end)
                 self._drain(limit=0)
@@ -481,9 +488,7 @@ class RecordingWriter:
         first = self._packed[0].result()
         for channel_id in first.indexes:
             if channel_id not in segment.channels:
-                channel = self.channels[channel_id]
-                schema = channel.schema
-                segment.define(channel_id, self._schema_ids[schema] if schema else 0, channel)
+                self._define(segment, channel_id)
         chunks, size = [first], len(first.data)
         while size < _WRITTEN_AT_ONCE and len(chunks) < len(self._packed):
             following = self._packed[len(chunks)]
@@ -500,8 +505,21 @@ class RecordingWriter:
         segment = self._open_segment()
         if isinstance(record, Metadata):
             segment.add_metadata(record)
-        else:
-            segment.add_attachment(record)
+            return
+        segment.add_attachment(record)
+        if segment.position >= self.settings.segment_size:
+            self._seal()
+
+    def _define_rest(self) -> None:
+        """Define the channels without messages in the last segment."""
+        for channel_id in self.channels:
+            if not self.written[channel_id]:
+                self._define(self._open_segment(), channel_id)
+
+    def _define(self, segment: SegmentFile, channel_id: int) -> None:
+        channel = self.channels[channel_id]
+        schema = channel.schema
+        segment.define(channel_id, self._schema_ids[schema] if schema else 0, channel)
 
     def _write(self) -> None:
         segment = self._open_segment()

@@ -382,7 +382,8 @@ def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
     assert "complete" not in answer.err
     info = run("info", store=tmp_path / "s").out
     assert "coverage   complete, although its source was damaged in 1 place" in info
-    assert "0 messages lost, source damaged: open.mcap" in info
+    assert "source damaged: open.mcap" in info
+    assert "messages lost" not in info
 
 
 def test_topics_that_map_to_one_name(store: Path) -> None:

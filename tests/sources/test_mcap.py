@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Message, Metadata, Schema
+from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 import hybridlog as hl
 from hybridlog.sources.base import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog.sources.mcap import McapSource
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap_scan import MAGIC, ScannedChunk, scan
 from tests.data import DATA, needs_data

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import bz2
+import re
 import struct
 import tempfile
 import tracemalloc
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame
@@ -425,6 +427,72 @@ def test_headers_in_any_order_and_with_more_fields() -> None:
     assert values(found) == [bytes([time]) for time in range(40)] + [b"+"] * 30
     assert sorted(time for time, _ in found[("/a", "")]) == list(range(70))
     assert damage == []
+
+
+def with_index_lengths(data: bytes, change: Callable[[int, int], int]) -> bytes:
+    """A bag whose index records state other lengths: `change(length, number)`."""
+    out = bytearray(data)
+    at, number = 13, 0
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        place = at + 4 + size
+        (length,) = struct.unpack_from("<I", data, place)
+        if re.search(rb"op=[\x04\x06]", data[at + 4 : place]):
+            struct.pack_into("<I", out, place, max(change(length, number), 0))
+            number += 1
+        at = place + 4 + length
+    return bytes(out)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda length, _: length + 1,
+        lambda length, _: length - 1,
+        lambda length, _: length * 20 // 12,
+        lambda length, number: length + 7 * (number % 3) - 5 * (number % 2),
+        lambda _length, _: 0,
+        lambda _length, _: 2**32 - 1,
+    ],
+)
+def test_index_records_that_state_a_wrong_length(
+    tmp_path: Path, compression: str, change: Callable[[int, int], int]
+) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=2000, messages=400)
+    path.write_bytes(with_index_lengths(path.read_bytes(), change))
+    found, damage = read(path)
+    assert found == expected
+    assert damage == []
+    with Rosbag1Source(path) as source:
+        assert source.message_count == 400
+        assert source.time_range == (10**18, 10**18 + 399 * 1_000_003 + 1)
+
+
+def test_a_gap_between_chunks_does_not_count_the_messages_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, "none", chunk=2000, messages=400)
+    data = path.read_bytes()
+    # Neither the length nor the count of the first index record is right.
+    at = data.index(b"op=\x04")
+    start = data.index(b"count=", at - 60)
+    broken = bytearray(data)
+    struct.pack_into("<I", broken, start + 6, 5000)
+    size = data.index(struct.pack("<I", 12 * struct.unpack_from("<I", data, start + 6)[0]), start)
+    struct.pack_into("<I", broken, size, 77)
+    path.write_bytes(broken)
+    found, damage = read(path)
+    assert found == expected
+    assert [each.messages_lost for each in damage] == [0]
+
+
+def test_connections_without_messages_are_channels(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    make(path, "none", chunk=2000, messages=2)  # of three topics
+    with Rosbag1Source(path) as source:
+        assert total(contents(source)) == 2
+        assert sorted(c.topic for c in source.channels) == ["/topic_0", "/topic_1", "/topic_2"]
 
 
 def test_undefined_connection_is_counted() -> None:

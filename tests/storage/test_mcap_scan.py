@@ -30,6 +30,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import read_record
 from hybridlog_storage.mcap_scan import (
@@ -95,7 +96,11 @@ def as_json(record: Any) -> dict[str, Any]:
             return {str(k): v if isinstance(v, str) else str(v) for k, v in x.items()}
         return x if isinstance(x, str) else str(x)
 
-    fields = sorted([name, value(getattr(record, name))] for name in vars(record))
+    names = record.__slots__ if isinstance(record, Attachment) else vars(record)
+    values = {name: getattr(record, name) for name in names}
+    if isinstance(record, Attachment):
+        values["data"] = b"".join(record.pieces())
+    fields = sorted([name, value(each)] for name, each in values.items())
     return {"type": type(record).__name__, "fields": fields}
 
 
@@ -267,9 +272,12 @@ def test_times_past_int64_are_left_out_and_named() -> None:
     later = Message(1, 5, b"later", 2**64 - 1, 3)
     channel = Channel(1, "t", "e", {}, 0)
     content = parse_content(content_of(late, good, channel, later, good))
-    assert [bytes(content.batch.payload(i)) for i in range(2)] == [b"good", b"good"]
-    size = len(content_of(late))
-    assert content.invalid.tolist() == [0, 2 * size + len(content_of(channel))]
+    payloads = [bytes(content.batch.payload(i)) for i in range(len(content.batch))]
+    assert payloads == [b"good", b"later", b"good"]
+    # The log time stands for a publish time that is none.
+    assert content.batch.publish_time.tolist() == [0, 5, 0]
+    assert content.unpublished == 1
+    assert content.invalid.tolist() == [0]
     assert [d.row for d in content.definitions] == [1]
 
 

@@ -22,14 +22,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Attachment, ChunkIndex, Metadata
+from mcap.records import ChunkIndex, Metadata
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage import segment_writer
 from hybridlog_storage.append_file import BLOCK, AppendFile
+from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.compression import Compressor
+from hybridlog_storage.compression import Compressor, FilePart
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
@@ -951,7 +952,8 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     )
     rows = [(2 * (n % 2), bytes([n]) * (20 + n), 50 * n % 400, 50 * n, n) for n in range(20)]
     writer.append(batch_of(rows[:12]), CHANNELS)
-    writer.add_extra(Attachment(1, 2, "a.txt", "text/plain", b"attached"))
+    content = FilePart(io.BytesIO(b"attached"), 0, 8)
+    writer.add_extra(Attachment(2, 1, "a.txt", "text/plain", content))
     writer.append(batch_of([(1, bytes(1500), 77, 78, 1)]), CHANNELS)
     writer.add_extra(Metadata("source", {"k": "v"}))
     writer.append(batch_of(rows[12:]), CHANNELS)
