@@ -205,12 +205,12 @@ def _common(arrays: Sequence[Array], *, by_type: bool) -> Any:
     if all(array.type == first for array in arrays):
         return first
     kinds = [array.type for array in arrays]
-    summaries = [array for array in arrays if _is_summary(array.type)]
-    if summaries and all(_is_summary(kind) or _is_array(kind) for kind in kinds):
+    summaries = [array for array in arrays if is_summary(array.type)]
+    if summaries and all(is_summary(kind) or _is_array(kind) for kind in kinds):
         if len(summaries) == len(arrays):
             return _common_struct(arrays, by_type=by_type)
         return _common(
-            [array if _is_summary(array.type) else _summarised(array) for array in arrays],
+            [array if is_summary(array.type) else summary(array) for array in arrays],
             by_type=by_type,
         )
     if all(map(pa.types.is_struct, kinds)):
@@ -253,8 +253,8 @@ def _as(array: Array, kind: Any) -> Array:
         return array
     if pa.types.is_null(array.type):
         return pa.nulls(len(array), kind)
-    if _is_summary(kind) and _is_array(array.type):
-        return _as(_summarised(array), kind)
+    if is_summary(kind) and _is_array(array.type):
+        return _as(summary(array), kind)
     if pa.types.is_struct(kind) and pa.types.is_struct(array.type):
         names = [field.name for field in _fields(array.type)]
         columns = [
@@ -269,7 +269,15 @@ def _as(array: Array, kind: Any) -> Array:
     return converted(array, kind)
 
 
-def _summarised(array: Array) -> Array:
+def summary(array: Array) -> Array:
+    """Each array as the summary that tables and the index have of a long one.
+
+    Args:
+        array: Lists or bytes.
+
+    Returns:
+        `{n, min, max, mean}` of the finite numbers; `{n}` of other elements and of bytes.
+    """
     return _summary(array) if _is_list(array.type) else _bytes_summary(array)
 
 
@@ -277,7 +285,8 @@ def _fields(kind: Any) -> list[Any]:
     return [kind.field(number) for number in range(kind.num_fields)]
 
 
-def _is_summary(kind: Any) -> bool:
+def is_summary(kind: Any) -> bool:
+    """True for the type of a summary."""
     if not pa.types.is_struct(kind):
         return False
     return tuple(field.name for field in _fields(kind)) in {_N, _SUMMARY}

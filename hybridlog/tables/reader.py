@@ -102,7 +102,7 @@ class TableRows:
 _SIDES: Final[tuple[Any, Any]] = ("left", "right")
 
 
-class _Part(NamedTuple):
+class TablePart(NamedTuple):
     """Rows of one topic in a row group, in order.
 
     Attributes:
@@ -152,7 +152,7 @@ class TopicTable:
         files: The files with its rows.
     """
 
-    def __init__(self, topic: str, parts: Sequence[_Part], cache: _Cache) -> None:
+    def __init__(self, topic: str, parts: Sequence[TablePart], cache: _Cache) -> None:
         self.topic = topic
         self.rows = sum(part.rows for part in parts)
         self.files = list({part.file.number: part.file for part in parts}.values())
@@ -225,7 +225,7 @@ class TopicTable:
 
     def _read_run(
         self,
-        run: Sequence[_Part],
+        run: Sequence[TablePart],
         paths: Collection[str] | None,
         own: Collection[str],
         spans: Sequence[Span] | None,
@@ -250,12 +250,37 @@ class TopicTable:
                 yield rows
 
     def _read(
-        self, part: _Part, paths: Collection[str] | None, own: Collection[str], kind: Any
+        self, part: TablePart, paths: Collection[str] | None, own: Collection[str], kind: Any
     ) -> TableRows:
-        wanted = {"t", "seq", *own}
+        ours, records = self.read(part, paths, {"t", "seq", *own})
+        t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
+        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
+
+    @property
+    def parts(self) -> list[TablePart]:
+        """Its row groups, by the log time of their first rows."""
+        return sorted((part for run in self._runs for part in run), key=lambda part: part.first)
+
+    def read(
+        self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
+    ) -> tuple[dict[str, Any], Any]:
+        """Columns of one row group.
+
+        Args:
+            part: One of `parts`.
+            paths: As for `fields`.
+            own: Columns of the table itself.
+
+        Returns:
+            The table's own columns by name, and the fields as for `TableRows.records`, in
+            the types of the file.
+
+        Raises:
+            StoreError: the data read is damaged.
+        """
         leaves = self._leaves[part.file.number]
         by_top: dict[str, list[int]] = {}
-        for number in self._chosen(part.file, paths, wanted):
+        for number in self._chosen(part.file, paths, own):
             by_top.setdefault(leaves[number].top, []).append(number)
         columns = {
             top: self._cache.get(part.file, part.group, top, tuple(numbers)).slice(
@@ -263,11 +288,9 @@ class TopicTable:
             )
             for top, numbers in by_top.items()
         }
-        ours = {name: columns.pop(name) for name in wanted if name in columns}
-        t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
+        ours = {name: columns.pop(name) for name in own if name in columns}
         named = [part.file.schema.field(top) for top in columns]
-        records = _records(list(columns.values()), named, part.rows)
-        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
+        return ours, _records(list(columns.values()), named, part.rows)
 
     def _chosen(
         self, file: ParquetFileReader, paths: Collection[str] | None, own: Collection[str]
@@ -461,6 +484,38 @@ class Tables:
             raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
         return table
 
+    def of_sealed(
+        self, recording: RecordingEntry, topic: str, messages: Mapping[int, int]
+    ) -> tuple[TopicTable, frozenset[int]] | None:
+        """The table of some sealed segments of a recording that is being written.
+
+        Args:
+            recording: The recording's entry in the catalog.
+            topic: Full name.
+            messages: Number of messages of the topic by sealed segment.
+
+        Returns:
+            The table, and the segments of which it has all rows; None without a valid one.
+        """
+        schemas = {
+            table_schema(c.message_encoding, c.schema, c.metadata)
+            for c in self._channels_of(recording, topic)
+        }
+        if len(schemas) != 1:
+            return None
+        folder = recording_folder(self._root, recording.id)
+        try:
+            found = list(self._own_parts(folder / topic_folder(topic)))
+            for part in found:
+                _confirm(part.file, recording, topic, *schemas)
+        except (FileNotFoundError, StoreError):
+            return None
+        segments = frozenset(int(number) for part in found for number in part.file.about.segments)
+        rows = sum(part.rows for part in found)
+        if not found or rows != sum(messages.get(number, 0) for number in segments):
+            return None  # its files are just getting their names
+        return TopicTable(topic, found, self._cache), segments
+
     def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
         """The channels of a topic; those of the recording asked about last are at hand."""
         found = self._channels
@@ -471,7 +526,7 @@ class Tables:
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])
 
-    def _own_parts(self, folder: Path) -> Iterator[_Part]:
+    def _own_parts(self, folder: Path) -> Iterator[TablePart]:
         """Row groups of the files of one topic."""
         try:
             found = files.names(folder, depth=IN_TOPIC - 1)
@@ -489,9 +544,9 @@ class Tables:
                 raise StoreError(f"The table {folder / name} has the name of another one.")
             for group, (rows, *keys) in enumerate(file.about.bounds):
                 first, last = (keys[0], keys[1]), (keys[2], keys[3])
-                yield _Part(file, group, 0, rows, first, last)
+                yield TablePart(file, group, 0, rows, first, last)
 
-    def _small_parts(self, path: Path, topic: str) -> Iterator[_Part]:
+    def _small_parts(self, path: Path, topic: str) -> Iterator[TablePart]:
         """Rows of a topic in a file of several topics."""
         file, first_rows = self._small_file(path)
         if topic not in first_rows:
@@ -501,7 +556,7 @@ class Tables:
         for group, (count, *_) in enumerate(file.about.bounds):
             low, high = max(begin, before), min(end, before + count)
             if low < high:
-                yield _Part(file, group, low - before, high - low, _FIRST, _LAST)
+                yield TablePart(file, group, low - before, high - low, _FIRST, _LAST)
             before += count
 
     def _small_file(self, path: Path) -> _SmallFile:
@@ -532,12 +587,12 @@ def _confirm(file: ParquetFileReader, recording: RecordingEntry, topic: str, sch
         raise StoreError(f"Segments of the table {file.path} are missing.")
 
 
-def _runs(parts: Sequence[_Part]) -> Iterator[list[_Part]]:
+def _runs(parts: Sequence[TablePart]) -> Iterator[list[TablePart]]:
     """Row groups in as few ordered sequences as possible."""
     if all(part.first == _FIRST for part in parts):
         yield list(parts)  # of a file in which the topic's rows are in order
         return
-    runs: list[list[_Part]] = []
+    runs: list[list[TablePart]] = []
     for part in sorted(parts, key=lambda part: part.first):
         for run in runs:
             if run[-1].last < part.first:

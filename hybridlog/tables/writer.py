@@ -15,11 +15,10 @@ import logging
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -30,7 +29,6 @@ from hybridlog.tables.layout import (
     IN_TOPIC,
     OWN_FILE_ROWS,
     SMALL,
-    STATES,
     SUFFIX,
     TOPIC_COLUMN,
     About,
@@ -41,9 +39,10 @@ from hybridlog.tables.layout import (
     topic_file,
     topic_folder,
 )
+from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage import files
 from hybridlog_storage.buffers import buffers
-from hybridlog_storage.messages import REDUCED
+from hybridlog_storage.messages import REDUCED as REDUCED_ENCODING
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,89 +62,9 @@ _ENOUGH = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
 _ROWS = 1 << 18  # messages collected
 _PENDING = 48 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
-_ROW = 64  # bytes of a row in addition to its fields
 _RESERVE = 256 << 20  # bytes of the disk reserved for segments
 _OPEN_FILES = 128  # maximum number of unfinished files
-_WHOLE, _REDUCED, _UNREADABLE = 0, 1, 2  # indexes in `STATES`
 _log = logging.getLogger(__name__)
-
-
-class _Messages(NamedTuple):
-    """Messages by columns: location of their payloads in memory, and values for the table.
-
-    Attributes:
-        at: int64[n], start of each payload in its current buffer.
-        length: int64[n], bytes of each payload.
-        channel: int32[n], ids of channels.
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        publish_time: int64[n], ns.
-        chunk: int32[n], number of the chunk in its segment.
-        offset: int64[n], start of each payload in the chunk.
-    """
-
-    at: NDArray[np.int64]
-    length: NDArray[np.int64]
-    channel: NDArray[np.int32]
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-    publish_time: NDArray[np.int64]
-    chunk: NDArray[np.int32]
-    offset: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, chunk: StoredChunk, begin: int) -> _Messages:
-        """Messages of a chunk, whose payloads are copied to a buffer `-begin` bytes further on."""
-        batch = chunk.batch
-        number = np.full(len(batch), chunk.number, np.int32)
-        return cls(
-            batch.offset - begin,
-            batch.length.copy(),
-            batch.channel.copy(),
-            batch.log_time.copy(),
-            chunk.seq.copy(),
-            batch.publish_time.copy(),
-            number,
-            batch.offset.copy(),
-        )
-
-    @classmethod
-    def joined(cls, parts: Sequence[_Messages]) -> _Messages:
-        """Several batches, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-    def take(self, rows: NDArray[np.intp]) -> _Messages:
-        return _Messages._make(column[rows] for column in self)
-
-
-@dataclass(slots=True)
-class _Piece:
-    """Rows of a topic in one segment, in the order of the file.
-
-    Attributes:
-        segment: Number of the segment.
-        messages: The messages.
-        fields: Their columns, a struct each; None without columns.
-        errors: Unreadable rows, each with the reason.
-        state: Index in `STATES` of the state of all other rows.
-    """
-
-    segment: int
-    messages: _Messages
-    fields: Any
-    errors: list[tuple[NDArray[np.intp], str]] = field(default_factory=list)
-    state: int = _WHOLE
-
-    @property
-    def rows(self) -> int:
-        return len(self.messages.seq)
-
-    @property
-    def size(self) -> int:
-        """Bytes in memory."""
-        return self.rows * _ROW + (0 if self.fields is None else int(self.fields.nbytes))
 
 
 class _Topic:
@@ -165,7 +84,7 @@ class _Topic:
         self.shape: FieldShape = FieldShape()
         self.is_wanted = True
         self.rows = 0
-        self.pieces: list[_Piece] = []
+        self.pieces: list[Piece] = []
         """Rows in memory."""
         self.size = 0
         """Bytes of the rows in memory."""
@@ -175,12 +94,12 @@ class _Topic:
         """Number of finished files, by the segments in their names."""
         self.has_failed = False
 
-    def add(self, piece: _Piece) -> None:
+    def add(self, piece: Piece) -> None:
         self.pieces.append(piece)
         self.rows += piece.rows
         self.size += piece.size
 
-    def take(self, segments: Collection[int]) -> list[_Piece]:
+    def take(self, segments: Collection[int]) -> list[Piece]:
         """Remove and return the rows in memory that belong to some segments."""
         found = [piece for piece in self.pieces if piece.segment in segments]
         self.pieces = [piece for piece in self.pieces if piece.segment not in segments]
@@ -213,7 +132,7 @@ class _File:
         self._writer: ParquetFileWriter | None = None
         self._schema: Any = None
 
-    def write(self, topic: str, pieces: list[_Piece]) -> None:
+    def write(self, topic: str, pieces: list[Piece]) -> None:
         """Write rows of a topic, in order of log time and arrival, as row groups.
 
         Raises:
@@ -229,7 +148,7 @@ class _File:
             self.bounds.append((end - begin, *first, *last))
         self._count(topic, pieces)
 
-    def write_together(self, topics: Mapping[str, list[_Piece]]) -> None:
+    def write_together(self, topics: Mapping[str, list[Piece]]) -> None:
         """Write the rows of several topics, one topic after the other.
 
         Raises:
@@ -252,12 +171,12 @@ class _File:
         for name, pieces in topics.items():
             self._count(name, pieces)
 
-    def _count(self, topic: str, pieces: list[_Piece]) -> None:
+    def _count(self, topic: str, pieces: list[Piece]) -> None:
         """Count rows of a topic that were written."""
         self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
         self.segments.update(piece.segment for piece in pieces)
         for piece in pieces:
-            self.reduced += piece.rows if piece.state == _REDUCED else 0
+            self.reduced += piece.rows if piece.state == REDUCED else 0
             self.unreadable += sum(len(rows) for rows, _ in piece.errors)
 
     def _write(self, table: Any) -> Iterator[tuple[int, int]]:
@@ -274,7 +193,7 @@ class _File:
             yield begin, end
 
     def _table(
-        self, topic: str, pieces: list[_Piece], kind: Any = None, *, with_topic: bool = False
+        self, topic: str, pieces: list[Piece], kind: Any = None, *, with_topic: bool = False
     ) -> Any:
         """Rows of a topic in order.
 
@@ -288,7 +207,7 @@ class _File:
 
         from hybridlog.tables.fields import joined
 
-        messages = _Messages.joined([piece.messages for piece in pieces])
+        messages = Messages.joined([piece.messages for piece in pieces])
         segment = np.repeat(
             np.array([piece.segment for piece in pieces], np.int32),
             [piece.rows for piece in pieces],
@@ -304,7 +223,7 @@ class _File:
                     for piece in pieces
                 ]
             )
-        columns = _own_columns(pieces, messages, segment, fields, self._has_publish_time)
+        columns = own_columns(pieces, messages, segment, fields, self._has_publish_time)
         if with_topic:
             columns[TOPIC_COLUMN] = pa.repeat(pa.scalar(topic), len(segment))
         known = list(map(pa.field, columns, [column.type for column in columns.values()]))
@@ -370,7 +289,7 @@ class TableWriter:
         self.has_failed = False
         self._arena: NDArray[np.uint8] | None = None
         self._filled = 0
-        self._held: list[_Messages] = []
+        self._held: list[Messages] = []
         self._held_rows = 0
         self._held_segment = -1
         self._channels: dict[int, Channel] = {}
@@ -475,7 +394,7 @@ class TableWriter:
             self._decode()
         self._held_segment = chunk.segment
         data = np.frombuffer(batch.buffer, np.uint8, size, begin)
-        self._held.append(_Messages.of(chunk, begin - self._filled))
+        self._held.append(Messages.of(chunk, begin - self._filled))
         self._held_rows += rows
         if is_enough:
             self._decode(data)
@@ -493,7 +412,7 @@ class TableWriter:
             assert self._arena is not None
             data = self._arena[: self._filled]
         self._has_grown = True
-        messages = _Messages.joined(self._held)
+        messages = Messages.joined(self._held)
         self._held.clear()
         self._filled = self._held_rows = 0
         for topic, codec, is_reduced, part in self._by_topic(messages):
@@ -501,7 +420,7 @@ class TableWriter:
                 with self._only(topic):
                     topic.add(self._piece(topic, codec, part, data, is_reduced=is_reduced))
 
-    def _by_topic(self, messages: _Messages) -> Iterator[tuple[_Topic, Codec, bool, _Messages]]:
+    def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, bool, Messages]]:
         """The messages, grouped by topic and encoding."""
         numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
         found = {number: self._topic_of(number) for number in numbers}
@@ -527,7 +446,7 @@ class TableWriter:
             if topic is None:
                 topic = self._topics[channel.topic, schema] = _Topic(channel, schema)
                 topic.is_wanted = self._wanted is None or channel.topic in self._wanted
-            is_reduced = channel.message_encoding == REDUCED
+            is_reduced = channel.message_encoding == REDUCED_ENCODING
             found = self._of_channel[number] = topic, codec_for(channel), is_reduced
             self._has_publish_time[number] = channel.has_publish_time
         return found
@@ -536,19 +455,19 @@ class TableWriter:
         self,
         topic: _Topic,
         codec: Codec,
-        messages: _Messages,
+        messages: Messages,
         data: NDArray[np.uint8],
         *,
         is_reduced: bool,
-    ) -> _Piece:
-        state = _REDUCED if is_reduced else _WHOLE
-        piece = _Piece(self._held_segment, messages, None, state=state)
+    ) -> Piece:
+        state = REDUCED if is_reduced else WHOLE
+        piece = Piece(self._held_segment, messages, None, state=state)
         if codec.indexed and not is_reduced:
             self._add_fields(piece, topic, codec, data)
         return piece
 
     def _add_fields(
-        self, piece: _Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
+        self, piece: Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
     ) -> None:
         from hybridlog.tables.fields import detached, without
 
@@ -601,7 +520,7 @@ class TableWriter:
                     place = segment if segment not in self._cut else max(self._seen)
                     opened += self._write(topic, place, topic.take({segment}))
 
-    def _write(self, topic: _Topic, segment: int, pieces: list[_Piece]) -> int:
+    def _write(self, topic: _Topic, segment: int, pieces: list[Piece]) -> int:
         """Write rows to the unfinished file of a segment; returns the number of new files."""
         from hybridlog.tables.fields import UnfitError
 
@@ -780,74 +699,3 @@ def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.in
 def _rows_of_group(table: Any) -> int:
     rows = max(int(table.num_rows), 1)
     return max(min(GROUP_ROWS, rows * GROUP_BYTES // max(int(table.nbytes), 1)), 1)
-
-
-def _own_columns(
-    pieces: Sequence[_Piece],
-    messages: _Messages,
-    segment: NDArray[np.int32],
-    fields: Any,
-    has_publish_time: Mapping[int, bool],
-) -> dict[str, Any]:
-    """The columns that every table has, by name."""
-    import pyarrow as pa
-
-    states = np.concatenate([np.full(piece.rows, piece.state, np.int8) for piece in pieces])
-    errors = _errors(pieces, states)
-    ids = np.flatnonzero(np.bincount(messages.channel)).tolist()
-    silent = [number for number in ids if not has_publish_time[number]]
-    no_publish = np.isin(messages.channel, silent) if silent else None
-    micros = messages.log_time // 1000
-    return {
-        "log_time": pa.array(micros).view(pa.timestamp("us", "UTC")),
-        "t": pa.array(messages.log_time),
-        "seq": pa.array(messages.seq),
-        "pub": pa.array(messages.publish_time, mask=no_publish),
-        "stamp": _stamps(fields, len(segment)),
-        "channel": pa.array(messages.channel),
-        "state": pa.array(STATES).take(pa.array(states)),
-        "error": errors,
-        "ref": pa.StructArray.from_arrays(
-            [
-                pa.array(segment),
-                pa.array(messages.chunk),
-                pa.array(messages.offset),
-                pa.array(messages.length.astype(np.int32)),
-            ],
-            names=["seg", "chunk", "off", "len"],
-        ),
-    }
-
-
-def _errors(pieces: Sequence[_Piece], states: NDArray[np.int8]) -> Any:
-    """Reasons why messages are unreadable; sets their states."""
-    import pyarrow as pa
-
-    if not any(piece.errors for piece in pieces):
-        return pa.nulls(len(states), pa.string())
-    found: list[str | None] = [None] * len(states)
-    before = 0
-    for piece in pieces:
-        for rows, reason in piece.errors:
-            for row in rows.tolist():
-                found[before + row] = reason
-                states[before + row] = _UNREADABLE
-        before += piece.rows
-    return pa.array(found, pa.string())
-
-
-def _stamps(fields: Any, rows: int) -> Any:
-    """Header stamps, ns."""
-    import pyarrow as pa
-
-    if fields is not None and fields.type.get_field_index("header") >= 0:
-        header = fields.field("header")
-        if pa.types.is_struct(header.type) and header.type.get_field_index("stamp") >= 0:
-            (stamp,) = [
-                part
-                for part, inner in zip(header.flatten(), header.type, strict=True)
-                if inner.name == "stamp"
-            ]
-            if pa.types.is_timestamp(stamp.type):
-                return stamp.view(pa.int64())
-    return pa.nulls(rows, pa.int64())
