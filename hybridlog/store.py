@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.sources.base import Source
+    from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog_storage.database import Database
     from hybridlog_storage.summary import RecordingSummary
     from hybridlog_storage.topic_places import TopicPlace
@@ -170,6 +171,7 @@ class Store:
     ) -> None:
         self.directory = directory
         self.session = Session(directory, mongo, progress, cache_mb)
+        self._sql: SqlEngine | None = None
 
     def __enter__(self) -> Self:
         """Return this store."""
@@ -237,6 +239,8 @@ class Store:
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
+        if self._sql is not None:
+            self._sql.close()
         self.session.close()
 
     # Recordings and topics.
@@ -429,6 +433,41 @@ class Store:
             if key == name or self.topic(key).topics == query.topics:
                 query = query.fields(*fields.pop(key))
         return query
+
+    @property
+    def sql_engine(self) -> SqlEngine:
+        """Runs SQL; for programs that need several statements in one connection."""
+        if self._sql is None:
+            from hybridlog.sql.engine import SqlEngine
+
+            self._sql = SqlEngine(self.session)
+        return self._sql
+
+    def sql(
+        self,
+        query: str,
+        params: Sequence[Any] | Mapping[str, Any] | None = None,
+        *,
+        memory: int | None = None,
+        timeout: float | None = None,
+    ) -> SqlAnswer:
+        """Ask in SQL. Needs the extra `sql`, and no MongoDB.
+
+        Args:
+            query: A query on views of topics (`base__scan`, or `scan` where that is
+                unambiguous) and on `recordings`, `topics`, `losses` and `marks`.
+            params: Values of `?` or `$name` in it.
+            memory: Bytes that DuckDB may use, from 64 MiB; 1 GiB by default.
+            timeout: Seconds that the answer may take; None for no limit.
+
+        Returns:
+            Has `to_arrow()`, `to_batches()`, `to_pandas()`, `to_polars()` and `rows()`.
+
+        Raises:
+            UsageError: The query is refused.
+            MissingDependencyError: DuckDB is not installed.
+        """
+        return self.sql_engine.connect(memory).query(query, params, timeout)
 
     # Changes.
 

@@ -46,6 +46,12 @@ def frame_of(
     return pd.DataFrame(data, index=index, copy=False)
 
 
+def frame_of_table(table: pa.Table) -> pd.DataFrame:
+    """A frame of all columns of an Arrow table, with row numbers as the index."""
+    data = {name: _array(table.column(place)) for place, name in enumerate(table.column_names)}
+    return pd.DataFrame(data, index=pd.RangeIndex(table.num_rows), copy=False)
+
+
 def frame_of_intervals(
     names: Sequence[str],
     recording: NDArray[np.int32],

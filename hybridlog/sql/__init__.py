@@ -1,0 +1,1 @@
+"""SQL over topics: DuckDB reads the tables of topics as the store holds them."""

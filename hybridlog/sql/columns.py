@@ -1,0 +1,315 @@
+"""Columns of a view: the fields of a topic's messages in types that SQL has.
+
+Nested messages are structs. Arrays are lists, whole; one that tables may hold as a summary
+has a twin of the name `<array>_summary` with `n`, `min`, `max` and `mean`. Times are
+timestamps without a zone, in UTC, since DuckDB's timestamps with a zone have microseconds.
+Durations are nanoseconds. Fields without a common exact type are JSON text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_objects import json_array
+from hybridlog.schema.arrow_types import is_list, missing_of, plain_values, with_values
+from hybridlog.tables.fields import LIMIT, is_summary, summary
+from hybridlog.tables.layout import OWN_COLUMNS, TOPIC_COLUMN, column_names
+
+OWN: Final = pa.schema(
+    [
+        ("log_time", pa.timestamp("us", "UTC")),
+        ("t", pa.int64()),
+        ("recording", pa.string()),
+        ("tags", pa.map_(pa.string(), pa.string())),
+        ("seq", pa.int64()),
+        ("pub", pa.int64()),
+        ("stamp", pa.int64()),
+        ("state", pa.string()),
+        ("error", pa.string()),
+    ]
+)
+"""Columns of every view in addition to the fields."""
+_RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names, TOPIC_COLUMN})
+_types = pa.types
+Fields = Callable[["ViewColumn"], Any]
+"""Finds the values of a field that is no struct; None where the messages lack it."""
+
+
+class UnfitValueError(Exception):
+    """A value that the type of its column does not represent."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewColumn:
+    """A column of a view, or a field inside one.
+
+    Attributes:
+        name: Its name in SQL.
+        source: Path of the field in the messages.
+        kind: Type of the field, as codecs give it.
+        inner: Fields of a struct.
+        is_summary: True for the twin of an array.
+    """
+
+    name: str
+    source: tuple[str, ...]
+    kind: Any
+    inner: tuple[ViewColumn, ...] = ()
+    is_summary: bool = False
+
+    @property
+    def type(self) -> Any:
+        """Its type in SQL."""
+        if self.inner:
+            return pa.struct([pa.field(column.name, column.type) for column in self.inner])
+        return sql_type(self.kind)
+
+    def leaves(self, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], ViewColumn]]:
+        """Its fields that are no structs, each with the names on the way in SQL, folded."""
+        path = (*above, self.name.casefold())
+        if not self.inner:
+            yield path, self
+        for column in self.inner:
+            yield from column.leaves(path)
+
+    def values(self, fields: Fields, rows: int, missing: Callable[[tuple[str, ...]], Any]) -> Any:
+        """Its values.
+
+        Args:
+            fields: Finds the values of the fields that are no structs, in their SQL types.
+            rows: Number of rows.
+            missing: Returns the mask of messages without the struct at a path, or None.
+        """
+        if not self.inner:
+            found = fields(self)
+            return pa.nulls(rows, self.type) if found is None else found
+        children = [column.values(fields, rows, missing) for column in self.inner]
+        return pa.StructArray.from_arrays(
+            children, fields=list(self.type), mask=missing(self.source)
+        )
+
+
+def view_columns(kind: Any) -> list[ViewColumn]:
+    """The columns for messages of one type.
+
+    Args:
+        kind: Struct type of the messages.
+    """
+    return list(_columns(kind, (), _RESERVED))
+
+
+def _columns(kind: Any, path: tuple[str, ...], reserved: Iterable[str]) -> Iterator[ViewColumn]:
+    fields: list[tuple[str, Any, bool]] = []
+    for field in kind:
+        fields.append((field.name, field, False))
+        if _may_be_summary(field.type):
+            fields.append((f"{field.name}_summary", field, True))
+    named = column_names([name for name, _, _ in fields], frozenset(reserved))
+    for (_, name), (_, field, is_twin) in zip(named, fields, strict=True):
+        source = (*path, field.name)
+        if is_twin:
+            yield ViewColumn(name, source, summary_type(field.type), is_summary=True)
+            continue
+        inner: tuple[ViewColumn, ...] = ()
+        if _types.is_struct(field.type):
+            inner = tuple(_columns(field.type, source, ()))
+        yield ViewColumn(name, source, field.type, inner)
+
+
+def _may_be_summary(kind: Any) -> bool:
+    """True if tables may hold an array as a summary."""
+    if _types.is_fixed_size_list(kind):
+        return bool(kind.list_size > LIMIT)
+    return is_list(kind) or bool(_types.is_binary(kind) or _types.is_large_binary(kind))
+
+
+def summary_type(kind: Any) -> Any:
+    """Type of the summary of an array."""
+    return summary(pa.nulls(0, kind)).type
+
+
+def merged(kinds: Sequence[Any]) -> Any:
+    """The type for values of several types.
+
+    Integers beside floats become doubles. Values that no type represents become JSON text.
+    """
+    kinds = list(dict.fromkeys(kind for kind in kinds if not _types.is_null(kind)))
+    if len(kinds) <= 1:
+        return kinds[0] if kinds else pa.null()
+    whole = [kind for kind in kinds if not is_summary(kind)]
+    if len(whole) < len(kinds):
+        if whole and all(map(_may_be_summary, whole)):
+            return merged(whole)
+        if whole or len({kind.num_fields for kind in kinds}) > 1:
+            return pa.json_()
+    for applies, merge in _MERGES:
+        if all(map(applies, kinds)):
+            return merge(kinds)
+    return pa.json_()
+
+
+def _merged_structs(kinds: Sequence[Any]) -> Any:
+    found: dict[str, list[Any]] = {}
+    for kind in kinds:
+        for field in kind:
+            found.setdefault(field.name, []).append(field.type)
+    return pa.struct([pa.field(name, merged(inner)) for name, inner in found.items()])
+
+
+def _merged_lists(kinds: Sequence[Any]) -> Any:
+    return pa.list_(merged([kind.value_type for kind in kinds]))
+
+
+def _merged_numbers(kinds: Sequence[Any]) -> Any:
+    if any(map(_types.is_floating, kinds)):
+        return pa.float64()
+    signed = [kind.bit_width for kind in kinds if _types.is_signed_integer(kind)]
+    unsigned = [kind.bit_width for kind in kinds if _types.is_unsigned_integer(kind)]
+    if not signed:
+        return pa.type_for_alias(f"uint{max(unsigned)}")
+    bits = max([*signed, *(2 * width for width in unsigned)])
+    return pa.type_for_alias(f"int{bits}") if bits <= 64 else pa.decimal128(20, 0)
+
+
+def _is_number(kind: Any) -> bool:
+    return bool(_types.is_integer(kind) or _types.is_floating(kind))
+
+
+def _is_text(kind: Any) -> bool:
+    return bool(_types.is_string(kind) or _types.is_large_string(kind))
+
+
+def _is_bytes(kind: Any) -> bool:
+    return bool(_types.is_binary(kind) or _types.is_large_binary(kind))
+
+
+_MERGES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Sequence[Any]], Any]]]] = (
+    (_types.is_struct, _merged_structs),
+    (is_list, _merged_lists),
+    (_is_number, _merged_numbers),
+    (_is_text, lambda _: pa.string()),
+    (_is_bytes, lambda _: pa.binary()),
+)
+
+
+def whole_type(kind: Any) -> Any:
+    """The type of messages of which tables hold some arrays as summaries.
+
+    Such an array is a list of numbers, or JSON text where its elements are no numbers.
+    """
+    if is_summary(kind):
+        if kind.num_fields == 1:
+            return pa.json_()
+        return pa.list_(kind.field("min").type)
+    if _types.is_struct(kind):
+        return pa.struct([field.with_type(whole_type(field.type)) for field in kind])
+    if is_list(kind):
+        return pa.list_(whole_type(kind.value_type))
+    return kind
+
+
+def lacks(have: Any, want: Any) -> bool:
+    """True if a table holds a summary where a view has the array.
+
+    Args:
+        have: Type in the table.
+        want: Type of the field.
+    """
+    if is_summary(have) and not _types.is_struct(want):
+        return True
+    if is_list(have) and is_list(want):
+        return lacks(have.value_type, want.value_type)
+    if _types.is_struct(have) and _types.is_struct(want):
+        inner = {field.name: field.type for field in want}
+        return any(f.name in inner and lacks(f.type, inner[f.name]) for f in have)
+    return False
+
+
+def sql_type(kind: Any) -> Any:
+    """The type in SQL of values of a type."""
+    for applies, made in _SQL_TYPES:
+        if applies(kind):
+            return made(kind)
+    return kind
+
+
+def _sql_struct(kind: Any) -> Any:
+    if not kind.num_fields:
+        return pa.bool_()
+    named = column_names([field.name for field in kind], frozenset())
+    pairs = zip(named, kind, strict=True)
+    return pa.struct([pa.field(name, sql_type(field.type)) for (_, name), field in pairs])
+
+
+_SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] = (
+    (_types.is_timestamp, lambda _: pa.timestamp("ns")),
+    (_types.is_duration, lambda _: pa.int64()),
+    (lambda kind: kind == pa.json_() or _is_text(kind), lambda _: pa.string()),
+    (_is_bytes, lambda _: pa.binary()),
+    (_types.is_null, lambda _: pa.int32()),  # as DuckDB has it
+    (is_list, lambda kind: pa.list_(sql_type(kind.value_type))),
+    (_types.is_struct, _sql_struct),
+)
+
+
+def fitted(array: Any, kind: Any) -> Any:
+    """Values of a field in the type that SQL has for it.
+
+    Args:
+        array: The values, as a codec or a table gives them.
+        kind: Type of the field.
+
+    Raises:
+        UnfitValueError: the type does not represent a value.
+    """
+    target = sql_type(kind)
+    if array.type == target and kind != pa.json_():
+        return array
+    if array.null_count == len(array):
+        return pa.nulls(len(array), target)
+    return _converted(array, kind, target)
+
+
+def _converted(array: Any, kind: Any, target: Any) -> Any:
+    have = array.type
+    if kind == pa.json_():
+        return (array if have == kind else json_array(plain_values(array))).storage
+    if is_list(have) and is_list(target):
+        made = with_values(array, fitted(array.flatten(), kind.value_type))
+        return made if made.type == target else made.cast(target)
+    if _types.is_struct(have) and _types.is_struct(target):
+        return _fitted_struct(array, kind)
+    if _types.is_struct(have) and _types.is_boolean(target):  # a message without fields
+        there = np.ones(len(array), np.bool_)
+        return pa.array(there, mask=missing_of(array))
+    if _types.is_timestamp(have) or _types.is_duration(have):
+        return array.view(pa.int64()).view(target)
+    try:
+        return array.cast(target)
+    except pa.ArrowException as error:
+        raise UnfitValueError(f"{have} is not {target}: {error}") from error
+
+
+def _fitted_struct(array: Any, kind: Any) -> Any:
+    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
+    columns = {
+        name: fitted(have[field.name], field.type)
+        if field.name in have
+        else pa.nulls(len(array), sql_type(field.type))
+        for (_, name), field in zip(
+            column_names([field.name for field in kind], frozenset()), kind, strict=True
+        )
+    }
+    return structs(columns, len(array), missing_of(array))
+
+
+def summary_values(array: Any, kind: Any) -> Any:
+    """The summaries of an array, which a table may have instead of it."""
+    found = array if is_summary(array.type) else summary(array)
+    return fitted(found, kind)

@@ -1,0 +1,146 @@
+"""DuckDB as SQL on a store needs it: bounded, interruptible, without access to anything else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any, Final, TypeVar
+
+from hybridlog.processors import processors
+from hybridlog_storage.errors import (
+    MissingDependencyError,
+    ResourceError,
+    UsageError,
+)
+
+MEMORY: Final = 1 << 30
+"""Default limit of DuckDB's memory, bytes."""
+MIN_MEMORY: Final = 64 << 20
+"""Least limit of DuckDB's memory, bytes."""
+_POLL_S: Final = 0.05
+_SETTINGS: Final = {
+    "allow_community_extensions": False,
+    "allow_persistent_secrets": False,
+    "autoinstall_known_extensions": False,
+    "autoload_known_extensions": False,
+    "enable_external_access": False,
+    "python_enable_replacements": False,
+    "temp_directory": "",
+}
+_T = TypeVar("_T")
+
+
+def duckdb() -> Any:
+    """The package.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return import_module("duckdb")
+    except ImportError as error:
+        raise MissingDependencyError("SQL needs DuckDB: pip install 'hybridlog[sql]'") from error
+
+
+def open_duckdb(memory: int) -> Any:
+    """DuckDB in memory, which reads nothing but what is registered.
+
+    Files, extensions, other databases and variables of Python are out of its reach, and no
+    query can change its settings.
+
+    Args:
+        memory: Limit of its memory, bytes.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+        UsageError: the limit is too low.
+    """
+    if memory < MIN_MEMORY:
+        raise UsageError(f"SQL needs at least {MIN_MEMORY >> 20} MiB of memory.")
+    settings = {**_SETTINGS, "memory_limit": f"{memory}B", "threads": processors()}
+    base = duckdb().connect(":memory:", config=settings)
+    base.execute("set global TimeZone = 'UTC'")
+    base.execute("set global lock_configuration = true")
+    return base
+
+
+@contextmanager
+def explained(memory: int) -> Iterator[None]:
+    """Turn errors of DuckDB into ours.
+
+    Args:
+        memory: Limit of DuckDB's memory, bytes.
+
+    Raises:
+        UsageError: the query is refused.
+        ResourceError: it needs more memory.
+    """
+    package = duckdb()
+    try:
+        yield
+    except package.OutOfMemoryException as error:
+        raise ResourceError(
+            f"The query needs more than {memory >> 20} MiB of memory: allow more (--memory), or "
+            "ask for less at a time."
+        ) from error
+    except package.PermissionException as error:
+        raise UsageError(
+            "SQL reads the views of this store alone; files, extensions and other databases are "
+            f"off. {_first_line(error)}"
+        ) from error
+    except package.Error as error:
+        raise UsageError(str(error).strip()) from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]
+
+
+class Worker:
+    """Runs calls of one connection in a thread, so that Ctrl-C and timeouts interrupt them.
+
+    Args:
+        cursor: The connection.
+        timeout: Seconds for all calls; None for no limit.
+    """
+
+    def __init__(self, cursor: Any, timeout: float | None) -> None:
+        self._cursor = cursor
+        self._timeout = timeout
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-sql")
+        self._until = None if timeout is None else time.monotonic() + timeout
+
+    def run(self, call: Callable[[], _T]) -> _T:
+        """The result of a call.
+
+        Raises:
+            ResourceError: the time is over.
+        """
+        future: Future[_T] = self._pool.submit(call)
+        try:
+            left = None if self._until is None else max(self._until - time.monotonic(), 0)
+            return future.result(left)
+        except TimeoutError:
+            if future.done():
+                raise
+            self._stop(future)
+            raise ResourceError(
+                f"The query was stopped after {self._timeout:g} s: narrow it down, or allow more."
+            ) from None
+        except BaseException as error:
+            if not future.done():  # Ctrl-C
+                self._stop(future)
+            raise error
+
+    def _stop(self, future: Future[_T]) -> None:
+        # A call that has not reached DuckDB yet does not notice.
+        while not future.done():
+            self._cursor.interrupt()
+            wait([future], _POLL_S)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._pool.shutdown(cancel_futures=True)

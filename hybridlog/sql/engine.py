@@ -1,0 +1,359 @@
+"""Runs SQL on a store: connections to DuckDB, and answers of queries."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from hybridlog.sql.content import StoreContent, current_content
+from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
+from hybridlog.sql.names import TABLES
+from hybridlog.sql.pieces import DamagedTableError
+from hybridlog.sql.store_tables import store_table
+from hybridlog.sql.topic_view import Reading, TopicDataset
+from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
+from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+    from hybridlog.session import Session
+    from hybridlog.sql.pieces import ScanCounts
+    from hybridlog.sql.topic_view import Remarks
+
+Params = Sequence[Any] | Mapping[str, Any] | None
+_BATCH_ROWS: Final = 65_536
+_TREE: Final = (
+    "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
+    "skip_default := true)"
+)
+_MAX_TRIES: Final = 10  # tables that may be damaged in one query
+_T = TypeVar("_T")
+
+
+class SqlEngine:
+    """Runs SQL on an open store. Thread safe.
+
+    Args:
+        session: The open store.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._bases: dict[int, Any] = {}
+        self._content: StoreContent | None = None
+        self._lock = threading.RLock()
+
+    def connect(self, memory: int | None = None) -> SqlConnection:
+        """A connection; what is created in it is there until it is closed.
+
+        Args:
+            memory: Limit of DuckDB's memory, bytes; None for 1 GiB.
+
+        Raises:
+            MissingDependencyError: DuckDB is not installed.
+            UsageError: the limit is too low.
+        """
+        most = MEMORY if memory is None else memory
+        with self._lock:
+            if most not in self._bases:
+                self._bases[most] = open_duckdb(most)
+            return SqlConnection(self, self._bases[most].cursor(), most)
+
+    def content(self) -> StoreContent:
+        """Recordings and views as they are now."""
+        with self._lock:
+            self._content = current_content(self.session, self._content)
+            return self._content
+
+    def reject(self, damaged: DamagedTableError) -> None:
+        """Drop a damaged table; the next query makes it again."""
+        with self._lock:
+            self.session.reject_table(damaged.source.entry, damaged.source.topic)
+            self._content = None
+
+    def close(self) -> None:
+        """Close DuckDB. May be called more than once."""
+        with self._lock:
+            for base in self._bases.values():
+                base.close()
+            self._bases.clear()
+            self._content = None
+
+
+class SqlConnection:
+    """Runs queries one after the other. Not thread safe.
+
+    Args:
+        engine: The engine.
+        cursor: A connection of DuckDB.
+        memory: Limit of its memory, bytes.
+    """
+
+    def __init__(self, engine: SqlEngine, cursor: Any, memory: int) -> None:
+        self.engine = engine
+        self.cursor = cursor
+        self.memory = memory
+        self.reading = Reading()
+        self._has_own = False  # views and macros of the user read what a query does not name
+        self._content: StoreContent | None = None
+        self._names: set[str] = set()
+        self._registered: set[str] = set()
+
+    def names(self) -> list[str]:
+        """Names of all views and tables of the store."""
+        return list(self.engine.content().names)
+
+    def columns(self, view: str) -> list[str]:
+        """Names of the columns of a view; empty without such a view."""
+        content = self.engine.content()
+        topic = content.names.topic(view)
+        if topic is not None:
+            return list(content.view(topic).schema.names)
+        return list(store_table(view, content).schema.names) if view in TABLES else []
+
+    def query(self, text: str, params: Params = None, timeout: float | None = None) -> SqlAnswer:
+        """Prepare a query; of several statements, all but the last are run.
+
+        Args:
+            text: One statement or several.
+            params: Values of `?` or `$name` in the last statement.
+            timeout: Seconds that it may take; None for no limit.
+
+        Raises:
+            UsageError: DuckDB refuses it.
+        """
+        with explained(self.memory):
+            statements = list(self.cursor.extract_statements(text))
+        if not statements:
+            raise UsageError("The query is empty.")
+        self._names.update(self.engine.content().names.named(text))
+        self.register()
+        answers = [
+            self._prepared(statement, params if statement is statements[-1] else None, timeout)
+            for statement in statements
+        ]
+        return answers[-1]
+
+    def _prepared(self, statement: Any, params: Params, timeout: float | None) -> SqlAnswer:
+        kind = _kind(statement)
+        is_reading = kind in {"SELECT", "EXPLAIN"}
+        usage = self._usage(statement) if kind == "SELECT" else EVERYTHING
+        answer = SqlAnswer(self, statement.query, params, usage, timeout)
+        if not is_reading:
+            self._has_own = True
+            answer.run()
+        return answer
+
+    def register(self) -> None:
+        """Register the views that were named so far, if they are not the current ones."""
+        content = self.engine.content()
+        known = set() if content is not self._content else self._registered
+        for name in self._names - known:
+            topic = content.names.topic(name)
+            if topic is not None:
+                source: Any = TopicDataset(content.view(topic), lambda: self.reading)
+            elif name in TABLES:
+                source = store_table(name, content)
+            else:
+                continue
+            self.cursor.register(name, source)
+        self._content, self._registered = content, set(self._names)
+
+    def _usage(self, statement: Any) -> Usage:
+        if self._has_own:
+            return EVERYTHING
+        text = statement.query.strip().rstrip(";")
+        ((tree,),) = self.cursor.execute(_TREE, [text]).fetchall()
+        return usage_of(tree, {name.casefold() for name in self._names})
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.cursor.close()
+
+
+class SqlAnswer:
+    """The answer of a query. It is computed whenever it is asked for, as one of these.
+
+    Args:
+        connection: The connection, open as long as the answer is used.
+        text: The statement.
+        params: Values of its parameters.
+        usage: Paths that it names.
+        timeout: Seconds that it may take; None for no limit.
+
+    Attributes:
+        columns: Names of the columns.
+    """
+
+    def __init__(
+        self,
+        connection: SqlConnection,
+        text: str,
+        params: Params,
+        usage: Usage,
+        timeout: float | None,
+    ) -> None:
+        self._connection = connection
+        self._text = text
+        self._params = params
+        self._timeout = timeout
+        self._reading = Reading(usage)
+        self._relation: Any = None
+        self._result: pa.Table | None = None
+        self._prepare()
+
+    def __repr__(self) -> str:
+        return f"<SqlAnswer of {len(self.columns)} columns: {', '.join(self.columns[:8])}>"
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns; empty for statements that return nothing."""
+        return [] if self._relation is None else list(self._relation.columns)
+
+    @property
+    def counts(self) -> ScanCounts:
+        """What was read for it."""
+        return self._reading.counts
+
+    @property
+    def remarks(self) -> Remarks:
+        """What it may lack."""
+        return self._reading.remarks
+
+    def run(self) -> None:
+        """Compute a statement that changes something; the answer is its result."""
+        if self._relation is not None:
+            self._result = self._computed(self._table)
+
+    def to_arrow(self) -> pa.Table:
+        """The whole answer as an Arrow table.
+
+        Raises:
+            ResourceError: it needs more memory or time than it may.
+        """
+        import pyarrow as pa
+
+        if self._result is not None:
+            return self._result
+        if self._relation is None:
+            return pa.table({})
+        return self._computed(self._table)
+
+    def to_batches(self) -> Iterator[pa.RecordBatch]:
+        """The answer in record batches of bounded size, at least one.
+
+        The next query of the connection ends it.
+
+        Raises:
+            ResourceError: it needs more memory or time than it may.
+        """
+        if self._result is not None or self._relation is None:
+            yield from self.to_arrow().to_batches()
+            return
+        worker = Worker(self._connection.cursor, self._timeout)
+        try:
+            reader, batch = self._tried(lambda: worker.run(self._stream))
+            if batch is None:
+                yield _empty(reader.schema)
+            while batch is not None:
+                yield batch
+                with self._explained():
+                    batch = worker.run(partial(next, reader, None))
+        finally:
+            worker.close()
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The whole answer as a pandas frame.
+
+        Raises:
+            ResourceError: it needs more memory or time than it may.
+        """
+        from hybridlog.frames.frame import frame_of_table
+
+        return frame_of_table(self.to_arrow())
+
+    def to_polars(self) -> Any:
+        """The whole answer as a polars frame.
+
+        Raises:
+            MissingDependencyError: polars is not installed.
+            ResourceError: it needs more memory or time than it may.
+        """
+        try:
+            polars = import_module("polars")
+        except ImportError as error:
+            raise MissingDependencyError("This needs polars: pip install polars") from error
+        return polars.from_arrow(self.to_arrow())
+
+    def rows(self) -> list[tuple[Any, ...]]:
+        """The whole answer as tuples of Python values."""
+        columns = [column.to_pylist(maps_as_pydicts="strict") for column in self.to_arrow().columns]
+        return list(zip(*columns, strict=True))
+
+    def _stream(self) -> tuple[Any, pa.RecordBatch | None]:
+        """A reader of the answer, and its first batch."""
+        reader = self._relation.to_arrow_reader(_BATCH_ROWS)
+        return reader, next(reader, None)
+
+    def _table(self) -> pa.Table:
+        table: pa.Table = self._relation.to_arrow_table()
+        return table
+
+    def _prepare(self) -> None:
+        self._connection.register()
+        with self._explained():
+            self._relation = self._connection.cursor.sql(self._text, params=self._params)
+
+    def _computed(self, call: Callable[[], _T]) -> _T:
+        worker = Worker(self._connection.cursor, self._timeout)
+        try:
+            return self._tried(lambda: worker.run(call))
+        finally:
+            worker.close()
+
+    def _tried(self, call: Callable[[], _T]) -> _T:
+        """The result of a call; repeated when a table was damaged, which is made again."""
+        for _ in range(_MAX_TRIES):
+            self._reading = self._connection.reading = Reading(self._reading.usage)
+            try:
+                with self._explained():
+                    return call()
+            except DamagedTableError as damaged:
+                self._connection.engine.reject(damaged)
+                self._prepare()
+        with self._explained():
+            return call()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Raise the error of the source instead of what DuckDB made of it."""
+        try:
+            with explained(self._connection.memory):
+                yield
+        except UsageError:
+            if isinstance(self._reading.error, HybridlogError):
+                raise self._reading.error from None
+            if self._reading.error is not None:
+                raise UsageError(str(self._reading.error)) from self._reading.error
+            raise
+
+
+def _kind(statement: Any) -> str:
+    """Kind of a statement; empty for those that the package has no name for."""
+    try:
+        return str(statement.type.name)
+    except ValueError:
+        return ""
+
+
+def _empty(schema: pa.Schema) -> pa.RecordBatch:
+    import pyarrow as pa
+
+    arrays = [pa.nulls(0, field.type) for field in schema]
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)

@@ -1,0 +1,100 @@
+"""Names of views in SQL: one a topic, as its collection, and short names that are unambiguous."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+from hybridlog.tables.layout import column_names
+from hybridlog_storage.collection_names import collection_of
+
+TABLES: Final = ("recordings", "topics", "losses", "marks")
+"""Tables about the store itself; their names are reserved."""
+_WORD: Final = re.compile(r'"((?:[^"]|"")*)"|([^\W\d][\w$]*)')
+_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_LISTING: Final = frozenset(
+    {
+        "database",
+        "duckdb_columns",
+        "duckdb_tables",
+        "duckdb_views",
+        "information_schema",
+        "pg_catalog",
+        "pragma_show",
+        "pragma_table_info",
+        "show",
+    }
+)
+"""Words of statements that list views."""
+
+
+class ViewNames:
+    """The names of the views of some topics. DuckDB ignores case, and so do these.
+
+    Args:
+        topics: Full names.
+
+    Attributes:
+        views: Name of the view of each topic, by topic.
+    """
+
+    def __init__(self, topics: Iterable[str]) -> None:
+        # Of names that differ in case, the one in lower case stays as it is.
+        known = sorted(topics, key=lambda topic: (topic.casefold(), topic.swapcase()))
+        collections = dict(zip(map(collection_of, known), known, strict=True))
+        named = column_names(collections, TABLES)
+        self.views = {collections[collection]: view for collection, view in named}
+        self._topics = {view.casefold(): topic for topic, view in self.views.items()}
+        self._shorts: dict[str, list[str]] = {}
+        found = {topic: list(_short_names(topic)) for topic in known}
+        owners = Counter(name.casefold() for names in found.values() for name in names)
+        for topic, names in found.items():
+            for name in names:
+                folded = name.casefold()
+                if owners[folded] == 1 and folded not in self._topics and folded not in TABLES:
+                    self._shorts.setdefault(topic, []).append(name)
+        self._topics |= {
+            name.casefold(): topic for topic, names in self._shorts.items() for name in names
+        }
+
+    def __iter__(self) -> Iterator[str]:
+        """All names: tables, views, short names."""
+        yield from TABLES
+        for topic, view in self.views.items():
+            yield view
+            yield from self._shorts.get(topic, ())
+
+    def topic(self, name: str) -> str | None:
+        """The topic of a view; None if there is none of that name."""
+        return self._topics.get(name.casefold())
+
+    def short(self, topic: str) -> str | None:
+        """The shortest name of a topic's view; None if only the long one is unambiguous."""
+        return min(self._shorts.get(topic, ()), key=len, default=None)
+
+    def named(self, query: str) -> list[str]:
+        """Names in the text of a query, in any role; all for statements that list views."""
+        words = {(quoted.replace('""', '"') or plain).casefold() for quoted, plain in _words(query)}
+        if not words.isdisjoint(_LISTING):
+            return list(self)
+        return [name for name in self if name.casefold() in words]
+
+
+def quoted(name: str) -> str:
+    """A name as SQL takes it, whatever it is."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _words(query: str) -> list[tuple[str, str]]:
+    return _WORD.findall(query)
+
+
+def _short_names(topic: str) -> Iterator[str]:
+    """Whole parts at the end of a name: `scan` and `base__scan` of `/robot/base/scan`."""
+    parts = topic.strip("/").split("/")
+    for start in range(1, len(parts)):
+        name = "__".join(parts[start:])
+        if _PLAIN.fullmatch(name):
+            yield name

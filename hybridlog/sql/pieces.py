@@ -1,0 +1,330 @@
+"""Rows of a topic in one recording: from its table, or from its chunks.
+
+A topic of an ended recording has a table, which is made again if it is missing. Where it can
+have none, and for what a running recording has flushed, chunks are decoded instead, into the
+same columns.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.losses import lost_spans
+from hybridlog.query.question import RecordedChannel
+from hybridlog.tables.fields import without
+from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
+from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from hybridlog.session import Session
+    from hybridlog.tables.reader import TablePart, TopicTable
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.open_segment import OpenSegment
+    from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+
+_FIXED: Final = frozenset({"ros1", "cdr", "protobuf"})
+"""Encodings whose definition fixes the fields."""
+_MAX_CHUNKS: Final = 4  # read chunks that are kept
+Paths = Collection[str] | None
+"""Dotted paths of fields to read; None for all."""
+
+
+@dataclass(slots=True)
+class ScanCounts:
+    """What was read for a query.
+
+    Attributes:
+        files: Paths of the files of tables that were read.
+        row_groups: Row groups that were read.
+        chunks: Chunks that were read.
+        payload_bytes: Bytes of payloads that were decoded.
+    """
+
+    files: set[str] = field(default_factory=set)
+    row_groups: int = 0
+    chunks: int = 0
+    payload_bytes: int = 0
+
+
+class Rows(NamedTuple):
+    """Some messages of a topic.
+
+    Attributes:
+        own: Columns of the table itself, by name.
+        records: Fields of the messages; arrays may be summaries.
+        size: Number of messages.
+    """
+
+    own: Mapping[str, Any]
+    records: Any
+    size: int
+
+
+class DamagedTableError(StoreError):
+    """A table turned out to be damaged while it was read.
+
+    Args:
+        source: The topic and its recording.
+        problem: The damage.
+    """
+
+    def __init__(self, source: TopicOfRecording, problem: str) -> None:
+        super().__init__(f"{problem} It is made again when you ask again.")
+        self.source = source
+
+
+class RowSource(Protocol):
+    """Some rows of a topic of a recording that are read together."""
+
+    @property
+    def first(self) -> int | None:
+        """Least log time, ns; None if unknown."""
+
+    @property
+    def last(self) -> int | None:
+        """Greatest log time, ns; None if unknown."""
+
+    @property
+    def is_whole(self) -> bool:
+        """True if it has all arrays; else some may be summaries."""
+
+    @property
+    def kinds(self) -> Sequence[Any]:
+        """Types of the fields that it holds."""
+
+    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
+        """Read columns."""
+
+
+class TopicOfRecording:
+    """A topic of one recording.
+
+    Args:
+        session: The open store.
+        entry: The recording.
+        topic: Full name.
+        open_segments: Segments of the recording that are not sealed.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        entry: RecordingEntry,
+        topic: str,
+        open_segments: Sequence[OpenSegment] = (),
+    ) -> None:
+        self.session = session
+        self.entry = entry
+        self.topic = topic
+        self._open = open_segments
+        self._read: dict[tuple[int, int], StoredChunk] = {}
+        self._lock = threading.Lock()
+
+    @cached_property
+    def channels(self) -> dict[int, RecordedChannel]:
+        """Channels of the topic, by id."""
+        found = {
+            channel.channel_id: channel
+            for channel in self.session.channels(self.entry)
+            if channel.channel.topic == self.topic
+        }
+        for segment in self._open:
+            for number, channel in segment.channels.items():
+                if channel.topic == self.topic and number not in found:
+                    stats = ChannelStats()
+                    found[number] = RecordedChannel(self.entry, number, channel, stats, None)
+        return found
+
+    @property
+    def flushed(self) -> int:
+        """Number of its messages in segments that are not sealed."""
+        return sum(segment.messages[channel] for segment in self._open for channel in self.channels)
+
+    @property
+    def is_fixed(self) -> bool:
+        """True if definitions fix the fields of all messages."""
+        return all(
+            channel.is_reduced
+            or channel.codec.reason is not None
+            or channel.channel.message_encoding in _FIXED
+            for channel in self.channels.values()
+        )
+
+    @cached_property
+    def kinds(self) -> list[Any]:
+        """Types of its messages; arrays may be summaries where no definition fixes the fields."""
+        if not self.is_fixed:
+            return [kind for source in self.sources for kind in source.kinds]
+        return [
+            kind_of(channel)
+            for channel in self.channels.values()
+            if not channel.is_reduced and channel.codec.indexed
+        ]
+
+    @cached_property
+    def table(self) -> TopicTable | None:
+        """Its table; None if it can have none."""
+        if self.entry.status == "open" or any(True for _ in lost_spans(self.entry)):
+            return None  # rows of lost messages must not answer
+        return self.session.table(self.entry, self.topic)
+
+    @cached_property
+    def sources(self) -> list[RowSource]:
+        """Its rows, in parts, by log time."""
+        if self.table is not None:
+            return [_TableRows(self, self.table, part) for part in self.table.parts]
+        found: list[RowSource] = []
+        covered: frozenset[int] = frozenset()
+        chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
+        if self.entry.status == "open":
+            messages: dict[int, int] = {}
+            for chunk in chunks:
+                count = sum(s.messages for c, s in chunk.stats.items() if c in self.channels)
+                messages[chunk.segment] = messages.get(chunk.segment, 0) + count
+            made = self.session.tables.of_sealed(self.entry, self.topic, messages)
+            if made is not None:
+                table, covered = made
+                found += [_TableRows(self, table, part) for part in table.parts]
+        found += [
+            _ChunkRows(self, chunk.segment, chunk.place, chunk.span(self.channels))
+            for chunk in chunks
+            if chunk.segment not in covered
+        ]
+        found += [
+            _ChunkRows(self, segment.number, place, (place.first, place.last))
+            for segment in self._open
+            for place in segment.chunks
+            if not self.channels.keys().isdisjoint(place.channels)
+        ]
+        return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
+
+    def reader(self, segment: int) -> SegmentReader:
+        """The reader of a segment."""
+        for one in self._open:
+            if one.number == segment:
+                return one.reader
+        return self.session.segment(self.entry.id, segment)
+
+    @cached_property
+    def places(self) -> dict[tuple[int, int], ChunkPlace]:
+        """Positions of its chunks, by segment and number."""
+        chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
+        found = {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
+        for segment in self._open:
+            found |= {(segment.number, place.number): place for place in segment.chunks}
+        return found
+
+    def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
+        """A chunk; those read last are at hand.
+
+        Raises:
+            SegmentError: it is damaged.
+        """
+        with self._lock:
+            found = self._read.get((segment, number))
+        if found is None:
+            found = self.reader(segment).read_chunk(self.places[segment, number])
+            counts.chunks += 1
+            with self._lock:
+                while len(self._read) >= _MAX_CHUNKS:
+                    del self._read[next(iter(self._read))]
+                self._read[segment, number] = found
+        return found
+
+
+def kind_of(channel: RecordedChannel) -> Any:
+    """Type of the messages of a channel whose definition fixes their fields."""
+    none = np.empty(0, np.int64)
+    return channel.codec.arrow(b"", none, none, None).records.type
+
+
+class _TableRows:
+    """A row group of a table."""
+
+    is_whole = False
+
+    def __init__(self, source: TopicOfRecording, table: TopicTable, part: TablePart) -> None:
+        self._source = source
+        self._table = table
+        self._part = part
+        is_known = part.first[0] > -(1 << 63)
+        self.first = part.first[0] if is_known else None
+        self.last = part.last[0] if is_known else None
+
+    @property
+    def kinds(self) -> Sequence[Any]:
+        return [self._table.fields(None)]
+
+    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
+        counts.files.add(str(self._part.file.path))
+        counts.row_groups += 1
+        try:
+            ours, records = self._table.read(self._part, paths, own)
+        except StoreError as error:
+            raise DamagedTableError(self._source, str(error)) from error
+        yield Rows(ours, records, self._part.rows)
+
+
+class _ChunkRows:
+    """The messages of a topic in a chunk."""
+
+    is_whole = True
+
+    def __init__(
+        self,
+        source: TopicOfRecording,
+        segment: int,
+        place: ChunkPlace,
+        span: tuple[int, int] | None,
+    ) -> None:
+        self._source = source
+        self._segment = segment
+        self._place = place
+        self.first, self.last = span or (place.first, place.last)
+
+    @cached_property
+    def kinds(self) -> Sequence[Any]:
+        return [rows.records.type for rows in self.read(None, (), ScanCounts())]
+
+    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
+        chunk = self._source.chunk(self._segment, self._place.number, counts)
+        for number, channel in self._source.channels.items():
+            rows = np.flatnonzero(chunk.batch.channel == number)
+            if len(rows):
+                yield self._rows(chunk, channel, Messages.of(chunk, 0).take(rows), paths, counts)
+
+    def _rows(
+        self,
+        chunk: StoredChunk,
+        channel: RecordedChannel,
+        messages: Messages,
+        paths: Paths,
+        counts: ScanCounts,
+    ) -> Rows:
+        count = len(messages.seq)
+        piece = Piece(self._segment, messages, None, state=WHOLE)
+        records = pa.nulls(count, pa.struct([]))
+        if channel.is_reduced:
+            piece.state = REDUCED
+        elif channel.codec.indexed:
+            wanted = None if paths is None else {*paths, "header.stamp"}
+            decoded = channel.codec.arrow(chunk.batch.buffer, messages.at, messages.length, wanted)
+            counts.payload_bytes += int(messages.length.sum())
+            name = channel.channel.schema.name if channel.channel.schema is not None else ""
+            for bad in decoded.unreadable:
+                piece.errors.append((bad.rows, f"the payload does not fit {name}: {bad.reason}"))
+            if len(decoded.rows):
+                records = without(decoded.records, decoded.rows, count)
+        segment = np.full(count, self._segment, np.int32)
+        publishes = {channel.channel_id: channel.channel.has_publish_time}
+        fields = records if records.type.num_fields else None
+        return Rows(own_columns([piece], messages, segment, fields, publishes), records, count)

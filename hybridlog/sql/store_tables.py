@@ -1,0 +1,183 @@
+"""Tables about the store itself: recordings, topics, losses, marks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.marks import MARKS
+from hybridlog.sql.pieces import ScanCounts
+from hybridlog_storage.catalog import ChannelStats
+
+if TYPE_CHECKING:
+    from hybridlog.sql.content import StoreContent
+
+_TIME: Final = pa.timestamp("us", "UTC")
+_TAGS: Final = pa.map_(pa.string(), pa.string())
+_RECORDINGS: Final = pa.schema(
+    [
+        ("recording", pa.string()),
+        ("id", pa.string()),
+        ("name", pa.string()),
+        ("tags", _TAGS),
+        ("status", pa.string()),
+        ("created", _TIME),
+        ("first_time", _TIME),
+        ("last_time", _TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("messages", pa.int64()),
+        ("topics", pa.int64()),
+        ("segments", pa.int64()),
+        ("bytes", pa.int64()),
+    ]
+)
+_TOPICS: Final = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("view", pa.string()),
+        ("short", pa.string()),
+        ("recording", pa.string()),
+        ("type", pa.string()),
+        ("encoding", pa.string()),
+        ("messages", pa.int64()),
+        ("bytes", pa.int64()),
+        ("first_time", _TIME),
+        ("last_time", _TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("problem", pa.string()),
+    ]
+)
+_LOSSES: Final = pa.schema(
+    [
+        ("recording", pa.string()),
+        ("topic", pa.string()),
+        ("cause", pa.string()),
+        ("messages", pa.int64()),
+        ("first_time", _TIME),
+        ("last_time", _TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("file", pa.string()),
+        ("reason", pa.string()),
+    ]
+)
+_MARKS: Final = pa.schema(
+    [
+        ("log_time", _TIME),
+        ("t", pa.int64()),
+        ("recording", pa.string()),
+        ("text", pa.string()),
+        ("tags", _TAGS),
+    ]
+)
+
+
+def store_table(name: str, content: StoreContent) -> pa.Table:
+    """One of the tables about a store.
+
+    Args:
+        name: `recordings`, `topics`, `losses` or `marks`.
+        content: The store.
+    """
+    rows, schema = _TABLES[name]
+    return pa.Table.from_pylist(list(rows(content)), schema=schema)
+
+
+def _recordings(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for summary in content.snapshot.summaries:
+        yield {
+            "recording": summary.label,
+            "id": summary.id,
+            "name": summary.name,
+            "tags": list(summary.tags.items()),
+            "status": summary.status,
+            "created": summary.created // 1000,
+            **_times(*(summary.span or (None, None))),
+            "messages": summary.messages,
+            "topics": summary.topic_count,
+            "segments": summary.segments,
+            "bytes": summary.stored_bytes,
+        }
+
+
+def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for topic, view in content.names.views.items():
+        for summary in content.summaries_of(topic):
+            found = content.topic_of(summary, topic)
+            channels = list(found.channels.values())
+            total = ChannelStats()
+            for channel in channels:
+                total.add(channel.stats)
+            types = dict.fromkeys(c.channel.schema.name for c in channels if c.channel.schema)
+            encodings = dict.fromkeys(c.channel.message_encoding for c in channels)
+            problems = dict.fromkeys(c.codec.reason for c in channels if c.codec.reason)
+            yield {
+                "topic": topic,
+                "view": view,
+                "short": content.names.short(topic),
+                "recording": summary.label,
+                "type": ", ".join(types) or None,
+                "encoding": ", ".join(encodings) or None,
+                "messages": total.messages + found.flushed,
+                "bytes": total.payload_bytes,
+                **_times(total.first, total.last),
+                "problem": "; ".join(problems) or None,
+            }
+
+
+def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for summary in content.snapshot.summaries:
+        entry = content.session.entry_of(summary)
+        for loss in entry.end.get("losses", ()):
+            yield {
+                "recording": entry.label,
+                "topic": loss.get("topic"),
+                "cause": str(loss["cause"]),
+                "messages": loss["count"],
+                **_times(loss.get("from"), loss.get("to")),
+                "file": loss.get("file") or None,
+                "reason": loss.get("reason") or None,
+            }
+
+
+def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for summary in content.summaries_of(MARKS):
+        topic = content.topic_of(summary, MARKS)
+        counts = ScanCounts()
+        for segment, number in topic.places:
+            batch = topic.chunk(segment, number, counts).batch
+            for row in np.flatnonzero(np.isin(batch.channel, list(topic.channels))).tolist():
+                begin, length = int(batch.offset[row]), int(batch.length[row])
+                mark = json.loads(bytes(memoryview(batch.buffer)[begin : begin + length]))
+                time = int(batch.log_time[row])
+                yield {
+                    "log_time": time // 1000,
+                    "t": time,
+                    "recording": summary.label,
+                    "text": mark.get("text"),
+                    "tags": list(mark.get("tags", {}).items()),
+                }
+
+
+def _times(first: int | None, last: int | None) -> dict[str, Any]:
+    return {
+        "first_time": None if first is None else first // 1000,
+        "last_time": None if last is None else last // 1000,
+        "first_t": first,
+        "last_t": last,
+    }
+
+
+_Rows = Callable[["StoreContent"], Iterator[Mapping[str, Any]]]
+_TABLES: Final[Mapping[str, tuple[_Rows, Any]]] = {
+    "recordings": (_recordings, _RECORDINGS),
+    "topics": (_topics, _TOPICS),
+    "losses": (_losses, _LOSSES),
+    "marks": (_marks, _MARKS),
+}

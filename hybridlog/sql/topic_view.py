@@ -1,0 +1,475 @@
+"""The view of a topic: its columns, and the rows that a query reads."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+from pyarrow import fs
+
+from hybridlog.sql.columns import (
+    OWN,
+    ViewColumn,
+    fitted,
+    lacks,
+    merged,
+    summary_values,
+    view_columns,
+    whole_type,
+)
+from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
+from hybridlog.sql.usage import EVERYTHING, Usage
+from hybridlog.tables.fields import without
+from hybridlog.tables.layout import STATES
+from hybridlog.tables.rows import REDUCED, UNREADABLE, WHOLE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.catalog import RecordingEntry
+
+_BATCH_BYTES: Final = 16 << 20  # of payloads whose arrays are in memory together
+_TABLE_OWN: Final = frozenset({"log_time", "t", "seq", "pub", "stamp", "state", "error"})
+_FORMAT: Final = ds.ParquetFileFormat()
+_PLACES: Final = fs.LocalFileSystem()
+_WORD: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(slots=True)
+class Remarks:
+    """What an answer may lack.
+
+    Attributes:
+        unreadable: Messages without fields, because they do not fit their definition, by topic.
+        reduced: Messages without fields, because they were reduced under pressure, by topic.
+        undefined: Topics without fields, with the reason.
+        recordings: Recordings that were read, by id.
+        topics: Topics that were read.
+    """
+
+    unreadable: dict[str, int] = field(default_factory=dict)
+    reduced: dict[str, int] = field(default_factory=dict)
+    undefined: dict[str, str] = field(default_factory=dict)
+    recordings: dict[str, RecordingEntry] = field(default_factory=dict)
+    topics: set[str] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class Reading:
+    """What one execution of a query reads and finds.
+
+    Attributes:
+        usage: Paths that the query names.
+        counts: What was read.
+        remarks: What the answer may lack.
+        error: The first error while rows were read.
+    """
+
+    usage: Usage = EVERYTHING
+    counts: ScanCounts = field(default_factory=ScanCounts)
+    remarks: Remarks = field(default_factory=Remarks)
+    error: Exception | None = None
+
+
+class TopicView:
+    """The rows of a topic in several recordings.
+
+    Args:
+        topic: Full name.
+        recordings: The topic in each recording, by the time of the recordings; made when a
+            query first reads it.
+        labels: Label of each recording.
+        spans: First and last log time of each recording, ns; None if unknown.
+        kinds: Types of the messages.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        recordings: Sequence[Callable[[], TopicOfRecording]],
+        labels: Sequence[str],
+        spans: Sequence[tuple[int, int] | None],
+        kinds: Sequence[Any],
+    ) -> None:
+        self.topic = topic
+        self._recordings = recordings
+        self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
+        kind = whole_type(merged(list(kinds)) if kinds else pa.struct([]))
+        self._columns = {column.name: column for column in view_columns(kind)}
+        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
+        self.schema = pa.schema([*OWN, *fields])
+        guarantees = [
+            _is_label(label) & _within(span) for label, span in zip(labels, spans, strict=True)
+        ]
+        self._chooser = _Chooser(self.schema, guarantees)
+
+    def rows(
+        self, columns: Sequence[str], where: Any, reading: Reading
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows for a query.
+
+        Args:
+            columns: Names of the columns.
+            where: Expression that holds for all of them; None for all rows.
+            reading: Collects what is read.
+        """
+        plan = _Plan(self.schema, self._columns, columns, where, reading)
+        for number in self._chooser.chosen(where):
+            recording, chooser = self._parts_of(number)
+            self._remark(recording, reading.remarks)
+            for place in chooser.chosen(where):
+                yield from plan.read(recording, recording.sources[place])
+
+    def _parts_of(self, number: int) -> tuple[TopicOfRecording, _Chooser]:
+        found = self._made.get(number)
+        if found is None:
+            recording = self._recordings[number]()
+            spans = [_within_source(source) for source in recording.sources]
+            found = self._made[number] = recording, _Chooser(self.schema, spans)
+        return found
+
+    def _remark(self, recording: TopicOfRecording, remarks: Remarks) -> None:
+        remarks.recordings[recording.entry.id] = recording.entry
+        remarks.topics.add(self.topic)
+        for channel in recording.channels.values():
+            if channel.codec.reason is not None and not channel.is_reduced:
+                remarks.undefined[self.topic] = channel.codec.reason
+
+
+class _Chooser:
+    """Chooses parts that may have rows for which an expression holds.
+
+    Args:
+        schema: Columns of the expression.
+        guarantees: An expression for each part that holds for all of its rows.
+    """
+
+    def __init__(self, schema: Any, guarantees: Sequence[Any]) -> None:
+        self._count = len(guarantees)
+        self._parts = ds.FileSystemDataset(
+            [
+                _FORMAT.make_fragment(str(number), _PLACES, partition_expression=guarantee)
+                for number, guarantee in enumerate(guarantees)
+            ],
+            schema,
+            _FORMAT,
+            _PLACES,
+        )
+
+    def chosen(self, where: Any) -> list[int]:
+        """Numbers of the parts, in order."""
+        if where is None:
+            return list(range(self._count))
+        return sorted(int(part.path) for part in self._parts.get_fragments(filter=where))
+
+
+def _is_label(label: str) -> Any:
+    return pc.field("recording") == label
+
+
+def _within(span: tuple[int, int] | None) -> Any:
+    """An expression that holds for the log times of a span, both ends included."""
+    if span is None:
+        return pc.scalar(True)
+    first, last = span
+    low, high = (pa.scalar(bound // 1000, pa.timestamp("us", "UTC")) for bound in span)
+    t, log_time = pc.field("t"), pc.field("log_time")
+    return (t >= first) & (t <= last) & (log_time >= low) & (log_time <= high)
+
+
+def _within_source(source: RowSource) -> Any:
+    known = source.first is not None and source.last is not None
+    return _within((source.first, source.last) if known else None)  # type: ignore[arg-type]
+
+
+class _Plan:
+    """Reads some columns of a topic.
+
+    Args:
+        schema: All columns of the view.
+        fields: Columns of fields by name.
+        columns: Names of the columns to return.
+        where: Expression that holds for all rows; None for all.
+        reading: Collects what is read.
+    """
+
+    def __init__(
+        self,
+        schema: Any,
+        fields: Mapping[str, ViewColumn],
+        columns: Sequence[str],
+        where: Any,
+        reading: Reading,
+    ) -> None:
+        self._where = where
+        self._reading = reading
+        self._columns = list(columns)
+        self._schema = pa.schema([schema.field(name) for name in columns])
+        self._tested = [] if where is None else _named(str(where), schema.names)
+        self._all = pa.schema(
+            [schema.field(n) for n in dict.fromkeys([*self._columns, *self._tested])]
+        )
+        self._fields = {name: fields[name] for name in self._all.names if name in fields}
+        self._leaves = {
+            leaf.source + (("",) if leaf.is_summary else ()): leaf
+            for column in self._fields.values()
+            for path, leaf in column.leaves()
+            if reading.usage.uses(path)
+        }
+        self._own = {name for name in self._all.names if name in _TABLE_OWN} | {"state"}
+
+    def read(self, recording: TopicOfRecording, source: RowSource) -> Iterator[pa.RecordBatch]:
+        """The rows of a source."""
+        absent = {key: leaf for key, leaf in self._leaves.items() if _is_absent(leaf, source)}
+        held = [leaf for key, leaf in self._leaves.items() if key not in absent]
+        own = self._own | ({"ref", "channel"} if absent else set())
+        for rows in source.read(_paths(held), own, self._reading.counts):
+            self._remark(recording.topic, rows)
+            if not absent:
+                yield from self._finished(self._batch(recording, rows, {}), self._where)
+                continue
+            yield from self._with_payloads(recording, rows, absent)
+
+    def _with_payloads(
+        self,
+        recording: TopicOfRecording,
+        rows: Rows,
+        absent: Mapping[tuple[str, ...], ViewColumn],
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows with arrays from payloads, which are read of as few messages as possible."""
+        chosen = np.arange(rows.size)
+        where = self._where
+        tests_them = _named(str(where), [leaf.name for leaf in absent.values()])
+        if where is not None and not tests_them:
+            known = self._batch(recording, rows, {})
+            numbered = pa.table(
+                [*known.columns, pa.array(chosen)], schema=known.schema.append(_NUMBER)
+            )
+            chosen = numbered.filter(where).column(_NUMBER.name).to_numpy()
+            where = None
+        for some in _split(chosen, rows.own["ref"]):
+            part = _taken(rows, some)
+            values = _from_payloads(recording, part, absent, self._reading.counts)
+            yield from self._finished(self._batch(recording, part, values), where)
+
+    def _finished(self, batch: pa.RecordBatch, where: Any) -> Iterator[pa.RecordBatch]:
+        """Rows for which an expression holds, with the columns to return."""
+        if where is None:
+            found = [batch]
+        else:
+            found = pa.Table.from_batches([batch]).filter(where).to_batches()
+        for one in found:
+            if one.num_rows:
+                yield one.select(self._columns)
+
+    def _batch(
+        self,
+        recording: TopicOfRecording,
+        rows: Rows,
+        payloads: Mapping[tuple[str, ...], Any],
+    ) -> pa.RecordBatch:
+        def leaf(column: ViewColumn) -> Any:
+            key = column.source + (("",) if column.is_summary else ())
+            if key not in self._leaves:
+                return None
+            if key in payloads:
+                return payloads[key]
+            array = _at(rows.records, column.source)
+            if array is None or (lacks(array.type, column.kind) and not column.is_summary):
+                return None
+            return (summary_values if column.is_summary else fitted)(array, column.kind)
+
+        def missing(path: tuple[str, ...]) -> Any:
+            array = _at(rows.records, path)
+            if array is None:
+                return pa.array(np.ones(rows.size, np.bool_))
+            return array.is_null() if array.null_count else None
+
+        arrays = []
+        for name in self._all.names:
+            if name in self._fields:
+                arrays.append(self._fields[name].values(leaf, rows.size, missing))
+            elif name in rows.own:
+                arrays.append(rows.own[name].cast(self._all.field(name).type))
+            else:
+                arrays.append(_constant(name, recording.entry, rows.size))
+        return pa.RecordBatch.from_arrays(arrays, schema=self._all)
+
+    def _remark(self, topic: str, rows: Rows) -> None:
+        states = rows.own["state"]
+        for state, found in (
+            (UNREADABLE, self._reading.remarks.unreadable),
+            (REDUCED, self._reading.remarks.reduced),
+        ):
+            count = pc.sum(pc.equal(states, STATES[state])).as_py() or 0
+            if count:
+                found[topic] = found.get(topic, 0) + count
+
+
+_NUMBER: Final = pa.field("\0row", pa.int64())
+
+
+def _named(text: str, names: Sequence[str]) -> list[str]:
+    """Names of columns that may be in the text of an expression; some of them are not."""
+    words = set(_WORD.findall(text))
+    return [name for name in names if name in words or not _WORD.fullmatch(name)]
+
+
+def _is_absent(leaf: ViewColumn, source: RowSource) -> bool:
+    """True if a source has only summaries of an array."""
+    if leaf.is_summary or source.is_whole:
+        return False
+    kinds = (_type_at(kind, leaf.source) for kind in source.kinds)
+    return any(kind is not None and lacks(kind, leaf.kind) for kind in kinds)
+
+
+def _paths(leaves: Collection[ViewColumn]) -> list[str] | None:
+    """Dotted paths of fields; None if a name has a dot itself."""
+    if any("." in name or "[" in name for leaf in leaves for name in leaf.source):
+        return None
+    return list(dict.fromkeys(".".join(leaf.source) for leaf in leaves))
+
+
+def _at(records: Any, path: Sequence[str]) -> Any:
+    """Values at a path, null where a struct above is; None if there are none."""
+    for name in path:
+        place = records.type.get_field_index(name) if pa.types.is_struct(records.type) else -1
+        if place < 0:
+            return None
+        records = pc.struct_field(records, [place]) if records.null_count else records.field(place)
+    return records
+
+
+def _type_at(kind: Any, path: Sequence[str]) -> Any:
+    for name in path:
+        place = kind.get_field_index(name) if pa.types.is_struct(kind) else -1
+        if place < 0:
+            return None
+        kind = kind.field(place).type
+    return kind
+
+
+def _constant(name: str, entry: RecordingEntry, rows: int) -> Any:
+    """A column with the same value for all rows of a recording."""
+    if name == "recording":
+        return pa.repeat(pa.scalar(entry.label), rows)
+    tags = pa.array([list(entry.tags.items())], OWN.field("tags").type)
+    return tags.take(pa.array(np.zeros(rows, np.int64)))
+
+
+def _taken(rows: Rows, chosen: NDArray[np.int64]) -> Rows:
+    if len(chosen) == rows.size:
+        return rows
+    places = pa.array(chosen)
+    own = {name: column.take(places) for name, column in rows.own.items()}
+    return Rows(own, rows.records.take(places), len(chosen))
+
+
+def _split(chosen: NDArray[np.int64], ref: Any) -> Iterator[NDArray[np.int64]]:
+    """Rows in parts whose payloads are in memory together."""
+    if not len(chosen):
+        return
+    sizes = ref.field("len").to_numpy(zero_copy_only=False)[chosen].astype(np.int64)
+    part = np.cumsum(sizes) // _BATCH_BYTES
+    yield from np.split(chosen, np.flatnonzero(np.diff(part)) + 1)
+
+
+def _from_payloads(
+    recording: TopicOfRecording,
+    rows: Rows,
+    leaves: Mapping[tuple[str, ...], ViewColumn],
+    counts: ScanCounts,
+) -> dict[tuple[str, ...], Any]:
+    """Arrays of some messages, decoded from their payloads."""
+    ref = {
+        name: rows.own["ref"].field(name).to_numpy(zero_copy_only=False).astype(np.int64)
+        for name in ("seg", "chunk", "off", "len")
+    }
+    channel = rows.own["channel"].to_numpy(zero_copy_only=False)
+    is_whole = pc.equal(rows.own["state"], STATES[WHOLE]).to_numpy(zero_copy_only=False)
+    wanted = np.flatnonzero(is_whole)
+    order = wanted[np.lexsort((ref["off"][wanted], ref["chunk"][wanted], ref["seg"][wanted]))]
+    keys = np.stack([ref["seg"][order], ref["chunk"][order], channel[order]])
+    edges = np.flatnonzero((keys[:, 1:] != keys[:, :-1]).any(axis=0)) + 1
+    found: dict[tuple[str, ...], list[Any]] = {key: [] for key in leaves}
+    paths = _paths(list(leaves.values()))
+    for group in np.split(order, edges) if len(order) else ():
+        first = group[0]
+        chunk = recording.chunk(int(ref["seg"][first]), int(ref["chunk"][first]), counts)
+        codec = recording.channels[int(channel[first])].codec
+        decoded = codec.arrow(chunk.batch.buffer, ref["off"][group], ref["len"][group], paths)
+        counts.payload_bytes += int(ref["len"][group].sum())
+        for key, leaf in leaves.items():
+            values = _at(decoded.records, leaf.source)
+            if values is None:
+                made = pa.nulls(len(group), leaf.type)
+            else:
+                made = without(fitted(values, leaf.kind), decoded.rows, len(group))
+            found[key].append(made)
+    places = np.full(rows.size, -1, np.int64)
+    places[order] = np.arange(len(order))
+    back = pa.array(places, mask=places < 0)
+    return {
+        key: (pa.concat_arrays(arrays) if arrays else pa.nulls(0, leaves[key].type)).take(back)
+        for key, arrays in found.items()
+    }
+
+
+class TopicDataset(ds.Dataset):  # type: ignore[misc] # pyarrow has no types
+    """A topic as DuckDB reads it: columns and filters reach `TopicView.rows`.
+
+    DuckDB relies on the source for the filters that it hands over.
+
+    Args:
+        view: The topic.
+        reading: Returns what the current execution reads.
+    """
+
+    def __init__(self, view: TopicView, reading: Callable[[], Reading]) -> None:
+        self._view = view
+        self._reading = reading
+
+    @property
+    def schema(self) -> Any:
+        """All columns."""
+        return self._view.schema
+
+    def scanner(
+        self,
+        columns: Sequence[str] | None = None,
+        filter: Any = None,  # noqa: A002
+        **_: Any,
+    ) -> _Scanner:
+        """A scanner, whose reader DuckDB takes."""
+        names = self.schema.names if columns is None else list(columns)
+        return _Scanner(self._view, names, filter, self._reading())
+
+
+class _Scanner:
+    def __init__(self, view: TopicView, columns: Sequence[str], where: Any, reading: Reading):
+        self._view = view
+        self._columns = columns
+        self._where = where
+        self._reading = reading
+
+    @cached_property
+    def _schema(self) -> Any:
+        return pa.schema([self._view.schema.field(name) for name in self._columns])
+
+    def to_reader(self) -> Any:
+        """The rows as a stream of record batches."""
+        return pa.RecordBatchReader.from_batches(self._schema, self._batches())
+
+    def _batches(self) -> Iterator[pa.RecordBatch]:
+        try:
+            yield from self._view.rows(self._columns, self._where, self._reading)
+        except Exception as error:
+            self._reading.error = self._reading.error or error
+            raise

@@ -1,0 +1,232 @@
+"""A query reads the views of its store and nothing else, in bounded memory and time."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.sql import duck
+from hybridlog.sql.engine import SqlConnection
+from hybridlog.tables.parquet_file import ParquetFileReader
+from hybridlog_storage.errors import (
+    MissingDependencyError,
+    ResourceError,
+    SegmentError,
+    StoreError,
+    UsageError,
+)
+from tests.sql.conftest import LARGE, SCANS
+
+ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
+
+
+@pytest.fixture
+def connection(store: hl.Store) -> Iterator[SqlConnection]:
+    opened = store.sql_engine.connect()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def own(root: Path, tmp_path: Path) -> Iterator[hl.Store]:
+    """A copy of the store that a test may damage."""
+    shutil.copytree(root, tmp_path / "store", ignore=shutil.ignore_patterns("mongod*"))
+    with hl.open(tmp_path / "store", mongo="mongodb://127.0.0.1:1/") as opened:
+        yield opened
+
+
+REFUSED = """
+attach '{path}' as other
+attach '{path}' as other (type sqlite)
+copy (select 1) to '{path}'
+copy large to '{path}' (format parquet)
+copy (select 1) to stdout
+create table x as select * from read_csv('/etc/passwd')
+export database '{path}'
+import database '{path}'
+install httpfs
+install '{path}'
+load httpfs
+load '{path}'
+select * from '/etc/passwd'
+select * from '{path}.parquet'
+select * from glob('/etc/*')
+select * from own_variable
+select * from read_blob('/etc/passwd')
+select * from read_csv('/etc/passwd')
+select * from read_csv_auto('http://127.0.0.1/x.csv')
+select * from read_json('/etc/passwd')
+select * from read_parquet('{path}')
+select * from read_parquet('s3://bucket/x')
+select * from read_text('/etc/passwd')
+select * from sniff_csv('/etc/passwd')
+select * from parquet_metadata('{path}')
+select * from sqlite_scan('{path}', 'x')
+select getenv('HOME')
+set enable_external_access = true
+set global python_enable_replacements = true
+set lock_configuration = false
+set memory_limit = '10GB'
+set temp_directory = '{path}'
+set threads = 1
+set extension_directory = '{path}'
+set TimeZone = 'Asia/Tokyo'
+reset memory_limit
+pragma enable_profiling
+pragma profiling_output = '{path}'
+pragma memory_limit = '10GB'
+pragma threads = 9
+call enable_logging(storage = 'file', storage_path = '{path}')
+create persistent secret s (type s3)
+update extensions
+"""
+
+
+@pytest.mark.parametrize("statement", REFUSED.strip().splitlines())
+def test_a_query_reaches_nothing_else(
+    connection: SqlConnection, tmp_path: Path, statement: str
+) -> None:
+    own_variable = connection.query("select 1 as secret").to_arrow()
+    assert own_variable.num_rows == 1
+    with pytest.raises(UsageError):
+        connection.query(statement.format(path=tmp_path / "reached")).to_arrow()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_say_what_to_do(store: hl.Store, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"views of this store alone.*Cannot access file"):
+        store.sql(f"copy (select 1) to '{tmp_path / 'x'}'").rows()
+    with pytest.raises(UsageError, match='scn does not exist!\nDid you mean "scan"'):
+        store.sql("select * from scn join scan using (t)")
+    with pytest.raises(UsageError, match='syntax error at or near "selec"'):
+        store.sql("selec 1")
+    with pytest.raises(UsageError, match="The query is empty"):
+        store.sql("-- nothing")
+    with pytest.raises(UsageError, match="at least 64 MiB"):
+        store.sql("select 1", memory=1 << 20)
+    with pytest.raises(UsageError, match="ranges_sumary"):
+        store.sql("select ranges_sumary from scan")
+
+
+def test_memory_is_bounded(store: hl.Store) -> None:
+    large = "select a.range, list(b.range) from range(3000) a, range(20000) b group by all"
+    with pytest.raises(ResourceError, match=r"more than 64 MiB of memory.*--memory"):
+        store.sql(large, memory=64 << 20).rows()
+    answer = store.sql("select range from range(30000000)", memory=64 << 20)
+    assert sum(batch.num_rows for batch in answer.to_batches()) == 30_000_000
+
+
+def test_a_timeout_ends_a_query(store: hl.Store) -> None:
+    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+        store.sql(ENDLESS, timeout=0.2).rows()
+    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+        list(store.sql(ENDLESS, timeout=0.2).to_batches())
+    assert store.sql("select 1", timeout=60).rows() == [(1,)]
+
+
+def test_ctrl_c_ends_a_query(connection: SqlConnection) -> None:
+    timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        connection.query(ENDLESS).rows()
+    assert connection.query("select 1").rows() == [(1,)]
+
+
+def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> Any:
+        if name in {"duckdb", "polars"}:
+            raise ImportError(name)
+        return importlib.import_module(name)
+
+    with hl.open(root, mongo="mongodb://127.0.0.1:1/") as opened:
+        answer = opened.sql("select 1")
+        monkeypatch.setattr("hybridlog.sql.engine.import_module", missing)
+        with pytest.raises(MissingDependencyError, match="pip install polars"):
+            answer.to_polars()
+        monkeypatch.setattr(duck, "import_module", missing)
+        with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[sql\]'"):
+            opened.sql("select 1")
+
+
+def large_file(store: hl.Store) -> Path:
+    (path,) = (store.directory.path / "tables").glob("*/topic=large/*.parquet")
+    return path
+
+
+def test_missing_and_damaged_tables_are_made_again(own: hl.Store) -> None:
+    query = "select count(*), sum(i8), sum(covariance_summary.n) from large"
+    wanted = own.sql(query).rows()
+    path = large_file(own)
+    data = bytearray(path.read_bytes())
+    data[3000] ^= 1
+    own.close()
+    path.write_bytes(data)
+    with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
+        assert again.sql("select * from large").to_arrow().num_rows == wanted[0][0]
+        assert again.sql(query).rows() == wanted
+        assert [topic for _, topic in again.repairs.tables] == ["/large"]
+    ParquetFileReader(large_file(own)).check()
+    shutil.rmtree(own.directory.path / "tables")
+    with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
+        assert again.sql(query).rows() == wanted
+        assert again.repairs.tables
+
+
+def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
+    (entry,) = own.select(["first"])
+    channels = [c.id for c in entry.channels if c.topic == "/base/scan"]
+    chunk = own.session.chunks(entry, channels, None, "log")[3]
+    path = own.directory.recording("first") / "000000.mcap"
+    with path.open("r+b") as file:
+        file.seek(chunk.offset + 100)
+        file.write(b"\xff\x00\xff")
+    assert own.sql("select max(angle) from scan").rows() == [((SCANS - 1) / 2,)]
+    with pytest.raises(SegmentError, match="damaged"):
+        own.sql("select max(ranges[1]) from scan").rows()
+
+
+def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
+    query = "select count(*) from large where recording = 'first'"
+    before = own.sql(query)
+    assert before.rows() == [(LARGE,)]
+    folder = own.directory.recording("first")
+    folder.rename(folder.with_name("renamed"))
+    own.refresh()
+    assert own.sql(query).rows() == [(0,)]
+    assert own.sql("select distinct recording from large order by 1").rows() == [
+        ("renamed",),
+        ("second",),
+    ]
+    own.close()
+    with pytest.raises((UsageError, StoreError)):
+        before.rows()
+
+
+def test_threads_ask_at_once(store: hl.Store) -> None:
+    found: list[Any] = []
+
+    def ask() -> None:
+        query = "select count(*), max(ranges[1]) from scan"
+        found.extend(store.sql(query).rows() for _ in range(2))
+
+    threads = [threading.Thread(target=ask) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [[(SCANS, SCANS - 1)]] * 6
+
+
+def test_an_answer_that_is_left_early_reads_no_more(store: hl.Store) -> None:
+    answer = store.sql("select ranges from scan limit 3")
+    assert len(answer.rows()) == 3
+    assert answer.counts.row_groups < 3

@@ -1,0 +1,109 @@
+"""The paths that a query may use are found, and never too few."""
+
+from __future__ import annotations
+
+import duckdb
+import pytest
+
+from hybridlog.sql.engine import _TREE
+from hybridlog.sql.usage import EVERYTHING, usage_of
+
+VIEWS = ("scan", "odom", "topics")
+PATH = ("echo", "far")
+
+
+@pytest.fixture(scope="module")
+def parser() -> duckdb.DuckDBPyConnection:
+    return duckdb.connect()
+
+
+def uses(parser: duckdb.DuckDBPyConnection, query: str, path: tuple[str, ...] = PATH) -> bool:
+    ((tree,),) = parser.execute(_TREE, [query]).fetchall()
+    return usage_of(tree, VIEWS).uses(path)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "select t from scan",
+        "select echo.kind from scan where echo.kind > 2",
+        "select s.echo.kind as far from scan s order by far",
+        "select echo.kind k, count(*) from scan group by all having count(*) > 1 order by k",
+        "select a.echo.kind from scan a asof join odom b on a.t >= b.t where b.pose.x > 1",
+        "with z as (select echo.kind as k from scan) select k, z.k from z",
+        "select t from scan where exists (select 1 from odom o where o.t = scan.t)",
+        "select sum(echo.kind) over (partition by recording order by t) from scan",
+        "select list_transform(ranges, lambda x: x + 1) from scan",
+        "select t from scan cross join range(3)",
+        "select ECHO.Kind from SCAN",
+        "select t from scan union all by name select t from odom",
+        "select unnest([1, 2]) from scan",
+        "select case when echo.kind = 1 then t end from scan qualify row_number() over () = 1",
+        "select t from scan join odom using (t)",
+    ],
+)
+def test_unused(parser: duckdb.DuckDBPyConnection, query: str) -> None:
+    assert not uses(parser, query)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "select * from scan",
+        "from scan",
+        "select scan.* from scan",
+        "select * exclude (t) from scan",
+        "select * replace (1 as t) from scan",
+        "select columns('e.*') from scan",
+        "select echo from scan",
+        "select echo.far from scan",
+        "select Echo.FAR[3] from scan",
+        "select echo['far'] from scan",
+        "select (echo).far from scan",
+        "select s.echo.far.x from scan s",
+        "select x.far from (select echo as x from scan)",
+        "select s from scan s",
+        "select scan from scan",
+        "select z from (select t from scan) z",
+        "with z as (select t from scan) select z from z",
+        "select struct_extract(echo, 'far') from scan",
+        "select t from scan where echo is null",
+        "select t from scan order by echo",
+        "select t from scan group by t, echo",
+        "select unnest(echo) from scan",
+        "select #3 from scan",
+        "select t from scan natural join odom",
+        "select t from scan join odom using (echo)",
+        "select x from scan as s(x, y)",
+        "select t from scan order by all",
+        "select t from a_view_of_the_user",
+        "select t from a_macro()",
+        "select t from query('select * from scan')",
+        "select t from query_table('scan')",
+        "describe scan",
+        "summarize scan",
+        "pivot scan on t using sum(seq)",
+        "create table x as select t from scan",
+        "explain select t from scan",
+        "select count(s) from scan s",
+        "select t from scan where t in (select max(echo.far[1]) from odom)",
+        "select sum(t) over (order by echo) from scan",
+        "select list_transform([1], lambda x: echo.far[x]) from scan",
+        "select t from scan qualify row_number() over (order by echo.far) = 1",
+        "select t from scan s where s = s",
+    ],
+)
+def test_used(parser: duckdb.DuckDBPyConnection, query: str) -> None:
+    assert uses(parser, query)
+
+
+def test_paths_are_compared_by_whole_names(parser: duckdb.DuckDBPyConnection) -> None:
+    query = "select a.b.c, e.f from scan"
+    assert uses(parser, query, ("a", "b", "c"))
+    assert uses(parser, query, ("a", "b", "c", "d"))
+    assert uses(parser, query, ("b", "c"))
+    assert not uses(parser, query, ("a", "c"))
+    assert not uses(parser, query, ("a", "b", "d"))
+    assert not uses(parser, query, ("ab", "c"))
+    assert uses(parser, query, ("f",))
+    assert EVERYTHING.uses(("anything",))

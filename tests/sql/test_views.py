@@ -1,0 +1,295 @@
+"""Views hold what the messages say, and read no more than a query is about."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import duckdb
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.sql.engine import SqlAnswer
+from hybridlog.sql.pieces import TopicOfRecording
+from tests.sql.conftest import LARGE, SCANS
+from tests.tables.logs import BASE, SECOND, Decoded, decoded
+
+LATER = BASE + 3600 * SECOND
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two values are equal; NaN equals NaN."""
+    if isinstance(one, float) and isinstance(other, float):
+        return one == other or (math.isnan(one) and math.isnan(other))
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return bool(one == other)
+
+
+def listed(values: Any) -> list[Any]:
+    return np.asarray(values).tolist()
+
+
+def row_of(message: Decoded) -> tuple[Any, ...]:
+    value = message.value
+    stamp = value.header.stamp.sec * SECOND + value.header.stamp.nanosec
+    return (
+        message.t,
+        message.t // 1000,
+        message.seq,
+        message.pub,
+        stamp,
+        stamp,
+        value.header.seq,
+        value.i8,
+        value.u64,
+        value.f64,
+        bool(value.yes),
+        value.took.sec * SECOND + value.took.nanosec,
+        value.name,
+        listed(value.many),
+        listed(value.nine),
+        listed(value.covariance),
+        list(value.words),
+        [(float(p.x), float(p.X), listed(p.data)) for p in value.points],
+        value.t,
+        value.Name,
+        value.state,
+        36,
+        0.25,
+        len(value.many),
+    )
+
+
+FIELDS = """
+select t, epoch_us(log_time), seq, pub, stamp, epoch_ns(header.stamp), header.seq, i8, u64, f64,
+    yes, took, name, many, nine, covariance, words,
+    list_transform(points, lambda p: row(p.x, p.X_2, p.data)), t_, Name_2, state_,
+    covariance_summary.n, covariance_summary.max, many_summary.n
+from {} where recording = 'first' order by t, seq
+"""
+
+
+def rows_of(answer: SqlAnswer) -> list[tuple[Any, ...]]:
+    return [
+        tuple(
+            [tuple(v.values()) if isinstance(v, dict) else v for v in cell]
+            if isinstance(cell, list)
+            else cell
+            for cell in row
+        )
+        for row in answer.rows()
+    ]
+
+
+@pytest.mark.parametrize("topic", ["/large", "/mixed", "/order", "/recordings"])
+def test_a_view_holds_what_messages_say(store: hl.Store, topic: str) -> None:
+    view = store.sql_engine.content().names.views[topic]
+    found = rows_of(store.sql(FIELDS.format(f'"{view}"')))
+    wanted = [row_of(message) for message in decoded(store, "first", topic)]
+    if topic == "/mixed":  # numbers in one recording and texts in the other are JSON text
+        kinds = dict(store.sql(f'select column_name, column_type from (describe "{view}")').rows())
+        assert kinds["f64"] == "VARCHAR"
+        assert kinds["i8"] == "DOUBLE"
+        texts = store.sql(f'select f64 from "{view}" order by t desc limit 2').rows()
+        assert texts == [('"3.5"',), ('"2.5"',)]
+        found = [row[:9] + row[10:] for row in found]
+        wanted = [row[:9] + row[10:] for row in wanted]
+    assert len(found) == len(wanted) > 0
+    for one, other in zip(found, wanted, strict=True):
+        assert all(map(alike, one, other)), (one, other)
+
+
+def test_decoded_chunks_say_the_same(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic without a table is answered from its chunks, with the same columns."""
+    queries = ["select * from large order by t, seq", "select * from scan order by t, seq"]
+    with_tables = [store.sql(query) for query in queries]
+    tables = [answer.to_arrow() for answer in with_tables]
+    monkeypatch.setattr(TopicOfRecording, "table", None)
+    engine = type(store.sql_engine)(store.session)
+    for query, table in zip(queries, tables, strict=True):
+        answer = engine.connect().query(query)
+        found = answer.to_arrow()
+        assert found.schema == table.schema
+        assert str(found.to_pylist()) == str(table.to_pylist())  # NaN is not equal to itself
+        assert answer.counts.row_groups == 0
+        assert answer.counts.chunks > 0
+    assert all(answer.counts.row_groups for answer in with_tables)
+
+
+PREDICATES = """
+f64 < 1.5 | f64 <= 1.5 | f64 > 1.5 | f64 >= 1.5 | f64 = 1.5 | f64 <> 1.5 | not f64 < 1.5
+f64 = 'nan'::double | f64 > 'nan'::double | f64 <= 'nan'::double | f64 = 'inf'::double
+f64 between -1 and 600 | f64 in (1.5, 'nan'::double) | f64 not in (1.5, 7) | f64 = -0.0
+f64 is null | f64 is not null | isnan(f64) | f64 < 1 or f64 > 100 | f64 < 1 or name = 'laser'
+u64 > 9223372036854775807 | u64 = 18446744073709551615 | u64 in (0, 1) | u64 >= 9007199254740993
+i8 < 0 | i8 = 2 | i8 in (1, 2) | i8 <> 0 | not (i8 = 1 or i8 = 2) | i8 between -1 and 1
+name = 'ä' | name < 'b' | name > 'a' | name in ('', 'laser') | name like 'l%' | name is null
+yes | not yes | yes = true | yes is distinct from false | took = -1 | took < 0
+header.seq < 100 | header.seq = 7 and i8 = 0 | header.frame_id = 'map' | header is null
+header.stamp < timestamp_ns '2023-11-14 22:13:19.000000100' | nothing | nothing is null
+many is null | len(many) = 3 | many[1] > 1 | list_contains(words, 'x') | points[1].x = 0
+t < 1700000000300000000 | t >= 1700000000300000000 and t < 1700000000301000000 | t % 7 = 3
+log_time < timestamptz '2023-11-14 22:13:20.25Z' | log_time = timestamptz '2023-11-14 22:13:21Z'
+recording = 'second' | recording in ('first', 'x') | recording > 'first' | recording like 'f%'
+tags['site'] = 'hall' | tags is null | state = 'whole' | error is null | error = 'x' | pub > t
+stamp < 1700000000000000000 | recording = 'second' and f64 > 3 or t < 1700000000010000000
+covariance[3] = 0.25 | covariance_summary.max = 0.25 | many_summary.min < 0 | many_summary is null
+recording = 'nothing' | t > 9223372036854775806 | f64 is not distinct from 'nan'::double
+coalesce(f64, 0) < 5 | (f64 < 5) is null | i8 = any([1, 2]) | t in (1700000000000000000, 5)
+"""
+
+
+@pytest.fixture(scope="module")
+def plain(store: hl.Store) -> duckdb.DuckDBPyConnection:
+    """The same rows in a table of DuckDB's own."""
+    connection = duckdb.connect(config={"python_enable_replacements": False})
+    connection.execute("set TimeZone = 'UTC'")
+    connection.register("arrow", store.sql("select * from large").to_arrow())
+    connection.execute("create table large as select * from arrow")
+    return connection
+
+
+@pytest.mark.parametrize("line", PREDICATES.strip().splitlines())
+def test_pushed_filters_mean_what_duckdb_means(
+    store: hl.Store, plain: duckdb.DuckDBPyConnection, line: str
+) -> None:
+    for predicate in line.split(" | "):
+        query = f"select t, seq, recording from large where {predicate} order by all"
+        assert store.sql(query).rows() == plain.execute(query).fetchall(), predicate
+
+
+def test_time_and_recording_choose_what_is_read(store: hl.Store) -> None:
+    every = store.sql("select sum(i8) from large")
+    assert every.rows() == [(sum(n % 5 - 2 for n in range(LARGE)) + 200,)]
+    assert (len(every.counts.files), every.counts.row_groups) == (2, LARGE // 300 + 1)
+    middle = BASE + 450 * 1_000_001
+    for where, files, groups in (
+        (f"t = {middle}", 1, 1),
+        (f"t between {middle} and {middle + 1_000}", 1, 1),
+        (f"log_time >= make_timestamptz({middle // 1000}) and t < {middle + SECOND // 10}", 1, 1),
+        (f"t < {middle} or t >= {LATER}", 2, 3),
+        ("recording = 'second'", 1, 1),
+        ("recording = 'first'", 1, 4),
+        (f"t > {LATER + 100 * SECOND}", 0, 0),
+        ("recording = 'third'", 0, 0),
+    ):
+        answer = store.sql(f"select count(i8) from large where {where}")
+        answer.rows()
+        assert (len(answer.counts.files), answer.counts.row_groups) == (files, groups), where
+        assert answer.counts.payload_bytes == 0
+
+
+def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> None:
+    size = 4 + 4 + 400 + 1 + 4 + 50 + 160
+    for query, messages in (
+        ("select angle, ranges_summary.min, echo.kind, echo.far_summary.n from scan", 0),
+        ("select count(*) from scan where ranges_summary.min < 10", 0),
+        ("select s.echo.kind from scan s join large l on l.t = s.t", 0),
+        ("select ranges[3] from scan where angle < 5", 10),
+        ("select ranges from scan where ranges_summary.max < 109", 10),
+        ("select echo.far[1] from scan where echo.kind = 3 and angle < 10", 3),
+        ("select echo from scan where angle < 1", 2),
+        ("select s from scan s where angle < 1", 2),
+        ("select * exclude (ranges) from scan where angle < 1", 2),
+        ("select list_min(ranges) from scan", SCANS),
+        ("select count(*) from scan where ranges is not null", SCANS),
+    ):
+        answer = store.sql(query)
+        answer.rows()
+        assert answer.counts.payload_bytes == messages * size, query
+    found = store.sql(
+        "select ranges[3], echo.far[1], echo.data[50], len(echo.data), echo.kind, "
+        "ranges_summary.max, echo.data_summary.n from scan order by t"
+    ).rows()
+    assert found == [(n + 2.0, n / 4, n % 256, 50, n % 7, n + 99.0, 50) for n in range(SCANS)]
+
+
+def test_each_chunk_is_read_once(store: hl.Store) -> None:
+    chunks = {
+        (chunk.segment, chunk.number)
+        for entry in store.recordings()
+        for chunk in store.session.chunks(
+            entry,
+            [c.id for c in entry.channels if c.topic == "/base/scan"],
+            None,
+            "log",
+        )
+        if any(c in chunk.stats for c in [c.id for c in entry.channels if c.topic == "/base/scan"])
+    }
+    answer = store.sql("select sum(ranges[1]) from scan")
+    assert answer.rows() == [(sum(range(SCANS)),)]
+    assert answer.counts.chunks == len(chunks) > 3
+
+
+def test_asof_join(store: hl.Store) -> None:
+    found = store.sql(
+        "select s.t, l.t from scan s asof join large l on s.t >= l.t order by s.t"
+    ).rows()
+    large = np.array([BASE + n * 1_000_001 for n in range(LARGE)])
+    times = [BASE + n * 2_000_000 + 5 for n in range(SCANS)]
+    assert found == [
+        (t, int(large[np.searchsorted(large, t, "right") - 1])) for t in times if t >= large[0]
+    ]
+
+
+def test_names(store: hl.Store) -> None:
+    topics = store.sql("select distinct topic, view, short from topics order by topic").rows()
+    assert [(t, s) for t, _, s in topics if s] == [("/base/scan", "scan")]
+    views = {topic: view for topic, view, _ in topics}
+    assert views["/recordings"] == "recordings_"  # ours is reserved, theirs stays
+    assert (views["/large"], views["/Large"]) == ("large", "Large_2")
+    assert views["/a b"].startswith("a_b~")
+    for topic, view in views.items():
+        ((count,),) = store.sql(f'select count(*) from "{view}"').rows()
+        assert count == store.topic(topic).count(), topic
+    assert store.sql("select count(*) from SCAN").rows() == [(SCANS,)]
+    assert store.sql("select count(*) from base__scan").rows() == [(SCANS,)]
+    shown = {name for (name,) in store.sql("show tables").rows()}
+    assert shown == {*views.values(), "scan", "recordings", "topics", "losses", "marks"}
+
+
+def test_tables_about_the_store(store: hl.Store) -> None:
+    found = store.sql(
+        "select recording, tags['site'], status, messages, first_t from recordings order by first_t"
+    ).rows()
+    entries = store.recordings()
+    assert found == [
+        (e.label, e.tags.get("site"), e.status, e.messages, e.span[0] if e.span else None)
+        for e in entries
+    ]
+    assert store.sql("select * from losses").rows() == []
+    messages = store.sql("select topic, sum(messages) from topics group by all").rows()
+    assert dict(messages) == {topic: store.topic(topic).count() for topic in store.topics()}
+
+
+def test_forms_of_an_answer(store: hl.Store) -> None:
+    query = "select recording, i8, f64, name, header.stamp from large order by t, seq"
+    table = store.sql(query).to_arrow()
+    assert store.sql(query).to_polars().to_arrow().num_rows == table.num_rows
+    frame = store.sql(query).to_pandas()
+    assert list(frame.columns) == table.column_names
+    assert frame.i8.tolist() == table.column("i8").to_pylist()
+    batches = list(store.sql(query).to_batches())
+    assert sum(batch.num_rows for batch in batches) == table.num_rows
+    nothing = list(store.sql(f"{query} limit 0").to_batches())
+    assert [batch.num_rows for batch in nothing] == [0]
+    assert nothing[0].schema.names == table.column_names
+    assert "recording" in repr(store.sql(query))
+    first = next(iter(store.sql(query).to_batches()))  # the rest is not read
+    assert first.num_rows
+
+
+def test_parameters_and_several_statements(store: hl.Store) -> None:
+    assert store.sql("select count(*) from large where i8 = ?", [5]).rows() == [(40,)]
+    counted = store.sql("select count(*) from large where i8 = $n", {"n": 5})
+    assert counted.rows() == [(40,)]
+    made = store.sql("create table few as select * from scan limit 7; select count(*) from few")
+    assert made.rows() == [(7,)]
+    # What a view of the user reads is not in the text of the next query.
+    own = "create view v as select echo from scan where angle < 1; select max(v.echo.far[1]) from v"
+    assert store.sql(own).rows() == [(0.25,)]
+    macro = "create macro m() as (select max(echo.far[1]) from scan); select m()"
+    assert store.sql(macro).rows() == [((SCANS - 1) / 4,)]
+    assert store.sql("create table x (a int)").rows() == []
