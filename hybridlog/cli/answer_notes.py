@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
@@ -46,6 +47,18 @@ def print_gaps(query: Query, between: tuple[str, str] | None) -> None:
         between: Its time range as typed, by the log clock; None for all times.
     """
     for line in gaps(query.doubtful(), query.topics, between):
+        output.note(line)
+
+
+def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None = None) -> None:
+    """Print what is to be known about an answer, a line each.
+
+    Args:
+        query: The query that was answered.
+        topics: Its topics as typed.
+        is_empty: The answer was empty; None to tell by its counters.
+    """
+    for line in query.remarks(*topics, is_empty=is_empty):
         output.note(line)
 
 

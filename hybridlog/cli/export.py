@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import latched, print_gaps
+from hybridlog.cli.answer_notes import latched, print_gaps, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -85,6 +85,8 @@ def command(
         else:
             _write_directory(query, form, target, force=force, quiet=quiet)
         if not quiet:
+            if form in _EXACT:
+                print_remarks(query, topic)
             print_gaps(query, between)
 
 

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_reduced, print_unreadable
+from hybridlog.cli.answer_notes import (
+    print_cost,
+    print_gaps,
+    print_reduced,
+    print_remarks,
+    print_unreadable,
+)
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, replacing
@@ -144,7 +150,8 @@ def command(**parameters: Any) -> None:
     path = _path(choices, form)
     started = time.monotonic()
     with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
-        query = asked = _query(store, choices)
+        events = _events(store, choices)
+        query = asked = _query(store, choices, events)
         between = choices.between if choices.clock == "log" else None
         if choices.at is not None:
             try:
@@ -162,6 +169,9 @@ def command(**parameters: Any) -> None:
         sys.stdout.flush()
         if not choices.quiet:
             print_cost(query.counters, time.monotonic() - started, count=choices.count)
+            if choices.event is not None and events is not None:
+                print_remarks(events, choices.event[:1], is_empty=not asked.question.during)
+            print_remarks(query, choices.topic)
             print_gaps(asked, between)
 
 
@@ -189,14 +199,19 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
     return query
 
 
-def _query(store: Store, choices: _Choices) -> Query:
+def _events(store: Store, choices: _Choices) -> Query | None:
+    if choices.event is None:
+        return None
+    topic, predicate = choices.event
+    return query_of(store, [topic], choices.choice).where(predicate)
+
+
+def _query(store: Store, choices: _Choices, events: Query | None) -> Query:
     query = query_of(store, choices.topic, choices.choice)
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)
-    if choices.event is not None:
-        topic, predicate = choices.event
-        events = query_of(store, [topic], choices.choice).where(predicate)
+    if events is not None:
         query = query.around(events, choices.before or 0, choices.after or 0)
     for predicate in choices.where:
         query = query.where(predicate)

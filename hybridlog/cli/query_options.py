@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.choice import Choice
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
+
+
+_SHOWN = 5  # recordings in a message
 
 
 def recordings_of(store: Store, choice: Choice) -> Recordings:
@@ -68,7 +72,10 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
     chosen = recordings_of(store, choice)
     if not topics:
         return chosen.all_topics()
-    with _name_open_recordings(lambda: chosen.summaries):
+    with (
+        _name_open_recordings(lambda: chosen.summaries),
+        _name_other_recordings(store, topics, chosen.topics()),
+    ):
         return chosen.topic(*topics)
 
 
@@ -87,6 +94,29 @@ def _name_open_recordings(
         raise TopicError(
             f"{error}; {', '.join(names)} {are} still being recorded: ask again when that has ended"
         ) from error
+
+
+@contextmanager
+def _name_other_recordings(
+    store: Store, topics: Sequence[str], known: Collection[str]
+) -> Iterator[None]:
+    """Add the recordings that have a topic to the error that the chosen ones do not."""
+    try:
+        yield
+    except TopicError as error:
+        for topic in topics:
+            having: set[str] = set()
+            with suppress(TopicError):
+                query = store.topic(topic)
+                if set(query.topics).isdisjoint(known):
+                    having = set(query.recordings)
+            labels = [one.label for one in store.summaries() if one.id in having]
+            if labels:
+                have = "has" if len(labels) == 1 else "have"
+                raise TopicError(
+                    f"{error}; in the store, {listed(labels, _SHOWN)} {have} such a topic"
+                ) from error
+        raise
 
 
 def parse_fields(text: str, option: str = "--fields") -> list[str]:

@@ -55,7 +55,8 @@ class Matches(NamedTuple):
 
     Attributes:
         holds: bool[n], True where the predicate holds.
-        unreadable: Number of messages that do not fit their definition and have no fields.
+        unreadable: Number of messages of which the predicate could not be asked, because they
+            do not fit their definition.
     """
 
     holds: NDArray[np.bool_]
@@ -105,7 +106,8 @@ class MessageFilter:
         if len(unreadable):
             rest = self._one_by_one(channel, batch, seq, unreadable)
             holds[unreadable] = rest.holds[unreadable]
-        return Matches(holds, len(unreadable))
+            return Matches(holds, rest.unreadable)
+        return Matches(holds, 0)
 
     def _one_by_one(
         self,
@@ -120,8 +122,8 @@ class MessageFilter:
             try:
                 fields = dict(channel.codec.plain(batch.payload(row), self._fields))
             except (PayloadError, DefinitionError):
-                unreadable += 1
                 if self._fields != {"_meta"}:
+                    unreadable += 1
                     continue
                 fields = {}
             if "_meta" in self._fields:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -80,6 +81,7 @@ class Planner:
         self.question = question
         self.counters = counters
         self._asked: Sequence[Part] = ()  # parts that are answered at the same time
+        self._told: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
         self._scan = PayloadScan(session, counters)
         self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
@@ -131,15 +133,19 @@ class Planner:
             if channel.channel.topic in wanted:
                 self._check_clock(channel)
                 by_topic[channel.channel.topic].append(channel)
+        predicate = self.question.predicate
+        asks_fields = predicate is not None and predicate.asks_fields
         for topic, channels in by_topic.items():
+            blind = [c for c in channels if asks_fields and _has_no_fields(c)]
             yield Part(
                 recording,
                 topic,
-                tuple(channels),
+                tuple(c for c in channels if not asks_fields or not _has_no_fields(c)),
                 bounds,
                 self.question.clock,
                 windows,
-                self.question.predicate,
+                predicate,
+                tuple(blind),
             )
 
     def channels(self) -> list[RecordedChannel]:
@@ -228,6 +234,7 @@ class Planner:
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """For each message of a part, whether it matches, in order."""
+        self._tell_unasked([part])
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
@@ -246,6 +253,7 @@ class Planner:
         if not self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields):
             # Only MongoDB finds the messages; the fields are those of the messages.
             return self._scan.values_of(self.plan([part]), fields)
+        self._tell_unasked([part])
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
     def runs(self) -> Iterator[MessageRun]:
@@ -305,6 +313,7 @@ class Planner:
         from hybridlog.query.message_filter import MessageFilter
 
         self.together(parts)
+        self._tell_unasked(parts)
         selecting: dict[Engine, list[Part]] = defaultdict(list)
         unindexed: set[int] = set()
         filters: dict[int, MessageFilter] = {}
@@ -348,6 +357,24 @@ class Planner:
 
         plan.selector = select if selecting else None
         return plan
+
+    def _tell_unasked(self, parts: Sequence[Part]) -> None:
+        """Count, once, the messages of which the predicate cannot be asked for want of fields.
+
+        Engines count the messages that they find to be unreadable.
+        """
+        for part in parts:
+            if part in self._told or part.predicate is None:
+                continue
+            self._told.add(part)
+            if part.blind:
+                unseen = replace(part, channels=part.blind, blind=(), predicate=None)
+                by_times = self._catalog[1]
+                is_known = by_times.cost(unseen, Need.COUNT) is not None
+                engine = by_times if is_known else self._scan
+                self.counters.unreadable += engine.count([unseen])
+            if part.predicate.is_opaque and self._mongo.reaches(part):
+                self.counters.unreadable += self._mongo.count_unasked(part)
 
     def _undecided(self, part: Part) -> Predicate | None:
         """The share of a part's predicate that is left when MongoDB has answered."""
@@ -402,6 +429,7 @@ class Planner:
 
     def _count(self, parts: Sequence[Part]) -> int:
         self.together(parts)
+        self._tell_unasked(parts)
         groups: dict[Engine, list[Part]] = defaultdict(list)
         narrowed: list[Part] = []
         for part in parts:
@@ -513,6 +541,11 @@ class Planner:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
+
+
+def _has_no_fields(channel: RecordedChannel) -> bool:
+    """True if the messages of a channel are not decoded, for example without a definition."""
+    return not channel.is_reduced and not channel.codec.indexed
 
 
 def _last_key(item: Outcomes | Values) -> _Key | None:

@@ -372,6 +372,7 @@ class Query:
                 asked = self.question.recordings
                 if asked is not None and not self._session.snapshot().by_id.keys() >= set(asked):
                     raise
+                self.counters.reset()
                 found = Planner(self._session, self.question, self.counters).count()
             self.counters.messages = found
         return found
@@ -648,6 +649,23 @@ class Query:
     def doubtful(self) -> list[RecordingEntry]:
         """The recordings that have losses, have not ended, or are not proved to be whole."""
         return self._session.doubtful(self.question)
+
+    def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
+        """Sentences about the last answer.
+
+        They tell how many messages the predicate could not be asked of, which topics lack its
+        fields, header stamps of another epoch, and likely causes of an empty answer.
+
+        Args:
+            names: The topics as they were written; further topics may end with a short name.
+            is_empty: Whether the answer was empty; without, if `counters` has no messages.
+        """
+        from hybridlog.query.answers.remarks import remarks
+
+        if is_empty is None:
+            is_empty = not self.counters.messages
+        found = remarks(self._session, self.question, self.counters, names, is_empty=is_empty)
+        return [*found]
 
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""

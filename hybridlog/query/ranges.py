@@ -14,6 +14,7 @@ from hybridlog.query.times import (
     parse_range,
     parse_time,
 )
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
@@ -242,4 +243,16 @@ class RangeResolver:
         if not spans:
             start, end = self._clock_span(summaries[places[0]])
             parse_range(begin, stop, start=start, end=end)
-        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")
+        raise TimeError(
+            f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self._others()}"
+        )
+
+    def _others(self) -> str:
+        """A sentence about recordings that span the range and were not asked; or nothing."""
+        shared = self._shared_bounds()
+        if self._question.recordings is None or shared is None:
+            return ""
+        snapshot = self._session.snapshot()
+        places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
+        labels = [snapshot.summaries[place].label for place in places]
+        return f" Other recordings span that time: {listed(labels, _SHOWN)}." if labels else ""

@@ -449,3 +449,17 @@ def test_pandas_is_not_loaded(form: str, store: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "False"
+
+
+def test_remarks_follow_the_closing_line(store: Path) -> None:
+    done = run("fetch", "-t", "/long", "--where", "data > 0", "--count", store=store)
+    assert "messages could not be asked: they do not fit their definition" in done.err
+    silent = run("fetch", "-t", "/long", "--where", "data > 0", "--count", "-q", store=store)
+    assert (silent.out, silent.err) == (done.out, "")
+    events = ("--event", "/long", "data > 9", "--before", "1s")
+    done = run("fetch", "-t", "/json", *events, "--count", store=store)
+    assert "messages could not be asked" in done.err
+    assert "No time is asked for: there are no events" in done.err
+    done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
+    assert "there is no topic 'odom'" in done.err
+    assert "in the store, robot has such a topic" in done.err

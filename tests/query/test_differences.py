@@ -180,3 +180,98 @@ def test_only_mongodb_finds_and_the_messages_tell(store: hl.Store) -> None:
     assert query.count() == len(list(query)) == query.to_arrow().num_rows == 4
     assert sum(table.num_rows for table in query.to_tables()) == 4
     assert len(query.changes("v", pause="0s")) == 1
+
+
+# Messages that a predicate cannot be asked of.
+
+TEXTS = Schema("pkg/T", "ros1msg", b"int32 n\nstring text")
+
+
+def text_of(n: int, text: str) -> bytes:
+    return np.int32(n).tobytes() + np.uint32(len(text)).tobytes() + text.encode()
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """Topics with fields too large for a document, unreadable payloads and no definition."""
+    large = "x" * 9_000_000
+    ros, as_text = Channel("/r", "ros1", TEXTS), Channel("/j", "json", None)
+    mixed = [Channel("/mixed", "ros1", TEXTS), Channel("/mixed", "cbor", None)]
+    nothing = Channel("/nothing", "ros1", None)
+    rows: list[tuple[Channel, bytes]] = []
+    for n in range(6):
+        text = large if n % 3 == 2 else "abc"
+        rows.append((ros, b"short" if n == 4 else text_of(n, text)))
+        fields = b"{broken" if n == 4 else json.dumps({"n": n, "text": text}).encode()
+        rows.append((as_text, fields))
+        rows.append((mixed[n % 2], text_of(n, "abc")))
+        rows.append((nothing, b"abc"))
+    path = tmp_path_factory.mktemp("blind") / "store"
+    with hl.open(path, create=True, require_database=True) as opened:
+        with opened.start("log") as recording:
+            for number, (channel, payload) in enumerate(rows):
+                recording.write(channel, payload, log_time=(1 + number // 4) * SECOND)
+        yield opened
+
+
+@pytest.mark.parametrize("way", [*WAYS])
+@pytest.mark.parametrize(
+    ("topic", "between", "predicate", "want", "unasked"),
+    [
+        ("/r", None, "n > 1", [3, 4, 6], 1),
+        ("/r", None, "n != 1", [1, 3, 4, 6], 1),
+        ("/r", None, "not (n > 1)", [1, 2], 1),
+        ("/r", None, "text ~ 'xxx'", [3, 6], 1),
+        ("/r", None, {"n": {"$gt": 1}}, [3, 4, 6], 1),
+        ("/r", (4, 6), "n > 1", [4], 1),
+        ("/r", (1, 5), "n > 1", [3, 4], 0),
+        ("/r", (6, 7), "n > 1", [6], 0),
+        ("/r", None, "_meta.t > 1", [1, 2, 3, 4, 5, 6], 0),
+        ("/j", None, "n > 1", [3, 4, 6], 1),
+        ("/j", (4, 6), "n != 3", [], 1),
+        ("/mixed", None, "n > 1", [3, 5], 3),
+        ("/mixed", (1, 3), "n != 9", [1], 1),
+        ("/nothing", None, "n != 9", [], 6),
+        ("/nothing", (2, 4), "n missing", [], 2),
+        ("/nothing", None, "_meta.t > 1", [1, 2, 3, 4, 5, 6], 0),
+    ],
+)
+def test_what_a_predicate_cannot_be_asked_of_is_counted(
+    blind: hl.Store,
+    way: str,
+    topic: str,
+    between: tuple[int, int] | None,
+    predicate: Any,
+    want: list[int],
+    unasked: int,
+) -> None:
+    query = blind.topic(topic).where(predicate)
+    if between is not None:
+        query = query.between(between[0] * SECOND, between[1] * SECOND)
+    if way == "mongo" and topic in {"/mixed", "/nothing"}:
+        way = "planner"  # documents do not tell channels apart
+    with only(way):
+        assert (query.count(), query.counters.unreadable) == (len(want), unasked)
+        assert [m.log_time_ns // SECOND for m in query] == want
+        assert query.counters.unreadable == unasked
+    with only("planner" if way == "mongo" else way):
+        found = query.windows(0, "1ns")
+        assert (len(found), query.counters.unreadable) == (len(want), unasked)
+        held = query.intervals(max_gap="1ns")
+        assert (sum(i.messages for i in held), query.counters.unreadable) == (len(want), unasked)
+
+
+def test_a_filter_that_only_mongodb_understands_sees_documents_only(blind: hl.Store) -> None:
+    query = blind.topic("/r").where({"$expr": {"$gt": ["$n", 1]}})
+    assert (query.count(), query.counters.unreadable) == (1, 3)
+    assert [m.log_time_ns // SECOND for m in query] == [4]
+    assert query.counters.unreadable == 3
+    assert query.between(4 * SECOND, 6 * SECOND).count() == 1
+    near = query.between(1 * SECOND, 3 * SECOND)
+    assert (near.count(), near.counters.unreadable) == (0, 0)
+
+
+def test_index_documents_are_those_of_the_messages_that_match(blind: hl.Store) -> None:
+    found = [*blind.topic("/r").where("n > 1").documents()]
+    assert [d["_meta"]["t"] // SECOND for d in found] == [3, 4, 6]
+    assert [d.get("n") for d in found] == [None, 3, None]

@@ -174,6 +174,16 @@ class IntervalQueries:
             span: The span.
             first: From `_just_before`.
         """
+        counters = self._planner.counters
+        unreadable = counters.unreadable  # within the span; others are not of the answer
+        try:
+            return self._outcome_before(part, span, first)
+        finally:
+            counters.unreadable = unreadable
+
+    def _outcome_before(
+        self, part: Part, span: Span, first: Sequence[Part]
+    ) -> tuple[int, bool] | None:
         further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
         for earlier in (*first, *further):
             last = None

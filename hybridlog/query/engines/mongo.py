@@ -38,6 +38,7 @@ _AHEAD = 200_000  # messages whose keys are read at once
 _MOST_APART = 100  # ranges of log time: as many as one command asks for
 _Filter = dict[str, object]
 _READABLE: _Filter = {"_meta.error": {"$exists": False}}
+_WITHOUT_FIELDS: _Filter = {"_meta.error": {"$exists": True}}
 
 
 class Mongo:
@@ -69,7 +70,9 @@ class Mongo:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
-        if need is Need.VALUES or self._is_away or _is_older(part) or not part.is_indexed:
+        # Documents do not tell the channels of a topic apart, so none may be blind.
+        is_answered = part.is_indexed and not part.blind and not _is_older(part)
+        if need is Need.VALUES or self._is_away or not is_answered:
             return None
         if not self.reaches(part):
             return None
@@ -101,14 +104,24 @@ class Mongo:
         if part.predicate is None:
             return to_mongo(And(()))
         found = to_mongo(part.predicate.root, part.field_types)
-        is_open = part.recording.status == "open"
-        if not is_open and not any(stats.unreadable for stats in part.stats):
+        if not _lacks_fields(part):
             return found
-        if not part.predicate.asks_fields:
-            return found
-        # An unreadable message has no fields.
-        possible, certain = (joined(_READABLE, f) for f in (found.filter, found.certain))
-        return MongoFilter(possible, certain, found.is_exact)
+        certain = joined(_READABLE, found.certain)
+        if part.predicate.is_opaque:
+            return MongoFilter(joined(_READABLE, found.filter), certain, found.is_exact)
+        # Fields that were too large for a document are in the message, which decides.
+        possible: _Filter = {"$or": [joined(_READABLE, found.filter), _WITHOUT_FIELDS]}
+        return MongoFilter(possible, certain, is_exact=False)
+
+    def count_unasked(self, part: Part) -> int:
+        """Number of documents without fields, of which a filter for MongoDB cannot be asked.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+            IndexChangedError: another process changes the index.
+        """
+        asked = [question for question, _ in self._questions([part], lambda _: _WITHOUT_FIELDS)]
+        return sum(self._index([part]).count_each(asked))
 
     def undecided(self, part: Part) -> int:
         """Number of documents that cannot decide whether their message matches.
@@ -148,7 +161,8 @@ class Mongo:
             DatabaseError: MongoDB is unavailable.
             IndexChangedError: another process changes the index.
         """
-        asked = [question for question, _ in self._questions(parts, lambda f: f.filter)]
+        # Where it decides, both filters find the same; this one also if a document comes now.
+        asked = [question for question, _ in self._questions(parts, lambda f: f.certain)]
         return sum(self._index(parts).count_each(asked))
 
     def counts(self, parts: Sequence[Part]) -> Iterator[tuple[Part, int]]:
@@ -171,7 +185,7 @@ class Mongo:
         if part in self._ahead or self._look_ahead(part):
             yield from self._ahead.pop(part)
             return
-        own = self.filter_of(part).filter
+        own = self.filter_of(part).certain
         place = self._place(part)
         for condition, _ in conditions(part, place):
             yes = self._keys(part, place, joined(condition, own))
@@ -194,10 +208,10 @@ class Mongo:
                 group.append(other)
         if len(group) < 2:
             return False
-        yes = self._all_keys(group, lambda found: found.filter)
+        yes = self._all_keys(group, lambda found: found.certain)
         no = yes.take(slice(0))
-        if self.filter_of(part).filter:
-            no = self._all_keys(group, lambda found: {"$nor": [found.filter]})
+        if self.filter_of(part).certain:
+            no = self._all_keys(group, lambda found: {"$nor": [found.certain]})
         for one in group:
             both = (iter([k] if len(k) else []) for k in (_keys_in(yes, one), _keys_in(no, one)))
             self._ahead[one] = [*_merged(*both)]
@@ -370,6 +384,13 @@ class Mongo:
             self._counters.documents_read += len(keys)
             if len(keys):
                 yield keys
+
+
+def _lacks_fields(part: Part) -> bool:
+    """True if documents of a part may have no fields: unreadable messages, or too large ones."""
+    if part.predicate is None or not part.predicate.asks_fields:
+        return False
+    return part.recording.status == "open" or any(stats.unreadable for stats in part.stats)
 
 
 def _is_older(part: Part) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,13 @@ _FIXED_ARRAY = re.compile(_SINGLE.pattern + r"\[(?P<length>\d+)\]")
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 
 
+class _Count(NamedTuple):
+    """Numbers of messages of a part."""
+
+    matched: int
+    unreadable: int
+
+
 class TablesEngine:
     """Reads only the columns of the question.
 
@@ -44,7 +51,8 @@ class TablesEngine:
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session
         self._counters = counters
-        self._counts: dict[Part, int] = {}
+        self._counts: dict[Part, _Count] = {}
+        self._told: set[Part] = set()
         self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
@@ -71,7 +79,8 @@ class TablesEngine:
         if is_lossy or (need is Need.VALUES and not _are_whole(part, fields)):
             return None
         table = self._session.table(part.recording, part.topic)
-        if table is None or table.reduced or table.unreadable:
+        is_whole = table is not None and not (table.reduced or part.blind)
+        if table is None or not is_whole or (table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
         # A table may be older than the package that reads the messages.
         is_older = not table.has_fields and any(c.codec.indexed for c in part.channels)
@@ -84,18 +93,31 @@ class TablesEngine:
             UndecidedError: the columns of a table cannot decide.
             StoreError: a table is damaged.
         """
-        return sum(map(self.check, parts))
+        found = [*map(self.check, parts)]
+        self._tell_unreadable(parts)
+        return sum(found)
 
     def check(self, part: Part) -> int:
         """The count of one part; confirms that the columns can decide."""
         if part not in self._counts:
-            rows = self._rows(part)
-            self._counts[part] = sum(int(holds.sum()) for _, holds in rows)
-        return self._counts[part]
+            matched = unreadable = 0
+            for rows, holds in self._rows(part):
+                matched += int(holds.sum())
+                unreadable += int(_are_unreadable(rows).sum())
+            self._counts[part] = _Count(matched, unreadable)
+        return self._counts[part].matched
+
+    def _tell_unreadable(self, parts: Sequence[Part]) -> None:
+        """Count the unreadable messages of parts that are answered, once."""
+        for part in parts:
+            if part not in self._told:
+                self._told.add(part)
+                self._counters.unreadable += self._counts[part].unreadable
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """The outcome for each row, in order."""
         self.check(part)
+        self._tell_unreadable([part])
         for rows, holds in self._rows(part):
             yield Outcomes(rows.t, rows.seq, holds)
 
@@ -103,6 +125,7 @@ class TablesEngine:
         """Columns of the rows for which the predicate holds, in order."""
         if part.predicate is not None:
             self.check(part)
+            self._tell_unreadable([part])
         for rows, holds in self._rows(part, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
             if len(chosen):
@@ -111,6 +134,9 @@ class TablesEngine:
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """References of the rows for which the predicate holds."""
         wanted = {task.key for task in tasks}
+        for part in parts:
+            self.check(part)
+        self._tell_unreadable(parts)
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         for part in parts:
             if part not in self._places:
@@ -154,11 +180,14 @@ class TablesEngine:
         columns = {*own}
         if part.predicate is not None and "_meta.pub" in part.predicate.fields():
             columns.add("pub")
+        asks_fields = part.predicate is not None and part.predicate.asks_fields
+        if asks_fields and table.unreadable:
+            columns.add("state")
         paths = _wanted(table, part, fields)
         self._counters.bytes_read += int(table.size(paths, own) * min(part.share * 1.2, 1.0))
         try:
             for rows in table.scan(paths, own=columns, spans=spans):
-                yield rows, self._holds(part, rows)
+                yield rows, self._holds(part, rows) & ~_are_unreadable(rows)
         except StoreError:
             self._session.reject_table(part.recording, part.topic)
             raise
@@ -178,6 +207,16 @@ class TablesEngine:
         if found is None:
             raise UndecidedError(f"The table of {part.topic} cannot tell.")
         return found
+
+
+def _are_unreadable(rows: TableRows) -> NDArray[np.bool_]:
+    """bool[n], True for messages without fields; none if the column was not read."""
+    import pyarrow.compute as pc
+
+    state = rows.own.get("state")
+    if state is None:
+        return np.zeros(len(rows), np.bool_)
+    return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
 
 
 _REFERENCE = ("seg", "chunk", "off")

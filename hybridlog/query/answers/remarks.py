@@ -1,0 +1,222 @@
+"""Remarks on an answer: messages that a predicate could not see, likely causes of no answer."""
+
+from __future__ import annotations
+
+import difflib
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.predicate.tree import Exists, is_meta
+from hybridlog.query.question import field_types
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import format_time
+from hybridlog.query.topics import namesakes
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TimeError
+
+if TYPE_CHECKING:
+    from hybridlog.query.question import Question, RecordedChannel, Span
+    from hybridlog.session import Session
+
+_MOST = 100  # recordings looked at
+_SHOWN = 5  # names in a remark
+_APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have other epochs
+
+
+def remarks(
+    session: Session,
+    question: Question,
+    counters: Counters,
+    names: Sequence[str],
+    *,
+    is_empty: bool,
+) -> Iterator[str]:
+    """Sentences about an answer, for people.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Of its answer.
+        names: The topics as they were written.
+        is_empty: The answer has no messages or intervals.
+    """
+    asks_fields = question.predicate is not None and question.predicate.asks_fields
+    if question.predicate is not None and asks_fields and counters.unreadable:
+        yield _unasked(counters.unreadable, is_opaque=question.predicate.is_opaque)
+    for name in names:
+        yield from _about_name(session, question, name)
+    if question.clock == "header" and question.bounds is not None:
+        yield from _about_stamps(session, question)
+    yield from _missing_fields(session, question, is_empty=is_empty)
+    if is_empty and question.limit != 0:
+        yield from _causes(session, question)
+
+
+def _unasked(messages: int, *, is_opaque: bool) -> str:
+    one = messages == 1
+    subject = "1 message" if one else f"{messages} messages"
+    if is_opaque:
+        # Only documents were asked.
+        return f"{subject} could not be asked: {'it has' if one else 'they have'} no fields there."
+    fit = "it does not fit its" if one else "they do not fit their"
+    return f"{subject} could not be asked: {fit} definition, or {'has' if one else 'have'} none."
+
+
+def _about_name(session: Session, question: Question, name: str) -> Iterator[str]:
+    """Further topics that end with a short name, in the recordings of the question."""
+    others = namesakes(name, session.topics())
+    if others:
+        snapshot = session.snapshot()
+        places = set(session.chosen(question).tolist())
+        others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
+    others = [topic for topic in others if topic not in question.topics]
+    if others:
+        yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _SHOWN)}."
+
+
+def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:
+    """The channels of the question with messages, of its first recordings."""
+    summaries = session.snapshot().summaries
+    wanted = set(question.topics)
+    for place in session.chosen(question)[:_MOST].tolist():
+        for channel in session.channels(session.entry_of(summaries[place])):
+            if channel.channel.topic in wanted and channel.stats.messages:
+                yield channel
+
+
+def _about_stamps(session: Session, question: Question) -> Iterator[str]:
+    """Header stamps of another epoch than the log times, and messages without a stamp."""
+    is_told = False
+    missing = 0
+    for channel in _channels(session, question):
+        stats = channel.stats
+        if channel.recording.is_decoded and not channel.is_reduced:
+            missing += stats.messages - stats.stamped
+        first, last = stats.first_stamp, stats.last_stamp
+        if is_told or first is None or last is None or stats.first is None or stats.last is None:
+            continue
+        if first < stats.first - _APART_NS or last > stats.last + _APART_NS:
+            is_told = True
+            yield (
+                f"Header stamps of {channel.channel.topic} are from {format_time(first)} to "
+                f"{format_time(last)}, its log times from {format_time(stats.first)} to "
+                f"{format_time(stats.last)}: times count by the header clock here."
+            )
+    if missing:
+        are, have = ("message is", "it has") if missing == 1 else ("messages are", "they have")
+        yield f"{missing} {are} at no time of the header clock: {have} no header stamp."
+
+
+def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> Iterator[str]:
+    """Topics of whose messages the predicate asks for a field that they do not have."""
+    if question.predicate is None or question.predicate.is_opaque:
+        return
+    asked = dict.fromkeys(
+        condition.field.names
+        for condition in question.predicate.conditions()
+        if not isinstance(condition, Exists) and not is_meta(condition.field.path)
+    )
+    if not asked:
+        return
+    by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
+    for channel in Planner(session, question, Counters()).examples:
+        by_topic[channel.channel.topic].append(channel)
+    for topic, channels in by_topic.items():
+        if not any(channel.codec.indexed for channel in channels):
+            continue  # they have no fields at all
+        known: Collection[str] | None = field_types(tuple(channels))
+        if known is None and is_empty:
+            known = _fields_in_tables(session, question, topic)
+        for path in asked if known is not None else ():
+            if not any(_is_near(path, name.replace("[]", "")) for name in known or ()):
+                near = difflib.get_close_matches(path, known or (), n=_SHOWN, cutoff=0.5)
+                hint = f"; did you mean {', '.join(near)}?" if near else "."
+                yield f"No message of {topic} has a field {path!r}{hint}"
+
+
+def _is_near(path: str, name: str) -> bool:
+    """True if a path is a field, above one, or below one, such as the summary of an array."""
+    return path == name or name.startswith(f"{path}.") or path.startswith(f"{name}.")
+
+
+def _fields_in_tables(session: Session, question: Question, topic: str) -> set[str] | None:
+    """Fields of messages of a topic that no definition describes; None if they are not known."""
+    summaries = session.snapshot().summaries
+    places = session.chosen(replace(question, topics=(topic,))).tolist()
+    found: set[str] = set()
+    for place in places:
+        table = session.table(session.entry_of(summaries[place]), topic)
+        if table is None or len(places) > _MOST:
+            return None
+        found.update(_names_in(table.fields(None), ""))
+    return found
+
+
+def _names_in(kind: Any, above: str) -> Iterator[str]:
+    """Paths of the fields of an Arrow type, through lists."""
+    from pyarrow import types
+
+    for field in kind:
+        inner, path = field.type, f"{above}{field.name}"
+        while types.is_list(inner) or types.is_large_list(inner):
+            inner = inner.value_type
+        if types.is_struct(inner):
+            yield from _names_in(inner, f"{path}.")
+        else:
+            yield path
+
+
+def _causes(session: Session, question: Question) -> Iterator[str]:
+    """Likely causes of an empty answer."""
+    if question.during is not None and not len(question.during):
+        yield "No time is asked for: there are no events, or no intervals."
+        return
+    if question.bounds is None or not question.is_by_log_time:
+        return
+    yield from _topics_beside(session, question)
+    if question.recordings is not None:
+        yield from _others(session, question)
+
+
+def _topics_beside(session: Session, question: Question) -> Iterator[str]:
+    """Topics without a message in the time range, although their recordings have others."""
+    wanted = set(question.topics)
+    spans: dict[str, list[Span]] = defaultdict(list)
+    inside: set[str] = set()
+    for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MOST):
+        for channel in session.channels(session.entry_of(summary)):
+            topic, stats = channel.channel.topic, channel.stats
+            if topic not in wanted or stats.first is None or stats.last is None:
+                continue
+            spans[topic].append((stats.first, stats.last))
+            is_open = channel.recording.status == "open"
+            if is_open or bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):
+                inside.add(topic)
+    for topic, found in spans.items():
+        if topic not in inside:
+            first, last = min(low for low, _ in found), max(high for _, high in found)
+            yield (
+                f"No message of {topic} is in that time; it has messages from "
+                f"{format_time(first)} to {format_time(last)}."
+            )
+
+
+def _others(session: Session, question: Question) -> Iterator[str]:
+    """Recordings that were not asked and have messages in the time range."""
+    everywhere = replace(question, recordings=None)
+    try:
+        ranges = RangeResolver(session, everywhere).resolve()
+    except TimeError:
+        return
+    labels = [
+        each.summary.label
+        for each in islice(ranges, _MOST)
+        if each.summary.id not in (question.recordings or ())
+    ]
+    if labels:
+        yield f"Other recordings span that time: {listed(labels, _SHOWN)}."

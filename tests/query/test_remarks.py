@@ -1,0 +1,157 @@
+"""What an answer says about itself: what it could not see, and why it may be empty."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.topics import namesakes
+from hybridlog_storage.errors import TimeError
+from hybridlog_storage.messages import Channel, Schema
+
+SECOND = 10**9
+BEGIN = 1_700_000_000 * SECOND
+NUMBER = Schema("p/N", "ros1msg", b"int32 n\nfloat32[] ranges")
+STAMPED = Schema(
+    "p/S",
+    "ros1msg",
+    b"Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\n"
+    b"uint32 seq\ntime stamp\nstring frame_id\n",
+)
+
+
+def number(n: int) -> bytes:
+    return np.array([n, 0], np.int32).tobytes()
+
+
+def stamp(seconds: int) -> bytes:
+    return np.array([0, seconds, 0, 0], np.uint32).tobytes()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    numbers = Channel("/n", "ros1", NUMBER)
+    early, near = Channel("/early", "ros1", STAMPED), Channel("/near", "ros1", STAMPED)
+    text, opaque = Channel("/j", "json", None), Channel("/opaque", "cbor", None)
+    scans = [Channel(f"{name}/scan", "ros1", NUMBER) for name in ("", "/rear", "/front/base")]
+    path = tmp_path_factory.mktemp("remarks") / "store"
+    with hl.open(path, create=True) as opened:
+        with opened.start("monday") as monday:
+            for n in range(6):
+                at = BEGIN + n * SECOND
+                monday.write(numbers, b"x" if n == 4 else number(n), log_time=at)
+                monday.write(early, stamp(n) if n else b"x", log_time=at)
+                monday.write(near, stamp(BEGIN // SECOND - 3600 + n), log_time=at)
+                fields = {"n": n, "list": [{"deep": 1}], "long": [1.5] * 40}
+                monday.write(text, json.dumps(fields).encode(), log_time=at)
+                monday.write(opaque, b"abc", log_time=at)
+            for scan in scans:
+                monday.write(scan, number(0), log_time=BEGIN + 20 * SECOND)
+        with opened.start("tuesday") as tuesday:
+            tuesday.write(numbers, number(7), log_time=BEGIN + 86_400 * SECOND)
+        yield opened
+
+
+def test_an_answer_that_lacks_nothing_has_no_remarks(store: hl.Store) -> None:
+    for query in (
+        store.topic("/n"),
+        store.topic("/j").where("n > 3 and long.min > 1 and list[0].deep == 1"),
+        store.topic("/n").between(BEGIN, BEGIN + 2 * SECOND).where("n >= 0 and ranges.n == 0"),
+        store.topic("/near").clock("header").between("start", "end"),
+        store.topic("/j").where("n > 99"),
+        store.topic("/n").limit(0),
+    ):
+        query.count()
+        assert query.remarks() == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "predicate", "words"),
+    [
+        ("/n", "n > 1", "1 message could not be asked: it does not fit its definition, or has"),
+        ("/opaque", "n > 1", "6 messages could not be asked: they do not fit their definition"),
+        ("/j", "speed > 1", "No message of /j has a field 'speed'."),
+        ("/j", "list.dep == 1", "No message of /j has a field 'list.dep'; did you mean list.deep?"),
+    ],
+)
+def test_what_a_predicate_did_not_see(
+    store: hl.Store, topic: str, predicate: str, words: str
+) -> None:
+    query = store.topic(topic).where(predicate)
+    for answer in (query.count, lambda: [*query], query.to_arrow if topic == "/n" else query.count):
+        answer()
+        (remark,) = query.remarks()
+        assert remark.startswith(words)
+    assert query.where("_meta.t > 0").counters.unreadable == 0
+
+
+def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
+    query = store.topic("/n", "/near").where("n > 2")
+    assert query.count() == 3
+    assert query.remarks()[1:] == ["No message of /near has a field 'n'."]
+    # A field that is said to be missing is not missed.
+    absent = store.topic("/n", "/near").where("n missing")
+    assert absent.count() == 6
+    assert absent.remarks() == [
+        "1 message could not be asked: it does not fit its definition, or has none."
+    ]
+
+
+def test_header_stamps_of_another_epoch(store: hl.Store) -> None:
+    for query, want in (
+        (store.topic("/early").clock("header").between("start", "end"), 5),
+        (store.topic("/early").clock("header").between(BEGIN, None), 0),
+    ):
+        assert query.count() == want
+        epoch, missing = query.remarks()
+        assert epoch.startswith(
+            "Header stamps of /early are from 1970-01-01T00:00:01Z to 1970-01-01T00:00:05Z, its "
+            "log times from 2023-11-14T22:13:20Z to"
+        )
+        assert missing == "1 message is at no time of the header clock: it has no header stamp."
+    by_log = store.topic("/early").between("start", "end")
+    assert by_log.count() == 6
+    assert by_log.remarks() == []
+
+
+def test_why_an_answer_is_empty(store: hl.Store) -> None:
+    def remarks(query: hl.Query) -> list[str]:
+        assert query.count() == 0
+        return query.remarks()
+
+    late = store.topic("/n").in_recording("monday").between(BEGIN + 15 * SECOND, None)
+    assert remarks(late) == [
+        "No message of /n is in that time; it has messages from 2023-11-14T22:13:20Z to "
+        "2023-11-14T22:13:25Z.",
+        "Other recordings span that time: tuesday.",
+    ]
+    never = store.topic("/n").where("n > 99").windows("1s")
+    assert remarks(store.topic("/j").during(never)) == [
+        "No time is asked for: there are no events, or no intervals."
+    ]
+    day = BEGIN + 86_400 * SECOND
+    with pytest.raises(TimeError, match=r"monday spans .* Other recordings span .*: tuesday\."):
+        store.topic("/n").in_recording("monday").between(day, day + 1).count()
+    with pytest.raises(TimeError, match=r"Z\.$"):
+        store.topic("/n").between(day + SECOND, day + 2 * SECOND).count()
+
+
+def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
+    query = store.topic("scan")
+    assert query.topics == ("/scan",)
+    assert query.count() == 1
+    assert query.remarks("scan") == [
+        "'scan' is the whole name of a topic; not asked: /front/base/scan, /rear/scan."
+    ]
+    assert query.remarks("/scan") == query.remarks("*scan") == []
+    every = store.topic("**/scan")
+    assert every.count() == 3
+    assert every.remarks("scan") == []
+    tuesday = store.topic("/n").in_recording("tuesday")
+    assert tuesday.remarks("scan", is_empty=False) == []
+    assert namesakes("SCAN", ["/Scan", "/a/scan", "/a/scanner"]) == ["/a/scan"]
+    assert namesakes("scan", ["/a/scan", "/b/scan"]) == []
