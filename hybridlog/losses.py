@@ -42,6 +42,9 @@ class Cause(StrEnum):
     QUEUE = "queue"
     """The memory budget was exhausted, and no smaller form could be stored."""
 
+    CLOCK = "clock"
+    """They came before the first message of `/clock`, which gives the log time."""
+
     DISK = "disk"
     """The disk was full."""
 

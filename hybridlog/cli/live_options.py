@@ -60,6 +60,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         settings=settings,
         snapshots=_snapshots(choices),
         no_index=matcher(choices.no_index) if choices.no_index else None,
+        use_sim_time=choices.use_sim_time,
     )
 
 

@@ -157,6 +157,12 @@ def _is_file(word: str) -> bool:
     help="Start a new segment file after this time.",
 )
 @click.option(
+    "--use-sim-time",
+    cls=_LiveOption,
+    is_flag=True,
+    help="Log times are those of /clock, the time of a simulation.",
+)
+@click.option(
     "--throttle",
     cls=_LiveOption,
     multiple=True,

@@ -49,6 +49,7 @@ class RecordChoices:
     max_size: str | None
     split_size: str | None
     split_duration: str | None
+    use_sim_time: bool
     throttle: tuple[str, ...]
     priority: tuple[str, ...]
     budget: str | None

@@ -28,6 +28,7 @@ from hybridlog.live.policy import (
     retention,
 )
 from hybridlog.live.recording import LiveOptions, LiveRecording, indexed_within_s
+from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
@@ -39,7 +40,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
-    from hybridlog.live.sources.base import LiveSource
+    from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordReport
     from hybridlog.store import Store
@@ -50,6 +51,8 @@ _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
 _MAX_EXPECTED = 1000  # channels that get a collection before their first message
 _SEQUENCES = 1 << 32
+_HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
+_CLOCK_WAIT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +63,7 @@ class RecorderOptions:
         name: Name of the recording.
         tags: Tags of the recording.
         matcher: Selects topics; None for all.
-        throttles: Maximum rates of topics, Hz; the first matching rule applies.
+        throttles: Maximum rates of topics, Hz by log time; the first matching rule applies.
         priorities: Priorities of topics under pressure; the first matching rule applies.
         duration_s: Stop after this time.
         max_messages: Stop after this number of messages.
@@ -71,6 +74,7 @@ class RecorderOptions:
         settings: Settings of segments and chunks.
         snapshots: Store only messages around triggers; None to store everything.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
+        use_sim_time: Log times are those of `/clock`.
     """
 
     name: str = "live"
@@ -87,9 +91,12 @@ class RecorderOptions:
     settings: SegmentSettings = field(default_factory=SegmentSettings)
     snapshots: SnapshotOptions | None = None
     no_index: TopicMatcher | None = None
+    use_sim_time: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse limits that would stop the recorder at once."""
+        """Refuse limits that would stop the recorder at once, and a ring of two times."""
+        if self.use_sim_time and self.snapshots is not None:
+            raise UsageError("--ring goes by the time of this machine: leave out --use-sim-time.")
         for name in ("duration_s", "max_messages", "max_bytes"):
             bound = getattr(self, name)
             if bound is not None and not bound > 0:
@@ -187,6 +194,10 @@ class Recorder:
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._state: RecorderState | None = None
+        self._simulated: SimulatedTime | None = None
+        if options.use_sim_time:
+            self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
+        self._sink: Sink = self._simulated or self
         self._target: LiveRecording | Snapshots
         if options.snapshots is None:
             self._target = self._begin(store, {})
@@ -224,7 +235,8 @@ class Recorder:
             LiveOptions(
                 tags={**options.tags, **tags},
                 source={
-                    "kind": ", ".join(source.kind for source in self._sources),
+                    "kind": ", ".join(source.kind for source in self._sources)
+                    + (f", by {CLOCK}" if options.use_sim_time else ""),
                     "path": ", ".join(source.address for source in self._sources),
                 },
                 budget_bytes=options.budget_bytes,
@@ -246,7 +258,7 @@ class Recorder:
         """
         try:
             for source in self._sources:
-                source.start(self)
+                source.start(self._sink)
         except BaseException:
             for source in self._sources:
                 source.stop()
@@ -277,6 +289,8 @@ class Recorder:
         for source in self._sources:
             source.stop()
         self._over.set()
+        if self._simulated is not None:
+            self._simulated.close()
         self._control.close()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
@@ -314,11 +328,13 @@ class Recorder:
             lost[cause.value] = lost.get(cause.value, 0) + count
         with self._lock:
             rates = sorted(self._topics.items())
-        wall = time.time_ns()
+        log_time = time.time_ns()
+        if self._simulated is not None:
+            log_time = self._simulated.at(log_time)
         topics = [
             rate.look(
                 elapsed,
-                wall,
+                log_time,
                 thinned=missing.get((topic, True), 0),
                 lost=missing.get((topic, False), 0),
             )
@@ -348,7 +364,7 @@ class Recorder:
 
     def mark(self, text: str, tags: Mapping[str, str]) -> None:
         """Set a mark: a message on the topic of marks, for queries and triggers."""
-        self.take(self._marks, mark_payload(text, tags), received=time.time_ns())
+        self._sink.take(self._marks, mark_payload(text, tags), received=time.time_ns())
 
     def fire(self, reason: str) -> None:
         """Start a snapshot.
@@ -447,6 +463,15 @@ class Recorder:
     ) -> None:
         """See `Sink.lost`."""
         self._note(topic, cause, count, first=first, last=last, detail=detail)
+
+    def clock(self, now: int, *, received: int) -> None:
+        """See `Sink.clock`; `SimulatedTime` uses it."""
+
+    def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
+        """See `simulated_time.Recording.drop`."""
+        recorded = self._recorded.get(channel) or self._meet(channel)
+        recorded.tally.add(size, at)
+        self._lose(recorded, cause, detail, at)
 
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
         """See `Sink.topic_came`."""
@@ -665,6 +690,13 @@ class Recorder:
 
     def _check_clock(self, now: float) -> None:
         """Report that the machine's clock was set: log times jump with it."""
+        if self._simulated is not None:
+            if self._simulated.is_waiting and now - self._started >= _CLOCK_WAIT_S:
+                self.say(
+                    f"waiting for {CLOCK}: messages are held in memory until it comes. Start the "
+                    "simulation, or leave out --use-sim-time"
+                )
+            return
         jump = time.time() - now - self._offset
         if abs(jump) >= _JUMP_S:
             self._offset += jump

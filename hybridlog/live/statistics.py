@@ -101,7 +101,7 @@ class TopicRates:
 
         Args:
             elapsed_s: Seconds since the last call.
-            now: Current time, ns since the epoch.
+            now: Current time, ns, by the clock of log times.
             thinned: Messages dropped by a throttle so far.
             lost: Messages lost otherwise so far.
         """

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import signal
+import struct
 import subprocess
 import time
 from collections import Counter
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from mcap.writer import Writer
 
 from hybridlog.cli.app import app
 from hybridlog.cli.live_table import closing_rows, summary
@@ -24,10 +26,17 @@ from hybridlog.live.recorder import RecorderState
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import UsageError
+from tests.cli import odd_log
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, recordings, run
 from tests.independent import read
 
 SMALL_S = 5
+CLOCK = b"""builtin_interfaces/Time clock
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
 
 
 @contextmanager
@@ -154,6 +163,39 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
     assert "/imu/data" in run("losses", store=store).out
 
 
+def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
+    second = 10**9
+    with (tmp_path / "simulation.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        kinds = [
+            ("/words", "std_msgs/msg/String", b"string data\n"),
+            ("/clock", "rosgraph_msgs/msg/Clock", CLOCK),
+        ]
+        words, clock = (
+            writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+            for topic, kind, text in kinds
+        )
+        for at in range(6):
+            log_time = 10**18 + at * second
+            writer.add_message(words, log_time, odd_log.text(f"{at}"), log_time)
+            payload = b"\0\1\0\0" + struct.pack("<iI", at // 2, 5)
+            writer.add_message(clock, log_time + second // 2, payload, log_time)
+        writer.finish()
+    store = tmp_path / "store"
+    arguments = ("--speed", 50, "--reserve", 0, "--use-sim-time", "-t", "/words")
+    done = run("record", "--replay", tmp_path / "simulation.mcap", *arguments, store=store)
+    assert re.search(r"(?m)^source .*simulation\.mcap \(replay, by /clock\)$", done.out)
+    assert re.search(r"(?m)^lost +nothing$", done.out)
+    assert "sent nothing" not in done.err
+    found = [
+        (row["log_time_ns"], row["data"])
+        for row in map(json.loads, run("fetch", "-t", "/words", "-F", "jsonl", store=store).lines)
+    ]
+    assert [word for _, word in found] == list("012345")
+    assert {at for at, _ in found} == {5, second + 5, 2 * second + 5}
+
+
 def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     with recorder(
@@ -259,6 +301,8 @@ def test_nothing_triggered_nothing_kept(logs: Path, tmp_path: Path) -> None:
         ("--replay {bag} --before 1s", "are for --ring"),
         ("--replay {bag} --ring 1s --before 2s", "longer than --ring"),
         ("--replay {bag} --ring 0s", "--ring must be longer"),
+        ("--replay {bag} --ring 2s --use-sim-time", "leave out --use-sim-time"),
+        ("{bag} --use-sim-time", "--use-sim-time is for a running robot"),
         ("--replay {bag} --ring 2d", "--ring must be at most a day"),
         ("--replay {bag} --ring 1s --trigger '/a: x >'", "x >"),
         ("--replay {bag} --duration soon", "soon"),

@@ -90,6 +90,15 @@ class Sink(Protocol):
         """
         ...
 
+    def clock(self, now: int, *, received: int) -> None:
+        """Note the time of a simulation, as a source that has no topic for it reports it.
+
+        Args:
+            now: The time, ns.
+            received: Receive time, ns since the epoch.
+        """
+        ...
+
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
         """Note the number of publishers of a wanted topic, at least one."""
         ...

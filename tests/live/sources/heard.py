@@ -59,6 +59,7 @@ class Heard:
         self.losses: list[Lost] = []
         self.topics: list[tuple[Any, ...]] = []
         self.said: list[str] = []
+        self.times: list[int] = []
         self.ends: list[str] = []
         self._changed = threading.Condition()
 
@@ -102,6 +103,9 @@ class Heard:
         detail: str = "",
     ) -> None:
         self._note(self.losses, Lost(topic, cause, count, first, last, detail))
+
+    def clock(self, now: int, *, received: int) -> None:
+        self._note(self.times, now)
 
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
         self._note(self.topics, (topic, type_name, publishers))

@@ -349,7 +349,10 @@ def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
         stream = b"".join(
             [message(number, at, payload) for at, payload in enumerate(payloads)]
             # Clocks, pings, other operations and unknown kinds lie in between.
-            + [frame(Opcode.BINARY, b"\x02" + bytes(8)), frame(Opcode.PING, b"hello")]
+            + [
+                frame(Opcode.BINARY, b"\x02" + (5).to_bytes(8, "little")),
+                frame(Opcode.PING, b"hello"),
+            ]
             + [text({"op": "parameterValues"}), frame(Opcode.BINARY, b"\x77" + bytes(100_000))]
             + [message(number, len(payloads), b"last")]
         )
@@ -371,6 +374,7 @@ def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
     assert {taken.sequence for taken in heard.taken} == {None}
     assert len({id(taken.channel) for taken in heard.taken}) == 1
     assert (len(heard.expected), heard.unexpected) == (1, [])
+    assert heard.times == [5]
     times = [taken.received for taken in heard.taken]
     assert before <= times[0]
     assert times == sorted(times)

@@ -18,7 +18,13 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 
 from hybridlog.live.sources.foxglove.handshake import TICK_S, Opened, reason_of
-from hybridlog.live.sources.foxglove.protocol import MAX_TEXT, MESSAGE_DATA, PeerError, Receiver
+from hybridlog.live.sources.foxglove.protocol import (
+    MAX_TEXT,
+    MESSAGE_DATA,
+    TIME,
+    PeerError,
+    Receiver,
+)
 
 _SEND_S: Final = 3.0
 _CLOSE_S: Final = 1.0
@@ -35,6 +41,7 @@ _HEAD: Final = 13  # opcode, subscription, log time
 _U16 = Struct(">H").unpack_from
 _U64 = Struct(">Q").unpack_from
 _IDS = Struct("<IQ").unpack_from
+_TIME = Struct("<xQ")
 
 
 class Connection:
@@ -188,9 +195,14 @@ class Connection:
         receiver.data(subscription, log_time, store.getvalue())
 
     def _other(self, head: bytes, receiver: Receiver) -> None:
-        """Handle another binary message: times and answers are not recorded."""
+        """Handle another binary message: the server's time; answers are not recorded."""
         if not head:
             receiver.broken("an empty binary message")
+        elif head[0] == TIME:
+            if len(head) < _TIME.size:
+                receiver.broken(f"a time of {len(head)} bytes")
+            else:
+                receiver.time(_TIME.unpack_from(head)[0])
         elif head[0] == MESSAGE_DATA:
             receiver.broken(f"a message of {len(head)} bytes, shorter than its header")
 

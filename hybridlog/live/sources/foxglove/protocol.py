@@ -21,6 +21,9 @@ SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 MESSAGE_DATA: Final = 1
 """First byte of a binary message with a payload."""
 
+TIME: Final = 2
+"""First byte of a binary message with the server's time."""
+
 MAX_TEXT: Final = 128 << 20
 """Largest JSON message, bytes; a thousand channels with their definitions take 20 MB."""
 
@@ -42,6 +45,10 @@ class Receiver(Protocol):
 
     def data(self, subscription: int, log_time: int, payload: bytes) -> None:
         """Take a message, with the server's log time in ns since the epoch."""
+        ...
+
+    def time(self, now: int) -> None:
+        """Take the time of the server, ns."""
         ...
 
     def text(self, data: bytes) -> None:

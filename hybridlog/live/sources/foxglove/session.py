@@ -136,6 +136,10 @@ class Session:
             if gaps.waiting:
                 self._report(channel.topic, gaps.confirmed())
 
+    def time(self, now: int) -> None:
+        """Take the server's time: that of a simulation, or of a log that it plays."""
+        self._sink.clock(now, received=time.time_ns())
+
     def too_large(self, subscription: int, size: int) -> None:
         """Note a skipped message that is larger than the limit."""
         topic = self._topic_of(subscription)

@@ -1,0 +1,274 @@
+"""Log times from `/clock`, the time of a simulation or of a log that is played.
+
+The log time of a message is the latest time of `/clock` at its arrival, as with
+`use_sim_time` in ROS. It stands still while the clock is paused, and goes back with it.
+Messages that come before the clock are held, so that latched ones are not missed, and get its
+first time.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+from hybridlog.live.sources.base import Sink
+from hybridlog.losses import Cause
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Channel
+
+CLOCK: Final = "/clock"
+"""The topic with the time."""
+
+_MAX_TICKS: Final = 4096  # past times, for messages and losses that are told late
+_MAX_JUMPS: Final = 10  # jumps that are told
+_OVERHEAD: Final = 256  # bytes of memory for a held message besides its payload
+_MAX_NS: Final = 1 << 63
+_ROS1 = struct.Struct("<II")
+_CDR = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
+
+
+class _Message(NamedTuple):
+    channel: Channel
+    payload: bytes
+    received: int
+    sent: int | None
+    sequence: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Loss:
+    topic: str
+    cause: Cause
+    count: int | None
+    first: int
+    last: int
+    detail: str
+
+
+class Recording(Sink, Protocol):
+    """A sink that also counts messages that cannot be given a time."""
+
+    def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
+        """Count a message as received and lost.
+
+        Args:
+            channel: Its channel.
+            size: Bytes of its payload.
+            cause: Cause of the loss.
+            detail: Text for the user.
+            at: Time of the loss, ns.
+        """
+        ...
+
+
+class SimulatedTime(Sink):
+    """Passes messages on to a recorder, with the time of `/clock` as their receive time.
+
+    Args:
+        recorder: Takes them.
+        max_bytes: Memory for messages that come before the clock.
+    """
+
+    def __init__(self, recorder: Recording, max_bytes: int) -> None:
+        self._recorder = recorder
+        self._max_bytes = max_bytes
+        self._is_clock_recorded = True
+        self._lock = threading.Lock()
+        self._latest = (0, 0)
+        self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
+        self._jumps = 0
+        self._held: deque[_Message | _Loss] | None = deque()
+        self._held_bytes = 0
+
+    @property
+    def is_waiting(self) -> bool:
+        """True until the first time has come."""
+        return not self._ticks
+
+    def clock(self, now: int, *, received: int) -> None:
+        """See `Sink.clock`."""
+        if not 0 <= now < _MAX_NS:
+            self._recorder.say(f"{CLOCK}: {now} ns is no time that can be stored; it is ignored")
+            return
+        with self._lock:
+            is_first, before = not self._ticks, self._latest[1]
+            self._latest = (received, now)
+            self._ticks.append(self._latest)
+            self._jumps += now < before
+            is_told = now < before and self._jumps <= _MAX_JUMPS
+        if is_told:
+            self._recorder.say(
+                f"{CLOCK} went back by {(before - now) / 1e9:.3f} s, to {now / 1e9:.3f} s; log "
+                "times go back with it"
+            )
+        if is_first:
+            self._release(now)
+
+    def at(self, received: int) -> int:
+        """The latest time of the clock at a time of arrival, both in ns."""
+        came, now = self._latest
+        if received < came:
+            with self._lock:
+                earlier = (tick for tick in reversed(self._ticks) if tick[0] <= received)
+                _, now = next(earlier, self._ticks[0])
+        return now
+
+    def close(self) -> None:
+        """Count what is held as lost, if the clock never came."""
+        with self._lock:
+            held, self._held = self._held, None
+        for item in held or ():
+            if isinstance(item, _Loss):
+                self._report(item, item.first, item.last)
+            else:
+                self._drop(item, item.received)
+
+    # The sink.
+
+    def wants(self, topic: str, type_name: str) -> bool:
+        """See `Sink.wants`; the clock is needed even if it is not recorded."""
+        wanted = self._recorder.wants(topic, type_name)
+        if topic == CLOCK:
+            self._is_clock_recorded = wanted
+            return True
+        return wanted
+
+    def expect(self, channel: Channel) -> None:
+        """See `Sink.expect`."""
+        if self._is_recorded(channel.topic):
+            self._recorder.expect(channel)
+
+    def take(
+        self,
+        channel: Channel,
+        payload: bytes,
+        *,
+        received: int,
+        sent: int | None = None,
+        sequence: int | None = None,
+    ) -> None:
+        """See `Sink.take`."""
+        if channel.topic == CLOCK:
+            now = clock_time(channel, payload)
+            if now is None:
+                self._recorder.say(
+                    f"{CLOCK} has messages that are no rosgraph_msgs Clock of ROS 1 or ROS 2; they "
+                    "give no time"
+                )
+            else:
+                self.clock(now, received=received)
+            if not self._is_clock_recorded:
+                return
+        message = _Message(channel, payload, received, sent, sequence)
+        if self._held is None or not self._hold(message):
+            self._record(message, self.at(received))
+
+    def lost(
+        self,
+        topic: str,
+        cause: Cause,
+        count: int | None,
+        *,
+        first: int,
+        last: int,
+        detail: str = "",
+    ) -> None:
+        """See `Sink.lost`."""
+        if not self._is_recorded(topic):
+            return
+        loss = _Loss(topic, cause, count, first, last, detail)
+        if self._held is None or not self._hold(loss):
+            self._report(loss, self.at(first), self.at(last))
+
+    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
+        """See `Sink.topic_came`."""
+        if self._is_recorded(topic):
+            self._recorder.topic_came(topic, type_name, publishers)
+
+    def topic_gone(self, topic: str) -> None:
+        """See `Sink.topic_gone`."""
+        if self._is_recorded(topic):
+            self._recorder.topic_gone(topic)
+
+    def say(self, text: str) -> None:
+        """See `Sink.say`."""
+        self._recorder.say(text)
+
+    def ended(self, reason: str = "") -> None:
+        """See `Sink.ended`."""
+        self._recorder.ended(reason)
+
+    # Parts of it.
+
+    def _is_recorded(self, topic: str) -> bool:
+        return self._is_clock_recorded or topic != CLOCK
+
+    def _hold(self, item: _Message | _Loss) -> bool:
+        """Keep an item until the clock comes; False once everything held has been passed on."""
+        size = _OVERHEAD + (len(item.payload) if isinstance(item, _Message) else 0)
+        with self._lock:
+            if self._held is None:
+                return False
+            fits = self._held_bytes + size <= self._max_bytes
+            if fits:
+                self._held_bytes += size
+                self._held.append(item)
+        if fits:
+            return True
+        if isinstance(item, _Message):
+            self._drop(item, item.received)
+        else:
+            self._report(item, item.first, item.last)
+        return True
+
+    def _release(self, now: int) -> None:
+        """Pass on what is held, in the order of arrival."""
+        while True:
+            with self._lock:
+                if not self._held:
+                    self._held = None
+                    return
+                held, self._held, self._held_bytes = self._held, deque(), 0
+            for item in held:
+                if isinstance(item, _Message):
+                    self._record(item, now)
+                else:
+                    self._report(item, now, now)
+
+    def _record(self, message: _Message, log_time: int) -> None:
+        channel, payload, _, sent, sequence = message
+        self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
+
+    def _report(self, loss: _Loss, first: int, last: int) -> None:
+        low, high = sorted((first, last))  # the clock may have gone back between them
+        self._recorder.lost(
+            loss.topic, loss.cause, loss.count, first=low, last=high, detail=loss.detail
+        )
+
+    def _drop(self, message: _Message, at: int) -> None:
+        self._recorder.drop(
+            message.channel,
+            len(message.payload),
+            Cause.CLOCK,
+            f"it came before the first time of {CLOCK}",
+            at,
+        )
+
+
+def clock_time(channel: Channel, payload: bytes) -> int | None:
+    """The time in a message of `/clock`, ns; None if it is no clock message."""
+    name = channel.schema.name if channel.schema is not None else ""
+    if channel.message_encoding == "ros1" and name == "rosgraph_msgs/Clock":
+        form: struct.Struct | None = _ROS1
+    elif channel.message_encoding == "cdr" and name == "rosgraph_msgs/msg/Clock":
+        form = _CDR.get(payload[1]) if len(payload) > 1 else None
+    else:
+        form = None
+    if form is None or len(payload) < form.size:
+        return None
+    seconds, nanoseconds = form.unpack_from(payload)
+    return int(seconds) * 10**9 + int(nanoseconds)
