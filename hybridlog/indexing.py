@@ -84,6 +84,8 @@ class ChunkIndexer:
                     found.stamped(group.rows, group.stamps)
                 if group.error is not None:
                     found.unreadable(group.rows)
+                if len(group.surplus):
+                    found.surplus(group.surplus)
                 if channel.is_indexed:
                     row = rows[group.rows]
                     tables.append(assembler.assemble(placed, row, group.body, group.error))
@@ -156,6 +158,7 @@ class _StatsByChunk:
         self._number = number
         self._has_publish_time = has_publish_time
         self._unreadable: list[NDArray[np.intp]] = []
+        self._surplus: list[NDArray[np.intp]] = []
         self._stamped: list[NDArray[np.intp]] = []
         self._stamps: list[NDArray[np.int64]] = []
 
@@ -180,6 +183,10 @@ class _StatsByChunk:
         """Add unreadable messages."""
         self._unreadable.append(rows)
 
+    def surplus(self, rows: NDArray[np.intp]) -> None:
+        """Add messages with bytes left over."""
+        self._surplus.append(rows)
+
     def by_chunk(self) -> Iterator[tuple[int, ChannelStats]]:
         """The chunks with messages, in order, and their statistics."""
         batch, begins = self._batch, run_starts(self._number)
@@ -199,13 +206,19 @@ class _StatsByChunk:
             spans = _spans(batch.publish_time, begins)
             for stats, (first, last) in zip(found.values(), spans, strict=True):
                 stats.first_publish, stats.last_publish = first, last
-        for rows in self._unreadable:
-            for number, count in enumerate(np.bincount(self._number[rows]).tolist()):
-                if count:
-                    found[number].unreadable += count
+        for number, count in self._counted(self._unreadable):
+            found[number].unreadable = count
+        for number, count in self._counted(self._surplus):
+            found[number].surplus = count
         if self._stamps:
             self._tell_stamps(found)
         return iter(found.items())
+
+    def _counted(self, rows: list[NDArray[np.intp]]) -> Iterator[tuple[int, int]]:
+        """Chunks with some of these messages, and how many."""
+        if rows:
+            counts = np.bincount(self._number[np.concatenate(rows)])
+            yield from ((number, count) for number, count in enumerate(counts.tolist()) if count)
 
     def _tell_stamps(self, found: dict[int, ChannelStats]) -> None:
         rows, stamps = np.concatenate(self._stamped), np.concatenate(self._stamps)

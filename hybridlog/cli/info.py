@@ -113,6 +113,7 @@ def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
                 "last_ns": c.stats.last,
                 "skew_ns": _skew(c),
                 "unreadable": c.stats.unreadable if entry.is_decoded else None,
+                "surplus": c.stats.surplus if entry.is_decoded else None,
                 "not_indexed": c.unindexed,
                 "metadata": c.metadata,
             }
@@ -208,6 +209,8 @@ def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> li
         notes.append(f"not indexed: {channel.unindexed}")
     if stats.unreadable:
         notes.append(f"{stats.unreadable} unreadable")
+    if stats.surplus:
+        notes.append(f"{stats.surplus} with bytes left over")
     if channel.message_encoding == REDUCED:
         notes.append("fields only")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):

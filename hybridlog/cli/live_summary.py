@@ -92,6 +92,8 @@ class LiveSummary:
         unused = [] if matcher is None else matcher.unused()
         for pattern in unused:
             yield f"no topic fits {output.quoted(pattern)}"
+        for report in self._reports:
+            yield from output.surpluses(report.entry.channels)
         if matcher is not None and not unused and not topics:
             yield "no topic is left: --exclude takes away all that --topics names"
         for option, rules in (

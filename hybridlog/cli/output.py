@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Literal
@@ -13,6 +14,8 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from hybridlog_storage.catalog import ChannelEntry
 
 Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
@@ -169,6 +172,21 @@ def unfit(messages: int) -> str:
     """A number of unreadable messages: `1 message does not fit its definition`."""
     verb = "does not fit its" if messages == 1 else "do not fit their"
     return f"{counted(messages, 'message')} {verb} definition"
+
+
+def surpluses(channels: Sequence[ChannelEntry]) -> Iterator[str]:
+    """A line for each topic with messages that are longer than their type."""
+    counts: Counter[str] = Counter()
+    for channel in channels:
+        counts[channel.topic] += channel.stats.surplus
+    for topic, messages in counts.items():
+        if messages:
+            types = {channel.type for channel in channels if channel.topic == topic}
+            verb = "has" if messages == 1 else "have"
+            yield (
+                f"{topic}: {counted(messages, 'message')} {verb} bytes left over behind the last "
+                f"field of {', '.join(sorted(types))}; the fields are read"
+            )
 
 
 def short_time(ns: int, *, minutes: bool = False) -> str:

@@ -258,6 +258,7 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "messages": entry.messages,
         "messages_indexed": report.indexed,
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
+        "messages_surplus": sum(c.stats.surplus for c in entry.channels),
         "messages_skipped": report.skipped,
         "messages_latched": report.latched,
         "bytes_in": entry.source["bytes"],
@@ -376,6 +377,9 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
+    if not quiet:
+        for line in output.surpluses(report.entry.channels):
+            output.note(line)
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
         count = damage.messages_lost

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 
+_NONE: NDArray[np.intp] = np.empty(0, np.intp)
+
+
 class BodyGroup(NamedTuple):
     """Bodies of index documents of equal width.
 
@@ -29,12 +32,14 @@ class BodyGroup(NamedTuple):
         error: Reason why these payloads could not be read; the width is then 0.
         stamps: int64[k], header stamps, ns; None if there are none, or if only
             `Codec.columns` provides them.
+        surplus: intp[j], rows of these with bytes left over behind the message.
     """
 
     rows: NDArray[np.intp]
     body: NDArray[np.uint8]
     error: str | None
     stamps: NDArray[np.int64] | None = None
+    surplus: NDArray[np.intp] = _NONE
 
 
 @dataclass(slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import threading
+from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -26,6 +27,7 @@ from hybridlog.schema.definition import (
 )
 from hybridlog.schema.document import TooLarge, bodies, top_level_names
 from hybridlog.schema.wire import Decoded, WireReader
+from hybridlog.schema.wire_scan import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Buffer, Schema
 
+_NONE = np.empty(0, np.intp)
 _MAX_BYTES = 8 << 20
 _MAX_UNROLLED = 10_000
 """Most elements of fixed arrays of strings and messages that rosbags unrolls into code."""
@@ -88,7 +91,8 @@ class RosCodec:
                 yield error_group(rows, text)
             else:
                 own = None if stamps is None else stamps[group.rows]
-                yield BodyGroup(rows, group.body, None, own)
+                surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else _NONE
+                yield BodyGroup(rows, group.body, None, own, surplus)
         for bad in decoded.unreadable:
             text = f"the payload does not fit {self._name}: {bad.reason}"
             yield error_group(bad.rows, text)
@@ -121,7 +125,13 @@ class RosCodec:
         if self._objects is None:
             with _REGISTERING:
                 self._objects = self._objects or RosObjects(self._type, self._wire)
-        return self._objects.decode(payload)
+        try:
+            return self._objects.decode(payload)
+        except PayloadError:
+            # rosbags refuses payloads with bytes left over.
+            with suppress(MisfitError):
+                return self._objects.decode(self._reader.message_in(payload))
+            raise
 
     def columns(
         self,
@@ -289,6 +299,9 @@ def _base(name: str) -> FieldDesc:
 def _rosbags_name(name: str) -> str:
     """The rosbags spelling of `pkg/Name`: `pkg/msg/Name`."""
     parts = name.strip("/").split("/")
+    if len(parts) == 1:
+        # Its class would hide names that the code of rosbags uses.
+        parts.insert(0, "unnamed")
     if len(parts) == 2:
         parts.insert(1, "msg")
     return "/".join(parts)

@@ -7,7 +7,7 @@ and all other rows are read.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -63,11 +63,21 @@ class Decoded:
         rows: Readable rows of the input, ascending.
         records: Their columns; as many rows as `rows`.
         unreadable: The other rows, each in one of these.
+        surplus: Readable rows with bytes left over behind the message, ascending.
     """
 
     rows: NDArray[np.intp]
     records: Records
     unreadable: list[Unreadable]
+    surplus: NDArray[np.intp]
+
+
+@dataclass(slots=True)
+class _Odd:
+    """Rows to remark: unreadable ones by reason, and those with bytes left over."""
+
+    bad: dict[str, list[NDArray[np.intp]]] = field(default_factory=dict)
+    surplus: list[NDArray[np.intp]] = field(default_factory=list)
 
 
 class WireReader:
@@ -110,19 +120,32 @@ class WireReader:
         """
         offset = np.asarray(offset, np.int64)
         end = offset + np.asarray(length, np.int64)
-        bad: dict[str, list[NDArray[np.intp]]] = {}
+        odd = _Odd()
         rows: NDArray[np.intp] | None = None
         outside = (offset < 0) | (end < offset) | (end > memoryview(buffer).nbytes)
         if bool(outside.any()):
             rows = np.flatnonzero(~outside)
-            bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
+            odd.bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
         if self._wire == "ros1":
             everything = np.arange(len(offset)) if rows is None else rows
-            good, records = self._read(self._source(buffer, "<"), everything, offset, end, bad)
+            good, records = self._read(self._source(buffer, "<"), everything, offset, end, odd)
         else:
-            good, records = self._read_cdr(buffer, rows, offset, end, bad)
-        unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in bad.items()]
-        return Decoded(good, records, unreadable)
+            good, records = self._read_cdr(buffer, rows, offset, end, odd)
+        unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
+        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else np.empty(0, np.intp)
+        return Decoded(good, records, unreadable, surplus)
+
+    def message_in(self, payload: Buffer) -> memoryview:
+        """A payload without the bytes that are left over behind its message.
+
+        Raises:
+            MisfitError: It does not fit the definition.
+        """
+        view = memoryview(payload)
+        start = 0 if self._wire == "ros1" else _HEADER
+        order: Literal["<", ">"] = ">" if start and view[:2].tobytes() == b"\0\0" else "<"
+        scanner = Scanner(Source(payload, order), self._wire)
+        return view[: scanner.walk(self._program, start, len(view), start)]
 
     def _read_cdr(
         self,
@@ -130,31 +153,31 @@ class WireReader:
         rows: NDArray[np.intp] | None,
         offset: NDArray[np.int64],
         end: NDArray[np.int64],
-        bad: dict[str, list[NDArray[np.intp]]],
+        odd: _Odd,
     ) -> tuple[NDArray[np.intp], Records]:
         """Split the rows by byte order, read both, and merge them."""
         if rows is None:
             rows = np.arange(len(offset))
         short = end[rows] - offset[rows] < _HEADER
         if bool(short.any()):
-            bad["is shorter than a CDR header"] = [rows[short]]
+            odd.bad["is shorter than a CDR header"] = [rows[short]]
             rows = rows[~short]
         start = offset + _HEADER
         little = self._source(buffer, "<")
         if len(rows) == 0:
-            return self._read(little, rows, start, end, bad)
+            return self._read(little, rows, start, end, odd)
         begin = offset[rows]
         kind = little.u1(begin, 0).astype(np.int64) << 8
         kind |= little.u1(begin, 1)
         if bool((kind == _LITTLE).all()):
-            return self._read(little, rows, start, end, bad)
+            return self._read(little, rows, start, end, odd)
         for code in distinct(kind).tolist():
             if code not in {_LITTLE, _BIG}:
                 name = _OTHER_ENCAPSULATIONS.get(code, "unknown")
-                bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]
+                odd.bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]
         orders: tuple[tuple[Literal["<", ">"], int], ...] = (("<", _LITTLE), (">", _BIG))
         (first_rows, first), (second_rows, second) = (
-            self._read(self._source(buffer, order), rows[kind == code], start, end, bad)
+            self._read(self._source(buffer, order), rows[kind == code], start, end, odd)
             for order, code in orders
         )
         if len(second_rows) == 0:
@@ -171,15 +194,17 @@ class WireReader:
         rows: NDArray[np.intp],
         start: NDArray[np.int64],
         end: NDArray[np.int64],
-        bad: dict[str, list[NDArray[np.intp]]],
+        odd: _Odd,
     ) -> tuple[NDArray[np.intp], Records]:
-        """Read rows of one byte order; those that do not fit go to `bad`."""
+        """Read rows of one byte order; those that do not fit go to `odd`."""
         walker = Walker(source, self._wire)
         try:
-            column = walker.read(self._program, start[rows], end[rows])
+            column, surplus = walker.read(self._program, start[rows], end[rows])
         except MisfitError:
-            rows = self._sort_out(source, rows, start, end, bad)
-            column = walker.read(self._program, start[rows], end[rows])
+            rows = self._sort_out(source, rows, start, end, odd)
+            column, surplus = walker.read(self._program, start[rows], end[rows])
+        if surplus is not None:
+            odd.surplus.append(rows[surplus])
         if column is None:
             return rows, Records({}, len(rows))
         assert isinstance(column, Records)
@@ -191,7 +216,7 @@ class WireReader:
         rows: NDArray[np.intp],
         start: NDArray[np.int64],
         end: NDArray[np.int64],
-        bad: dict[str, list[NDArray[np.intp]]],
+        odd: _Odd,
     ) -> NDArray[np.intp]:
         """Check each row separately; return the valid ones."""
         scanner = Scanner(source, self._wire)
@@ -202,5 +227,5 @@ class WireReader:
                 scanner.check(self._program, begin, finish)
             except MisfitError as misfit:
                 good[index] = False
-                bad.setdefault(str(misfit), []).append(np.array([row], np.intp))
+                odd.bad.setdefault(str(misfit), []).append(np.array([row], np.intp))
         return rows[good]

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 MAX_EMPTY_ELEMENTS = 1_000_000
 """Most elements of an array whose elements take no bytes."""
-MAX_TRAILING = {"ros1": 0, "cdr": 7}
-"""Most bytes behind the message in its payload."""
+MAX_PADDING = {"ros1": 0, "cdr": 7}
+"""Most bytes behind the message in its payload that are not worth a remark."""
 
 _U4 = {"<": Struct("<I"), ">": Struct(">I")}
 
@@ -36,10 +36,10 @@ class Scanner:
         self._u4 = _U4[source.order].unpack_from
         self._cdr = wire == "cdr"
         self._mask = 7 if self._cdr else 0
-        self._trailing = MAX_TRAILING[wire]
+        self._padding = MAX_PADDING[wire]
 
     def check(self, program: Program, start: int, end: int) -> None:
-        """Walk over a whole message.
+        """Walk over a whole message. Bytes may be left over, except of a type without fields.
 
         Args:
             program: The message.
@@ -50,8 +50,8 @@ class Scanner:
             MisfitError: The payload does not fit.
         """
         rest = end - self.walk(program, start, end, start)
-        if rest > self._trailing:
-            raise MisfitError(f"{rest} bytes left over: the definition does not fit")
+        if rest > self._padding and not program.steps:
+            raise MisfitError(f"{rest} bytes, but the definition has no fields")
 
     def walk(self, program: Program, at: int, end: int, origin: int) -> int:
         """The position behind one message or element.

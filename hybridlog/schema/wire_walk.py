@@ -30,7 +30,7 @@ from hybridlog.schema.wire_program import (
     Wire,
     assemble,
 )
-from hybridlog.schema.wire_scan import MAX_EMPTY_ELEMENTS, MAX_TRAILING, MisfitError, Scanner
+from hybridlog.schema.wire_scan import MAX_EMPTY_ELEMENTS, MAX_PADDING, MisfitError, Scanner
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -114,11 +114,11 @@ class Walker:
         # ROS 1: every phase counts as 0 and known.
         self._mask = 7 if self._cdr else 0
         self._count_align = 4 if self._cdr else 1
-        self._trailing = MAX_TRAILING[wire]
+        self._padding = MAX_PADDING[wire]
 
     def read(
         self, program: Program, start: NDArray[np.int64], end: NDArray[np.int64]
-    ) -> Column | None:
+    ) -> tuple[Column | None, NDArray[np.bool_] | None]:
         """Read columns of whole messages.
 
         Args:
@@ -127,19 +127,24 @@ class Walker:
             end: int64[n], ends of the payloads. All within the buffer.
 
         Returns:
-            The column, None if no field is requested.
+            The column, None if no field is requested; and bool[n], True where bytes are left
+            over behind the message, None if there are none.
 
         Raises:
             MisfitError: At least one payload does not fit; it is not named.
         """
         slots: list[Column | None] = [None] * program.slots
         if len(start) == 0:
-            return self._empty(program)
+            return self._empty(program), None
         cursor = _Cursor(start, end, start)
         self._walk(program, cursor, slots)
-        if int((end - cursor.base).max()) - cursor.delta > self._trailing:
-            raise MisfitError
-        return None if program.root is None else assemble(program.root, slots, len(start))
+        surplus = None
+        if int((end - cursor.base).max()) - cursor.delta > self._padding:
+            if not program.steps:
+                raise MisfitError
+            surplus = end - cursor.base > cursor.delta + self._padding
+        column = None if program.root is None else assemble(program.root, slots, len(start))
+        return column, surplus
 
     def _walk(self, program: Program, cursor: _Cursor, slots: list[Column | None] | None) -> None:
         """Take all steps of a program; gather columns if it has slots."""

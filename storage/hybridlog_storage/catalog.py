@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
 _JOURNAL: Final = f"{CATALOG}-journal"
-_VERSION: Final = 3
+_VERSION: Final = 4
 _BUSY_S: Final = 20.0
 _NO_DAMAGE: Final = frozenset(
     {
@@ -76,6 +76,7 @@ _CACHED_BYTES: Final = 64 << 20  # of chunk tables
 _STAMPS = np.dtype(
     [
         ("unreadable", "<u4"),
+        ("surplus", "<u4"),
         ("stamped", "<u4"),
         ("first_stamp", "<i8"),
         ("last_stamp", "<i8"),
@@ -123,12 +124,14 @@ class ChannelStats:
     """Statistics of the messages of one channel, in a chunk or in a recording.
 
     Times are nanoseconds; `first` and `last` are both inclusive; None without messages
-    or, for stamps, without a header. Skew is log time minus header stamp.
+    or, for stamps, without a header. Skew is log time minus header stamp. `surplus` counts
+    messages with bytes left over behind their last field.
     """
 
     messages: int = 0
     payload_bytes: int = 0
     unreadable: int = 0
+    surplus: int = 0
     first: int | None = None
     last: int | None = None
     first_publish: int | None = None
@@ -144,7 +147,7 @@ class ChannelStats:
 
     def add(self, other: ChannelStats) -> None:
         """Add the messages of another part of the channel."""
-        for name in ("messages", "payload_bytes", "unreadable", "stamped", "skew_sum"):
+        for name in ("messages", "payload_bytes", "unreadable", "surplus", "stamped", "skew_sum"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
@@ -395,6 +398,7 @@ def channel_totals(
 
 def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
     stats.unreadable = int(rows["unreadable"].sum())
+    stats.surplus = int(rows["surplus"].sum())
     rows = rows[rows["stamped"] > 0]
     if len(rows):
         stats.stamped = int(rows["stamped"].sum())
@@ -424,6 +428,7 @@ def stamps_of(
                 continue
             rows[row] = (
                 stats.unreadable,
+                stats.surplus,
                 stats.stamped,
                 stats.first_stamp or 0,
                 stats.last_stamp or 0,
@@ -1120,6 +1125,7 @@ def _stats(part: np.void, stamp: np.void | None, silent: Container[int]) -> Chan
         stats.last_publish = int(part["last_publish"])
     if stamp is not None:
         stats.unreadable = int(stamp["unreadable"])
+        stats.surplus = int(stamp["surplus"])
         if stamp["stamped"]:
             stats.stamped = int(stamp["stamped"])
             stats.skew_sum = float(stamp["skew_sum"])

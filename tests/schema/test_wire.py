@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 from collections import defaultdict
 from pathlib import Path
 
@@ -491,12 +492,12 @@ def test_reasons_name_the_field_and_the_numbers():
             u4(1, 0, 0, 1)[:-1],
         ],
     )
-    assert decoded.rows.tolist() == [0, 5]
-    assert decoded.records.fields["a"].values.tolist() == [1, 1]
+    assert decoded.rows.tolist() == [0, 3, 5]
+    assert decoded.surplus.tolist() == [3]
+    assert decoded.records.fields["a"].values.tolist() == [1, 1, 1]
     assert reasons(decoded) == {
         "ends in the middle of field a": [1],
         "ranges claims 4294967295 elements, 4 bytes remain": [2],
-        "12 bytes left over: the definition does not fit": [3],
         "s claims 7 bytes, 0 bytes remain": [4],
         "ps claims 50 elements, 0 bytes remain": [6],
         "ps[].y claims 4 bytes, 2 bytes remain": [7],
@@ -517,7 +518,6 @@ def test_the_same_reason_collects_its_rows():
         (b"\x00\x03\x00\x00" + u4(1), "encapsulation 0x0003 (PL_CDR) is not read"),
         (b"\x00\x07\x00\x00" + u4(1), "encapsulation 0x0007 (XCDR2) is not read"),
         (b"\x77\x01\x00\x00" + u4(1), "encapsulation 0x7701 (unknown) is not read"),
-        (HEADER + u4(1, 2, 3), "8 bytes left over: the definition does not fit"),
     ],
 )
 def test_what_cdr_refuses(payload, reason):
@@ -568,9 +568,27 @@ def test_elements_without_bytes_are_bounded():
 def test_messages_without_fields():
     decoded = read("", [b"", b"", b"x"])
     assert decoded.records == Records({}, 2)
-    assert reasons(decoded) == {"1 bytes left over: the definition does not fit": [2]}
+    assert reasons(decoded) == {"1 bytes, but the definition has no fields": [2]}
     decoded = read("", [HEADER + b"\x00", HEADER], wire="cdr")
     assert decoded.records == Records({}, 1)
+
+
+@pytest.mark.parametrize("count", [1, 5, 40])
+def test_bytes_left_over_are_told_and_the_message_is_read(count):
+    text = "uint32 a\nstring s\n"
+    whole = u4(7, 2) + b"hi"
+    for wire, head, padding in (("ros1", b"", 0), ("cdr", HEADER, 7)):
+        body = head + (whole if wire == "ros1" else u4(7, 3) + b"hi\0")
+        payloads = [body, body + bytes(padding), body + bytes(padding + 1), u4(1), body * 3]
+        decoded = read(text, [payload for payload in payloads for _ in range(count)], wire=wire)
+        rows = np.arange(5 * count)
+        assert decoded.rows.tolist() == rows[rows // count != 3].tolist()
+        assert decoded.surplus.tolist() == rows[np.isin(rows // count, [2, 4])].tolist()
+        assert set(decoded.records.fields["a"].values.tolist()) == {7}
+    big = b"\0\0\0\0" + struct.pack(">II", 7, 3) + b"hi\0"
+    decoded = read(text, [body, big + bytes(8), body + bytes(8), big], wire="cdr")
+    assert decoded.surplus.tolist() == [1, 2]
+    assert decoded.records.fields["a"].values.tolist() == [7] * 4
 
 
 def test_arrays_within_elements_without_bytes_are_refused():

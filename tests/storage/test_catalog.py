@@ -736,7 +736,7 @@ def test_the_catalog_of_another_store_is_made_anew(tmp_path: Path, model: Model)
         assert other.chunks(model.entry) == model.chunks()
 
 
-@pytest.mark.parametrize("version", ["1", "", "4", None])
+@pytest.mark.parametrize("version", ["1", "", "5", None])
 def test_the_catalog_of_another_version_is_made_anew(
     tmp_path: Path, model: Model, version: str | None
 ) -> None:
