@@ -18,8 +18,10 @@ import numpy as np
 from hybridlog.capture import Capture
 from hybridlog.entries import text
 from hybridlog.latched_front import LatchedFront
+from hybridlog.schema.completion import TRIED_MESSAGES, completed
 from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -189,6 +191,7 @@ class _Copy:
         self._writer = writer
         self._between = options.between
         self._choice = _Choice(options, self.front)
+        self._completed = _Completed(source)
 
     def run(self, progress: Callable[[int, int], None] | None) -> None:
         """Copy the source from its beginning to its end."""
@@ -198,13 +201,14 @@ class _Copy:
             safe_point()
             self._copy_extras()
             read += len(batch)
-            writer.append(self._choice.of(batch, source.channels), source.channels)
+            kept = self._choice.of(batch, source.channels)
+            writer.append(kept, self._completed.of(kept))
             if progress is not None:
                 progress(source.bytes_read, writer.totals.messages)
         for batch in self.front.batches() if self.front is not None else ():
-            writer.append(batch, source.channels)
+            writer.append(batch, self._completed.of(batch))
         self._copy_extras()
-        for channel in self._choice.channels(source.channels):
+        for channel in self._choice.channels(self._completed.all()):
             writer.declare(channel)
         self.skipped = read - writer.totals.messages
 
@@ -219,6 +223,40 @@ class _Copy:
                 continue
             self._writer.add_extra(extra)
         self._source.extras.clear()
+
+
+class _Completed:
+    """The channels of a source, completed with standard definitions by their first messages."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._channels: list[Channel] = []
+        self._open: set[int] = set()
+
+    def of(self, batch: Batch) -> list[Channel]:
+        """The channels of a batch, by their numbers in the source."""
+        self._learn()
+        if self._open and len(batch):
+            for number in self._open.intersection(distinct(batch.channel).tolist()):
+                rows = np.flatnonzero(batch.channel == number)
+                some = rows[:: max(1, len(rows) // TRIED_MESSAGES)].tolist()
+                payloads = [batch.payload(row) for row in some]
+                self._channels[number] = completed(self._channels[number], payloads)
+                self._open.discard(number)
+        return self._channels
+
+    def all(self) -> list[Channel]:
+        """All channels of the source; those without messages are completed by proof only."""
+        self._learn()
+        for number in self._open:
+            self._channels[number] = completed(self._channels[number], [])
+        self._open.clear()
+        return self._channels
+
+    def _learn(self) -> None:
+        known = len(self._channels)
+        self._channels += self._source.channels[known:]
+        self._open.update(range(known, len(self._channels)))
 
 
 class _Choice:

@@ -117,6 +117,7 @@ SLOW = frozenset(
         "test_cache_size.py",
         "test_catalog_by_hand.py",
         "test_consent.py",
+        "test_definitions_of_logs.py",
         "test_docs.py",
         "test_exact_values.py",
         "test_faults.py",
@@ -133,6 +134,7 @@ SLOW = frozenset(
         "test_reader.py",
         "test_real_logs.py",
         "test_second_opinion.py",
+        "test_sensor_messages.py",
         "test_sizes.py",
         "test_style.py",
     )

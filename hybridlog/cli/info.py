@@ -200,13 +200,15 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
 
 def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> list[str]:
     from hybridlog.latching import depth_of
-    from hybridlog_storage.messages import REDUCED, Channel
+    from hybridlog_storage.messages import REDUCED, SUPPLIED, Channel
 
     stats = channel.stats
     rate = _rate(channel)
     notes = []
     if channel.unindexed is not None:
         notes.append(f"not indexed: {channel.unindexed}")
+    if SUPPLIED in channel.metadata:
+        notes.append(f"definition of {channel.metadata[SUPPLIED]}")
     if stats.unreadable:
         notes.append(f"{stats.unreadable} unreadable")
     if stats.surplus:

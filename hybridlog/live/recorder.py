@@ -34,6 +34,7 @@ from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.losses import Cause
 from hybridlog.marks import mark_channel, mark_payload
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel
@@ -414,7 +415,7 @@ class Recorder:
         sequence: int | None = None,
     ) -> None:
         """See `Sink.take`."""
-        recorded = self._recorded.get(channel) or self._meet(channel)
+        recorded = self._recorded.get(channel) or self._meet(channel, payload)
         size = len(payload)
         through = recorded.throttle is None or recorded.throttle.lets_through(received)
         if through and not self._claim(size):
@@ -548,8 +549,8 @@ class Recorder:
 
     # Parts of `take`.
 
-    def _meet(self, channel: Channel) -> _RecordedChannel:
-        """Look up a channel object by its content, or add it.
+    def _meet(self, channel: Channel, payload: bytes) -> _RecordedChannel:
+        """Look up a channel object by its content, or add it with its first message.
 
         A publisher that reconnects makes a new channel object with the same content. It
         shares the old channel: a robot with a bad cable would otherwise use up all numbers.
@@ -571,7 +572,7 @@ class Recorder:
                 hz = first_fit(self._options.throttles, topic)
                 priority = first_fit(self._options.priorities, topic)
                 recorded = _RecordedChannel(
-                    channel,
+                    completed(channel, [payload]),
                     Tally(),
                     None if hz is None else Throttle(hz),
                     Priority.NORMAL if priority is None else Priority(int(priority)),

@@ -6,12 +6,15 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.completion import has_hidden_fields
+from hybridlog.schema.definition_text import canonical
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel, Schema
 
+_MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
@@ -22,7 +25,13 @@ def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
         channel: The channel; its message encoding and schema determine the codec.
         array_limit: Arrays of more elements are summarised in the index.
     """
-    return _codec(channel.message_encoding, channel.schema, array_limit)
+    schema = channel.schema
+    if schema is not None and has_hidden_fields(channel):
+        return OpaqueCodec(
+            f"{schema.name}: the definition in the source is empty, but its md5sum says that it "
+            "has fields"
+        )
+    return _codec(channel.message_encoding, schema, array_limit)
 
 
 @lru_cache(maxsize=1024)
@@ -53,6 +62,9 @@ def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
     if schema is None or not (schema.encoding or schema.data):
         named = "" if schema is None or not schema.name else f"{schema.name}: "
         return OpaqueCodec(f"{named}no definition in the source")
+    text = schema.data[:_MAX_NAME].decode(errors="replace").strip()
+    if text and canonical(text) == canonical(schema.name):
+        return OpaqueCodec(f"{schema.name}: the definition in the source is only its name")
     if (encoding, schema.encoding) in _ROS:
         from hybridlog.schema.ros_codec import RosCodec
 

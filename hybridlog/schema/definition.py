@@ -7,6 +7,7 @@ are limited before types are built, and nothing in it is executed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 import numpy as np
@@ -26,6 +27,8 @@ from hybridlog.schema.definition_text import (
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
     from hybridlog_storage.messages import Schema
 
 MAX_DEFINITION = 1 << 20
@@ -164,6 +167,10 @@ _ROS1_TIMES = {"time": Instant("time", False, False), "duration": Instant("durat
 _WORDS = frozenset({*_DTYPES, "byte", "string", *_NOT_PORTABLE})
 
 
+Release: TypeAlias = str
+"""Name of a release in rosbags, as `ROS2_HUMBLE`."""
+
+
 def parse_definition(schema: Schema) -> MessageType:
     """Parse a definition of encoding `ros1msg`, `ros2msg`, `ros2idl` or `omgidl`.
 
@@ -176,6 +183,23 @@ def parse_definition(schema: Schema) -> MessageType:
     Raises:
         DefinitionError: it is missing or malformed, refers to unknown types or to itself,
             has too many fields, or uses a type without a portable wire form.
+    """
+    return parse_for_release(schema, "")[0]
+
+
+@lru_cache(maxsize=1024)
+def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, frozenset[str]]:
+    """Parse a definition; missing standard types are those of one release.
+
+    Args:
+        schema: As for `parse_definition`.
+        release: One of `releases`; empty for Noetic or Kilted.
+
+    Returns:
+        The type, and the names of the standard types that the text lacks.
+
+    Raises:
+        DefinitionError: As for `parse_definition`.
     """
     if not schema.encoding:
         raise DefinitionError(f"{schema.name}: no definition in the source")
@@ -191,8 +215,9 @@ def parse_definition(schema: Schema) -> MessageType:
     top = canonical(schema.name)
     if top not in types:
         top = first
-    resolver = _Resolver(schema.name, types, ros)
-    return MessageType(schema.name, resolver.message(top).fields)
+    resolver = _Resolver(schema.name, types, ros, release)
+    fields = resolver.message(top).fields
+    return MessageType(schema.name, fields), frozenset(resolver.supplied)
 
 
 def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
@@ -205,9 +230,29 @@ def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
         ros: ROS 1 or ROS 2; headers and times differ.
     """
     key = canonical(name)
-    if _standard_fields(key, ros) is None:
+    if _standard_fields(key, _DEFAULT_RELEASES[ros]) is None:
         return None
     return MessageType(name, _Resolver(name, {}, ros).message(key).fields)
+
+
+_DEFAULT_RELEASES: dict[int, Release] = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
+
+
+def releases(wire: Literal["ros1", "cdr"]) -> list[Release]:
+    """The releases that are known, newest first."""
+    from rosbags.typesys import Stores
+
+    prefix = "ROS1_" if wire == "ros1" else "ROS2_"
+    return sorted((name for name in Stores.__members__ if name.startswith(prefix)), reverse=True)
+
+
+@cache
+def typestore(release: Release) -> Typestore:
+    """The standard types of a release; not to be changed."""
+    # Imported here, since it is slow and most definitions are complete.
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores[release])
 
 
 def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]], str]:
@@ -239,16 +284,13 @@ def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawFiel
     return {name: parse_msg(name, section.text, defaults=ros == 2)}
 
 
-def _standard_fields(name: str, ros: int) -> list[RawField] | None:
+def _standard_fields(name: str, release: Release) -> list[RawField] | None:
     """Fields of a standard type from the tables of rosbags."""
-    # Imported here, since it is slow and most definitions are complete.
     from rosbags.interfaces import Nodetype
-    from rosbags.typesys import Stores, get_typestore
 
     package, _, leaf = name.rpartition("/")
     key = name if "/" in package else f"{package}/msg/{leaf}"
-    store = Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_KILTED
-    definition = get_typestore(store).fielddefs.get(key)
+    definition = typestore(release).fielddefs.get(key)
     if definition is None:
         return None
 
@@ -286,10 +328,14 @@ class _Extent:
 class _Resolver:
     """Resolves type names to types, each type once."""
 
-    def __init__(self, owner: str, types: dict[str, list[RawField]], ros: int) -> None:
+    def __init__(
+        self, owner: str, types: dict[str, list[RawField]], ros: int, release: Release = ""
+    ) -> None:
+        self.supplied: set[str] = set()
         self._owner = owner
         self._types = types
         self._ros = ros
+        self._release = release or _DEFAULT_RELEASES[ros]
         self._done: dict[str, tuple[MessageType, _Extent]] = {}
         self._open: set[str] = set()
         self._by_leaf: dict[str, list[str]] = {}
@@ -311,7 +357,8 @@ class _Resolver:
             raise self._fail(f"messages are nested deeper than {MAX_DEPTH}")
         raw_fields = self._types.get(name)
         if raw_fields is None:
-            raw_fields = _standard_fields(name, self._ros)
+            raw_fields = _standard_fields(name, self._release)
+            self.supplied.add(name)
         if raw_fields is None:
             raise self._fail(f"the definition does not say what {name} is")
         if [raw.name for raw in raw_fields] == [_DUMMY]:

@@ -202,6 +202,7 @@ class Program:
         least: Its minimum size in bytes.
         align: Largest alignment of its fields of fixed size.
         fixed: True if its size depends only on the phase of its start.
+        empty: True if it has no fields.
     """
 
     steps: tuple[Step, ...]
@@ -210,6 +211,7 @@ class Program:
     least: int = field(init=False)
     align: int = field(init=False)
     fixed: bool = field(init=False)
+    empty: bool = field(init=False)
     _sizes: list[int | None] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -217,6 +219,10 @@ class Program:
         self.least = sum(_least(step) for step in self.steps)
         self.align = max((_align(step) for step in self.steps), default=1)
         self.fixed = all(_is_fixed(step) for step in self.steps)
+        self.empty = all(
+            isinstance(step, Run) and all(item.kind is None for item in step.fields)
+            for step in self.steps
+        )
 
     def size(self, phase: int) -> int:
         """Bytes from a start of that phase (0 to 7). Only for fixed programs."""

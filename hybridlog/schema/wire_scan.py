@@ -20,6 +20,8 @@ MAX_EMPTY_ELEMENTS = 1_000_000
 """Most elements of an array whose elements take no bytes."""
 MAX_PADDING = {"ros1": 0, "cdr": 7}
 """Most bytes behind the message in its payload that are not worth a remark."""
+MAX_EMPTY = {"ros1": 0, "cdr": 3}
+"""Most bytes behind a message without fields."""
 
 _U4 = {"<": Struct("<I"), ">": Struct(">I")}
 
@@ -36,7 +38,7 @@ class Scanner:
         self._u4 = _U4[source.order].unpack_from
         self._cdr = wire == "cdr"
         self._mask = 7 if self._cdr else 0
-        self._padding = MAX_PADDING[wire]
+        self._most_empty = MAX_EMPTY[wire]
 
     def check(self, program: Program, start: int, end: int) -> None:
         """Walk over a whole message. Bytes may be left over, except of a type without fields.
@@ -50,8 +52,8 @@ class Scanner:
             MisfitError: The payload does not fit.
         """
         rest = end - self.walk(program, start, end, start)
-        if rest > self._padding and not program.steps:
-            raise MisfitError(f"{rest} bytes, but the definition has no fields")
+        if program.empty and rest > self._most_empty:
+            raise MisfitError(f"{rest} bytes left over: the definition has no fields")
 
     def walk(self, program: Program, at: int, end: int, origin: int) -> int:
         """The position behind one message or element.

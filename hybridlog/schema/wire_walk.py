@@ -30,7 +30,13 @@ from hybridlog.schema.wire_program import (
     Wire,
     assemble,
 )
-from hybridlog.schema.wire_scan import MAX_EMPTY_ELEMENTS, MAX_PADDING, MisfitError, Scanner
+from hybridlog.schema.wire_scan import (
+    MAX_EMPTY,
+    MAX_EMPTY_ELEMENTS,
+    MAX_PADDING,
+    MisfitError,
+    Scanner,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -115,6 +121,7 @@ class Walker:
         self._mask = 7 if self._cdr else 0
         self._count_align = 4 if self._cdr else 1
         self._padding = MAX_PADDING[wire]
+        self._most_empty = MAX_EMPTY[wire]
 
     def read(
         self, program: Program, start: NDArray[np.int64], end: NDArray[np.int64]
@@ -139,9 +146,10 @@ class Walker:
         cursor = _Cursor(start, end, start)
         self._walk(program, cursor, slots)
         surplus = None
-        if int((end - cursor.base).max()) - cursor.delta > self._padding:
-            if not program.steps:
-                raise MisfitError
+        most = int((end - cursor.base).max()) - cursor.delta
+        if program.empty and most > self._most_empty:
+            raise MisfitError
+        if most > self._padding:
             surplus = end - cursor.base > cursor.delta + self._padding
         column = None if program.root is None else assemble(program.root, slots, len(start))
         return column, surplus

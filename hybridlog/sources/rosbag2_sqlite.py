@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import Counter
-from functools import cache, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
     from typing import Any, Literal
-
-    from rosbags.typesys.store import Typestore
 
 MAGIC = b"SQLite format 3\x00"
 
@@ -118,8 +115,8 @@ class SqliteSource(Source):
         self._select = f"SELECT {chosen} FROM messages WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
         self._db.execute(f"{self._select} LIMIT 0", (0,)).fetchall()
         self._has_publish_time = has_publish_time
-        distro = self._read_metadata(tables)
-        self._read_topics(topics, tables, distro)
+        self._read_metadata(tables)
+        self._read_topics(topics, tables)
         self._read_totals(tables, log_time)
 
     def _tables(self) -> set[str]:
@@ -136,9 +133,8 @@ class SqliteSource(Source):
     def _columns(self, table: str) -> set[str]:
         return {row[1] for row in self._db.execute(f"PRAGMA table_info({table})")}
 
-    def _read_metadata(self, tables: set[str]) -> str:
-        """Read the bag's own metadata if it exists; return the ROS release."""
-        distro = ""
+    def _read_metadata(self, tables: set[str]) -> None:
+        """Read the bag's own metadata if it exists."""
         if "metadata" in tables:
             query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
             for (text,) in self._optional(query):
@@ -147,13 +143,8 @@ class SqliteSource(Source):
                 except YamlError:
                     continue  # the recorder's copy of what the tables say
                 self.packed_messages = found.packed_messages
-                distro = found.ros_distro
-        if "schema" in tables:
-            for (name,) in self._optional("SELECT ros_distro FROM schema LIMIT 1"):
-                distro = str(name or distro)
-        return distro
 
-    def _read_topics(self, columns: set[str], tables: set[str], distro: str) -> None:
+    def _read_topics(self, columns: set[str], tables: set[str]) -> None:
         definitions: dict[str, tuple[str, bytes]] = {}
         if "message_definitions" in tables:
             query = (
@@ -174,9 +165,7 @@ class SqliteSource(Source):
         )
         for number, name, kind, encoding, qos, type_hash in self._db.execute(query):
             type_name = str(kind or "")
-            found = definitions.get(type_name)
-            if found is None:
-                found = known_definition(type_name, distro)
+            found = definitions.get(type_name, ("", b""))
             metadata = {}
             if "offered_qos_profiles" in columns:
                 metadata["offered_qos_profiles"] = str(qos or "")
@@ -433,36 +422,3 @@ def _unreadable(path: Path, error: Exception) -> SourceError:
         f"{path}: SQLite cannot read it ({error}); try to repair a copy with "
         "`sqlite3 FILE .recover | sqlite3 NEW` and use that"
     )
-
-
-@cache
-def _typestore(name: str) -> Typestore:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores(name))
-
-
-@lru_cache(maxsize=1024)
-def known_definition(type_name: str, distro: str = "") -> tuple[str, bytes]:
-    """Definition of a standard ROS 2 type, for bags without definitions.
-
-    Args:
-        type_name: Its name in the bag, with or without `/msg/`.
-        distro: ROS release that recorded the bag, empty if unknown.
-
-    Returns:
-        Schema encoding and definition, both empty for an unknown type.
-    """
-    from rosbags.typesys import Stores, TypesysError
-
-    parts = type_name.split("/")
-    name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
-    stores = [Stores.ROS2_HUMBLE, Stores.LATEST]
-    recorded = Stores.__members__.get(f"ROS2_{distro.upper()}")
-    for store in dict.fromkeys([recorded, *stores] if recorded else stores):
-        try:
-            text, _ = _typestore(store.value).generate_msgdef(name, ros_version=2)
-        except (TypesysError, KeyError, ValueError):
-            continue
-        return "ros2msg", text.encode()
-    return "", b""

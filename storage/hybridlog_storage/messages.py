@@ -30,6 +30,10 @@ REDUCED = "hybridlog.reduced"
 """Message encoding of a channel with reduced messages, whose payload was dropped."""
 
 
+SUPPLIED = "hybridlog.definition"
+"""Metadata of a channel whose definition the source lacks: its ROS release, and the proof."""
+
+
 @dataclass(frozen=True, slots=True)
 class Schema:
     """A message definition, unchanged from its source.
@@ -57,7 +61,7 @@ class Channel:
         topic: Its name, as the source spells it.
         message_encoding: MCAP message encoding: `ros1`, `cdr`, `json`, `protobuf`, ...
         schema: The definition, None for a channel without one.
-        metadata: MCAP channel metadata of the source, unchanged (ROS 1 connection
+        metadata: MCAP channel metadata of the source, with `SUPPLIED` added (ROS 1 connection
             header fields such as `callerid`, `latching`, `md5sum`; ROS 2
             `offered_qos_profiles`).
         has_publish_time: False if the source has no publish times; `publish_time`

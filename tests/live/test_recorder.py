@@ -38,6 +38,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.test_faults import wait_for
@@ -597,3 +598,17 @@ def test_what_a_ring_expects_is_in_no_index(store: hl.Store) -> None:
     robot.recorder.expect(text_channel("/said"))
     assert robot.recorder.stop() == []
     assert collection_of("/said") not in store.database_for("This").list_collections()
+
+
+def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=0))
+    bare = Channel("/chatter", "ros1", Schema("std_msgs/String", "", b""))
+    odd = Channel("/odd", "ros1", Schema("std_msgs/String", "", b""), {"md5sum": "1" * 32})
+    for number in range(3):
+        robot.speaker.say(bare, text(str(number)), SECOND + number)
+        robot.speaker.say(odd, text(str(number)), SECOND + number)
+    robot.recorder.stop()
+    assert store.topic("/chatter").to_arrow()["data"].to_pylist() == ["0", "1", "2"]
+    channels = {c.topic: c for c in store.entry(robot.recorder.name).channels}
+    assert channels["/chatter"].metadata[SUPPLIED] == "noetic, fits the messages"
+    assert "no definition in the source" in str(channels["/odd"].reason)

@@ -568,7 +568,7 @@ def test_elements_without_bytes_are_bounded():
 def test_messages_without_fields():
     decoded = read("", [b"", b"", b"x"])
     assert decoded.records == Records({}, 2)
-    assert reasons(decoded) == {"1 bytes, but the definition has no fields": [2]}
+    assert reasons(decoded) == {"1 bytes left over: the definition has no fields": [2]}
     decoded = read("", [HEADER + b"\x00", HEADER], wire="cdr")
     assert decoded.records == Records({}, 1)
 

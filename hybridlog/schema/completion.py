@@ -1,0 +1,194 @@
+"""Supplies definitions of standard ROS types that a source does not have.
+
+Three cases differ. A source may have no definition of a type; a definition that is empty; or
+messages that are empty, whose definition rightly has no fields. A text that cannot be parsed,
+such as the name of the type or prose, is no definition.
+
+A standard definition is supplied if it is proved: by the MD5 sum of ROS 1, by the type hash of
+ROS 2, or because it fits the messages. Releases of ROS 2 differ in some types; the one that fits
+best is chosen, the newest of equal ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+from hybridlog.schema.definition import (
+    MessageType,
+    Release,
+    parse_definition,
+    parse_for_release,
+    releases,
+    typestore,
+)
+from hybridlog.schema.definition_text import canonical
+from hybridlog.schema.wire import WireReader
+from hybridlog.schema.wire_scan import MisfitError
+from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import SUPPLIED, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from hybridlog.schema.wire_program import Wire
+    from hybridlog_storage.messages import Buffer, Channel
+
+TRIED_MESSAGES = 64
+"""Most messages of a channel that definitions are tried on."""
+
+_EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
+_ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
+_PADDING = 3  # bytes behind a CDR message that fits exactly
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A definition of one release.
+
+    Attributes:
+        release: The newest release that has it.
+        schema: The definition, with those of all nested types.
+        type: Its type.
+        proof: MD5 sum of a ROS 1 type, RIHS01 hash of a ROS 2 type.
+    """
+
+    release: Release
+    schema: Schema
+    type: MessageType
+    proof: str
+
+
+def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
+    """A channel with the definition of its standard type, if its source has none.
+
+    Args:
+        channel: The channel.
+        payloads: Messages of it; a few are enough.
+
+    Returns:
+        The channel itself if it has a definition, or if none is proved.
+    """
+    schema = channel.schema
+    wire = _WIRES.get(channel.message_encoding)
+    if wire is None or schema is None or not schema.name or schema.encoding not in _ENCODINGS:
+        return channel
+    try:
+        found, supplied = parse_for_release(schema, "")
+    except DefinitionError:
+        found, supplied = None, frozenset[str]()
+    if found is not None and found.fields:
+        return _with_nested(channel, schema, wire, payloads) if supplied else channel
+    candidates = _standard(schema.name, wire)
+    if not candidates:
+        return channel
+    proof = _proof(channel.metadata, wire)
+    if proof:
+        chosen = next((each for each in candidates if each.proof == proof), None)
+        how = "md5sum" if wire == "ros1" else "type hash"
+    else:
+        chosen = _fitting(candidates, wire, payloads)
+        how = "fits the messages"
+    return channel if chosen is None else _with(channel, chosen, how)
+
+
+_WIRES: Mapping[str, Wire] = {"ros1": "ros1", "cdr": "cdr"}
+
+
+def has_hidden_fields(channel: Channel) -> bool:
+    """True if the MD5 sum of a ROS 1 type proves that its empty definition is not its own."""
+    schema = channel.schema
+    if channel.message_encoding != "ros1" or schema is None or not schema.encoding:
+        return False
+    if schema.data.strip():
+        return False
+    return _proof(channel.metadata, "ros1") not in {"", _EMPTY_MD5}
+
+
+def _with(channel: Channel, chosen: _Candidate, how: str) -> Channel:
+    supplied = f"{chosen.release.removeprefix('ROS2_').removeprefix('ROS1_').lower()}, {how}"
+    schema = replace(chosen.schema, name=channel.schema.name if channel.schema else "")
+    return replace(channel, schema=schema, metadata={**channel.metadata, SUPPLIED: supplied})
+
+
+def _proof(metadata: Mapping[str, str], wire: Wire) -> str:
+    """The MD5 sum or type hash of a channel; empty without one."""
+    text = metadata.get("md5sum" if wire == "ros1" else "topic_type_hash", "").strip()
+    if wire == "ros1":
+        return text.lower() if len(text) == 32 and text.strip("0") else ""
+    return text if text.startswith("RIHS01_") and text[7:].strip("0") else ""
+
+
+def _with_nested(
+    channel: Channel, schema: Schema, wire: Wire, payloads: Sequence[Buffer]
+) -> Channel:
+    """The channel, with definitions of nested types if releases differ in them."""
+    candidates: dict[MessageType, _Candidate] = {}
+    for release in releases(wire):
+        try:
+            found, supplied = parse_for_release(schema, release)
+        except DefinitionError:
+            continue
+        if found not in candidates:
+            text = schema.data + _sections(release, supplied)
+            candidates[found] = _Candidate(release, replace(schema, data=text), found, "")
+    if len(candidates) < 2:
+        return channel
+    chosen = _fitting(list(candidates.values()), wire, payloads)
+    return channel if chosen is None else _with(channel, chosen, "nested types fit the messages")
+
+
+def _sections(release: Release, names: frozenset[str]) -> bytes:
+    """The definitions of standard types, to be appended to a definition."""
+    store = typestore(release)
+    texts = []
+    for name in sorted(names):
+        package, _, leaf = name.rpartition("/")
+        text, _ = store.generate_msgdef(f"{package}/msg/{leaf}", ros_version=2)
+        own = text.split("=" * 80, maxsplit=1)[0]
+        texts.append(f"\n{'=' * 80}\nMSG: {name}\n{own}")
+    return "".join(texts).encode()
+
+
+@cache
+def _standard(name: str, wire: Wire) -> list[_Candidate]:
+    """The definitions of a standard type in all releases, newest first; equal ones once."""
+    package, _, leaf = canonical(name).rpartition("/")
+    full = f"{package}/msg/{leaf}"
+    found: dict[MessageType, _Candidate] = {}
+    for release in releases(wire):
+        store = typestore(release)
+        if full not in store.fielddefs:
+            continue
+        version, encoding = (1, "ros1msg") if wire == "ros1" else (2, "ros2msg")
+        text, md5 = store.generate_msgdef(full, ros_version=version)
+        schema = Schema(name, encoding, text.encode())
+        try:
+            parsed = parse_definition(schema)
+        except DefinitionError:
+            continue
+        proof = md5 if wire == "ros1" else store.hash_rihs01(full)
+        found.setdefault(parsed, _Candidate(release, schema, parsed, proof))
+    return list(found.values())
+
+
+def _fitting(
+    candidates: Sequence[_Candidate], wire: Wire, payloads: Sequence[Buffer]
+) -> _Candidate | None:
+    """The candidate that fits most messages exactly, then most at all; None if none fits."""
+    step = -(-len(payloads) // TRIED_MESSAGES) or 1
+    best, most = None, (0, 0)
+    for candidate in candidates:
+        reader = WireReader(candidate.type, wire)
+        exact = fits = 0
+        for payload in payloads[::step]:
+            try:
+                rest = memoryview(payload).nbytes - len(reader.message_in(payload))
+            except MisfitError:
+                continue
+            fits += 1
+            exact += rest <= (_PADDING if wire == "cdr" else 0)
+        if (exact, fits) > most:
+            best, most = candidate, (exact, fits)
+    return best

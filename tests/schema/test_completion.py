@@ -1,0 +1,216 @@
+"""Definitions of standard types, supplied where a source has none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.completion import completed
+from hybridlog.schema.definition import parse_definition, typestore
+from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.messages import SUPPLIED, Channel, Schema
+from tests.ros_values import ROS1, message_of, same
+
+RULE = "=" * 80
+DIFFERENT = [
+    ("visualization_msgs/msg/Marker", "ROS2_FOXY"),
+    ("visualization_msgs/msg/Marker", "ROS2_HUMBLE"),
+    ("shape_msgs/msg/SolidPrimitive", "ROS2_FOXY"),
+    ("shape_msgs/msg/SolidPrimitive", "ROS2_LYRICAL"),
+    ("sensor_msgs/msg/Range", "ROS2_HUMBLE"),
+    ("sensor_msgs/msg/Range", "ROS2_JAZZY"),
+    ("rmw_dds_common/msg/Gid", "ROS2_GALACTIC"),
+    ("rmw_dds_common/msg/Gid", "ROS2_IRON"),
+    ("rosbag2_interfaces/msg/WriteSplitEvent", "ROS2_IRON"),
+    ("rosbag2_interfaces/msg/WriteSplitEvent", "ROS2_KILTED"),
+    # Nested in these.
+    ("visualization_msgs/msg/MarkerArray", "ROS2_FOXY"),
+    ("visualization_msgs/msg/InteractiveMarker", "ROS2_GALACTIC"),
+]
+NO_DEFINITIONS = [
+    ("", b""),
+    ("", b"string data"),
+    ("ros2msg", b""),
+    ("ros2msg", b" \n"),
+    ("ros2msg", b"# see the wiki\n"),
+    ("ros2msg", b"std_msgs/String"),
+    ("ros2msg", b"std_msgs/msg/String\n"),
+    ("ros2msg", b"A text that is sent by the robot.\n"),
+    ("ros2idl", b"module std_msgs {"),
+]
+
+
+def cdr(name: str, schema: Schema | None = None, **metadata: str) -> Channel:
+    return Channel("/t", "cdr", schema or Schema(name, "", b""), metadata)
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def payload_of(name: str, release: str, seed: int = 1) -> tuple[Any, bytes]:
+    store = get_typestore(Stores[release])
+    message = message_of(store, name, rng(seed))
+    return message, bytes(store.serialize_cdr(message, name))
+
+
+@pytest.mark.parametrize(("name", "release"), DIFFERENT)
+def test_the_release_that_fits_is_chosen(name: str, release: str) -> None:
+    pairs = [payload_of(name, release, seed) for seed in range(5)]
+    found = completed(cdr(name), [payload for _, payload in pairs])
+    assert found.schema is not None
+    expected = typestore(release).generate_msgdef(name, ros_version=2)[0].encode()
+    assert parse_definition(found.schema) == parse_definition(Schema(name, "ros2msg", expected))
+    assert found.metadata[SUPPLIED].endswith(", fits the messages")
+    codec = codec_for(found)
+    for message, payload in pairs:
+        same(codec.decode(payload), message)
+        (group,) = codec.bodies(payload, np.zeros(1, np.int64), np.array([len(payload)]))
+        assert group.error is None
+        assert not len(group.surplus)
+
+
+@pytest.mark.parametrize(("name", "release"), DIFFERENT)
+def test_a_type_hash_proves_a_release(name: str, release: str) -> None:
+    proof = typestore(release).hash_rihs01(name)
+    found = completed(cdr(name, topic_type_hash=proof), [])
+    assert found.schema is not None
+    expected = typestore(release).generate_msgdef(name, ros_version=2)[0].encode()
+    assert parse_definition(found.schema) == parse_definition(Schema(name, "ros2msg", expected))
+    assert found.metadata == {
+        "topic_type_hash": proof,
+        SUPPLIED: found.metadata[SUPPLIED],
+    }
+    assert found.metadata[SUPPLIED].endswith(", type hash")
+    other = completed(
+        cdr(name, topic_type_hash=f"RIHS01_{'1' * 64}"), [payload_of(name, release)[1]]
+    )
+    assert other.schema == Schema(name, "", b"")
+    unknown = cdr(name, topic_type_hash=f"RIHS01_{'0' * 64}")
+    assert completed(unknown, [payload_of(name, release)[1]]).schema != unknown.schema
+
+
+def test_an_md5_sum_proves_every_type_of_ros_1() -> None:
+    for name in ROS1.fielddefs:
+        if name.startswith("builtin_interfaces/"):
+            continue
+        short = name.replace("/msg/", "/")
+        text, md5 = ROS1.generate_msgdef(name, ros_version=1)
+        channel = Channel("/t", "ros1", Schema(short, "ros1msg", b""), {"md5sum": md5.upper()})
+        found = completed(channel, [])
+        assert found.schema == Schema(short, "ros1msg", text.encode())
+        assert found.metadata[SUPPLIED] == "noetic, md5sum"
+        assert codec_for(found).indexed
+
+
+@pytest.mark.parametrize(("encoding", "data"), NO_DEFINITIONS)
+def test_what_is_no_definition(encoding: str, data: bytes) -> None:
+    message, payload = payload_of("std_msgs/msg/String", "ROS2_HUMBLE")
+    for name in ("std_msgs/msg/String", "std_msgs/String"):
+        found = completed(cdr(name, Schema(name, encoding, data)), [payload])
+        assert found.schema == Schema(name, "ros2msg", b"string data\n")
+        same(codec_for(found).decode(payload), message)
+    encoding = "ros1msg" if encoding else ""
+    ros1 = Channel("/t", "ros1", Schema("std_msgs/String", encoding, data))
+    found = completed(ros1, [b"\2\0\0\0hi"])
+    assert found.schema == Schema("std_msgs/String", "ros1msg", b"string data\n")
+
+
+def test_a_message_that_is_empty_has_no_fields() -> None:
+    for schema in (Schema("std_msgs/Empty", "", b""), Schema("std_msgs/Empty", "ros1msg", b"")):
+        found = completed(Channel("/t", "ros1", schema), [b""])
+        assert codec_for(found).indexed
+        assert codec_for(found).paths() == []
+    own = cdr("p/msg/T", Schema("p/msg/T", "ros2msg", b"# nothing\nuint8 A=1\n"))
+    assert completed(own, [b"\0\1\0\0\0"]) is own
+    assert codec_for(own).plain(b"\0\1\0\0\0\0\0\0") == {}
+    (group,) = codec_for(own).bodies(b"\0\1\0\0\5\0\0\0hallo", np.zeros(1, int), np.array([13]))
+    assert group.error is not None
+    assert "8 bytes left over: the definition has no fields" in group.error
+
+
+@pytest.mark.parametrize(
+    ("metadata", "reason"),
+    [
+        ({"md5sum": "1" * 32}, "its md5sum says that it has fields"),
+        ({"md5sum": "d41d8cd98f00b204e9800998ecf8427e"}, None),
+        ({"md5sum": "0" * 32}, None),
+        ({"md5sum": "*"}, None),
+        ({}, None),
+    ],
+)
+def test_an_empty_definition_and_its_md5_sum(metadata: dict[str, str], reason: str | None) -> None:
+    channel = Channel("/t", "ros1", Schema("p/T", "ros1msg", b""), metadata)
+    assert completed(channel, [b"abc"]) is channel
+    codec = codec_for(channel)
+    assert codec.indexed == (reason is None)
+    assert reason is None or reason in str(codec.reason)
+    # A type of this name, but another one than the standard type.
+    channel = replace(channel, schema=Schema("std_msgs/String", "ros1msg", b""))
+    found = completed(channel, [b"\1\0\0\0a"])
+    assert (found is channel) == (
+        len(metadata.get("md5sum", "0")) == 32 and "0" * 32 not in metadata.values()
+    )
+
+
+def test_what_stays_as_it_is() -> None:
+    whole = cdr("", Schema("std_msgs/msg/String", "ros2msg", b"string mine\n"))
+    assert completed(whole, [b"\0\1\0\0"]) is whole
+    for channel in (
+        Channel("/t", "cdr", None),
+        Channel("/t", "json", Schema("std_msgs/msg/String", "", b"")),
+        Channel("/t", "cdr", Schema("std_msgs/msg/String", "protobuf", b"")),
+        cdr("p/msg/T"),
+        cdr("../x"),
+        cdr("String"),
+        cdr(""),
+    ):
+        assert completed(channel, [b"\0\1\0\0\1\0\0\0\0"]) is channel
+    unfit = cdr("std_msgs/msg/String")
+    assert completed(unfit, [b"\0\1\0\0\xff\0\0\0\0", b"", b"\0\7\0\0"]) is unfit
+    assert completed(unfit, []) is unfit
+    name_only = Channel("/t", "cdr", Schema("p/msg/T", "ros2msg", b"p/T\n"))
+    assert "is only its name" in str(codec_for(name_only).reason)
+
+
+def test_an_odd_message_does_not_decide() -> None:
+    payloads = [payload_of("shape_msgs/msg/SolidPrimitive", "ROS2_FOXY", s)[1] for s in range(4)]
+    found = completed(cdr("shape_msgs/msg/SolidPrimitive"), [b"\0\1", payloads[0][:-3], *payloads])
+    assert found.schema is not None
+    assert b"polygon" not in found.schema.data
+    padded = [payload + bytes(3) for payload in payloads]
+    assert completed(cdr("shape_msgs/msg/SolidPrimitive"), padded).schema == found.schema
+
+
+@pytest.mark.parametrize("release", ["ROS2_FOXY", "ROS2_JAZZY"])
+@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
+def test_nested_types_of_the_release_that_fits(release: str, encoding: str) -> None:
+    name = "visualization_msgs/msg/Marker"
+    text = b"uint8 n\nvisualization_msgs/Marker m"
+    store = get_typestore(Stores[release])
+    store.register(get_types_from_msg(text.decode(), "p/msg/T"))
+    payload = bytes(store.serialize_cdr(message_of(store, "p/msg/T", rng()), "p/msg/T"))
+    if encoding == "ros2idl":
+        text = b"""module p { module msg { struct T {
+            uint8 n; visualization_msgs::msg::Marker m; }; }; };"""
+    found = completed(cdr("", Schema("p/msg/T", encoding, text)), [payload])
+    assert found.schema is not None
+    assert found.schema.data.startswith(text + b"\n")
+    parsed = parse_definition(found.schema)
+    (_, marker) = parsed.fields[1]
+    assert [n for n, _ in marker.fields] == [n for n, _ in typestore(release).fielddefs[name][1]]  # type: ignore[union-attr]
+    # A type that all releases agree on needs nothing.
+    plain = cdr("", Schema("p/msg/T", "ros2msg", b"std_msgs/Header h\n"))
+    assert completed(plain, [payload]) is plain
+
+
+def test_types_that_cannot_be_read_are_not_supplied() -> None:
+    broken = cdr("", Schema("p/msg/T", "ros2msg", b"wstring w\nvisualization_msgs/Marker m\n"))
+    assert completed(broken, [b"\0\1\0\0"]) is broken
+    with pytest.raises(DefinitionError):
+        parse_definition(broken.schema or Schema("", "", b""))
