@@ -74,7 +74,7 @@ ALLOWED = {
     "re2": ("hybridlog.query.predicate.regex",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
-    "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema", "hybridlog.sources"),
+    "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
     "websockets": (
         "hybridlog.live.sources.foxglove.connection",
