@@ -150,6 +150,7 @@ class _RecordedChannel:
     reduced: Channel | None = None
     thinned: int = 0
     retention: Retention = Retention.ALL
+    is_complete: bool = False
 
 
 class Recorder:
@@ -470,7 +471,7 @@ class Recorder:
 
     def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
         """See `simulated_time.Recording.drop`."""
-        recorded = self._recorded.get(channel) or self._meet(channel)
+        recorded = self._recorded.get(channel) or self._meet(channel, None)
         recorded.tally.add(size, at)
         self._lose(recorded, cause, detail, at)
 
@@ -549,10 +550,10 @@ class Recorder:
 
     # Parts of `take`.
 
-    def _meet(self, channel: Channel, payload: bytes) -> _RecordedChannel:
-        """Look up a channel object by its content, or add it with its first message.
+    def _meet(self, channel: Channel, payload: bytes | None) -> _RecordedChannel:
+        """Look up a channel object by its content, or add it.
 
-        A publisher that reconnects makes a new channel object with the same content. It
+        Its first message may complete its definition; a dropped one has no payload. A publisher that reconnects makes a new channel object with the same content. It
         shares the old channel: a robot with a bad cable would otherwise use up all numbers.
         """
         content = (
@@ -572,13 +573,18 @@ class Recorder:
                 hz = first_fit(self._options.throttles, topic)
                 priority = first_fit(self._options.priorities, topic)
                 recorded = _RecordedChannel(
-                    completed(channel, [payload]),
+                    channel,
                     Tally(),
                     None if hz is None else Throttle(hz),
                     Priority.NORMAL if priority is None else Priority(int(priority)),
                 )
                 rates.tallies.append(recorded.tally)
                 self._recorded_by_content[content] = recorded
+            if payload is None:
+                return recorded
+            if not recorded.is_complete:
+                recorded.channel = completed(recorded.channel, [payload])
+                recorded.is_complete = True
             if len(self._recorded) >= _MAX_CACHED:
                 self._recorded.clear()  # they are found again by content
             self._recorded[channel] = recorded

@@ -604,6 +604,7 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0))
     bare = Channel("/chatter", "ros1", Schema("std_msgs/String", "", b""))
     odd = Channel("/odd", "ros1", Schema("std_msgs/String", "", b""), {"md5sum": "1" * 32})
+    robot.recorder.drop(bare, 5, Cause.CLOCK, "no time yet", SECOND)
     for number in range(3):
         robot.speaker.say(bare, text(str(number)), SECOND + number)
         robot.speaker.say(odd, text(str(number)), SECOND + number)
