@@ -553,7 +553,8 @@ class Recorder:
     def _meet(self, channel: Channel, payload: bytes | None) -> _RecordedChannel:
         """Look up a channel object by its content, or add it.
 
-        Its first message may complete its definition; a dropped one has no payload. A publisher that reconnects makes a new channel object with the same content. It
+        Its first message may complete its definition; a dropped one has no payload.
+        A publisher that reconnects makes a new channel object with the same content. It
         shares the old channel: a robot with a bad cable would otherwise use up all numbers.
         """
         content = (
