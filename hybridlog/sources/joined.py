@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -187,6 +188,7 @@ class JoinedSource(Source):
     def _read(self, part: Part, inner: Source, done: int, size: int) -> Iterator[Batch]:
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
+        alike: Counter[tuple[object, ...]] = Counter()
         got = 0
         found_before = len(self.damage)
         batches = self._unpacked(part, inner, inner.batches())
@@ -195,7 +197,7 @@ class JoinedSource(Source):
         for batch in batches:
             got += len(batch)
             if len(numbers) < len(inner.channels):
-                more = [self._number(each) for each in inner.channels[len(numbers) :]]
+                more = [self._number(each, alike) for each in inner.channels[len(numbers) :]]
                 numbers = np.append(numbers, np.array(more, np.int32))
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
@@ -210,8 +212,8 @@ class JoinedSource(Source):
                 batch.sequence,
             )
         self._take_extras(inner)
-        for channel in inner.channels:
-            self._number(channel)
+        for channel in inner.channels[len(numbers) :]:
+            self._number(channel, alike)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
         self._got += got
         if part.message_count is not None:
@@ -243,8 +245,15 @@ class JoinedSource(Source):
         self.extras.extend(inner.extras)
         inner.extras.clear()
 
-    def _number(self, channel: Channel) -> int:
-        """Index of a channel in this source."""
+    def _number(self, channel: Channel, alike: Counter[tuple[object, ...]]) -> int:
+        """Index of a channel in this source.
+
+        Equal channels of one file are publishers of their own, of two files the same ones.
+
+        Args:
+            channel: The channel.
+            alike: Numbers of the channels of its file so far, by what they have in common.
+        """
         schema = channel.schema
         key = (
             channel.topic,
@@ -253,9 +262,11 @@ class JoinedSource(Source):
             tuple(sorted(channel.metadata.items())),
             channel.has_publish_time,
         )
-        number = self._numbers.get(key)
+        alike[key] += 1
+        nth = (alike[key], *key)
+        number = self._numbers.get(nth)
         if number is None:
-            number = self._numbers[key] = len(self.channels)
+            number = self._numbers[nth] = len(self.channels)
             self.channels.append(channel)
         return number
 
