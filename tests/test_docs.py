@@ -550,7 +550,7 @@ def test_every_public_name_is_described(thing: type) -> None:
         attributes = "directory session"
         members |= dict.fromkeys(attributes.split())
     if thing is hl.Query:
-        members |= dict.fromkeys(("question", "counters"))
+        members |= dict.fromkeys(("question", "counters", "conditions"))
     if thing.__name__ == "Aligned":
         members |= {"counters": None}
     if thing.__name__ == "Synced":

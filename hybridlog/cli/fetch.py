@@ -24,6 +24,7 @@ from hybridlog.cli.output_path import check_room, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import Front, write_answer
+from hybridlog.query.predicate.across import names_topics
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class _Choices:
     reverse: bool
     fields: str | None
     tags: str | None
-    event: tuple[str, str] | None
+    within: str | None
     before: str | None
     after: str | None
     count: bool
@@ -111,14 +112,15 @@ class _Choices:
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
 @options.tag_columns
 @click.option(
-    "--event",
-    nargs=2,
-    metavar="TOPIC PREDICATE",
-    help="Only messages near those of TOPIC that satisfy PREDICATE, such as: rosout "
-    "'level >= 8'. Needs --before or --after.",
+    "--within",
+    metavar="DURATION",
+    help="Greatest distance in time of messages of other topics in --where "
+    "'/odom: twist.twist.linear.x > 0.5'.",
 )
-@click.option("--before", metavar="DURATION", help="Start this long before each event: 5min.")
-@click.option("--after", metavar="DURATION", help="End this long after each event.")
+@click.option(
+    "--before", metavar="DURATION", help="Instead: start this long before each of these: 5min."
+)
+@click.option("--after", metavar="DURATION", help="Instead: end this long after each of these.")
 @options.count
 @click.option(
     "--format",
@@ -150,8 +152,7 @@ def command(**parameters: Any) -> None:
     path = _path(choices, form)
     started = time.monotonic()
     with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
-        events = _events(store, choices)
-        query = asked = _query(store, choices, events)
+        query = asked = _query(store, choices)
         between = choices.between if choices.clock == "log" else None
         if choices.at is not None:
             try:
@@ -168,9 +169,9 @@ def command(**parameters: Any) -> None:
             query = _answer(query, form, path, choices)
         sys.stdout.flush()
         if not choices.quiet:
-            print_cost(query.counters, time.monotonic() - started, count=choices.count)
-            if choices.event is not None and events is not None:
-                print_remarks(events, choices.event[:1], is_empty=not asked.question.during)
+            cost = query.counters.copy()
+            cost.add(query.spent)
+            print_cost(cost, time.monotonic() - started, count=choices.count)
             print_remarks(query, choices.topic)
             print_gaps(asked, between)
 
@@ -199,22 +200,14 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
     return query
 
 
-def _events(store: Store, choices: _Choices) -> Query | None:
-    if choices.event is None:
-        return None
-    topic, predicate = choices.event
-    return query_of(store, [topic], choices.choice).where(predicate)
-
-
-def _query(store: Store, choices: _Choices, events: Query | None) -> Query:
+def _query(store: Store, choices: _Choices) -> Query:
     query = query_of(store, choices.topic, choices.choice)
     if choices.between is not None:
         query = query.between(*choices.between)
     query = query.clock(choices.clock)
-    if events is not None:
-        query = query.around(events, choices.before or 0, choices.after or 0)
+    near = _near(choices)
     for predicate in choices.where:
-        query = query.where(predicate)
+        query = query.where(predicate, near if names_topics(predicate) else None)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
     if choices.tags is not None:
@@ -229,7 +222,7 @@ def _query(store: Store, choices: _Choices, events: Query | None) -> Query:
 
 
 def _form(choices: _Choices) -> str:
-    _check_event(choices)
+    _check_near(choices)
     if choices.at is not None:
         for given, option in (
             (choices.between is not None, "--between"),
@@ -237,7 +230,7 @@ def _form(choices: _Choices) -> str:
             (choices.every > 1, "--every"),
             (choices.reverse, "--reverse"),
             (choices.clock != "log", "--clock"),
-            (choices.event is not None, "--event"),
+            (any(map(names_topics, choices.where)), "--where with other topics"),
         ):
             if given:
                 raise UsageError(f"--at gives one message, by log time: leave out {option}.")
@@ -257,12 +250,29 @@ def _form(choices: _Choices) -> str:
     return form
 
 
-def _check_event(choices: _Choices) -> None:
-    near = choices.before is not None or choices.after is not None
-    if near and choices.event is None:
-        raise UsageError("--before and --after need events: add --event TOPIC PREDICATE.")
-    if choices.event is not None and not near:
-        raise UsageError("--event needs a length of time: add --before or --after.")
+def _near(choices: _Choices) -> str | tuple[str, str] | None:
+    """How near in time the messages of other topics in --where are."""
+    around = choices.before, choices.after
+    if around == (None, None):
+        return choices.within
+    return around[0] or "0s", around[1] or "0s"
+
+
+def _check_near(choices: _Choices) -> None:
+    around = choices.before is not None or choices.after is not None
+    if around and choices.within is not None:
+        raise UsageError("--within is before and after: leave out --before and --after.")
+    near = around or choices.within is not None
+    asks = any(map(names_topics, choices.where))
+    if near and not asks:
+        raise UsageError(
+            "--within, --before and --after are about messages of other topics: add --where "
+            "'TOPIC: PREDICATE'."
+        )
+    if asks and not near:
+        raise UsageError(
+            "--where with another topic needs a length of time: add --within, --before or --after."
+        )
 
 
 def _form_of(path: Path) -> str:

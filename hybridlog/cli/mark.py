@@ -34,8 +34,8 @@ def command(
 ) -> None:
     """Set a mark that queries can use, now or at a past time.
 
-    A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --event
-    /hybridlog/marks "text = 'gripper slipped'" --before 5s --after 5s`.
+    A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --where
+    "/hybridlog/marks: text = 'gripper slipped'" --within 5s`.
     """
     tags = options.parse_tags(tag)
     if not text.strip():

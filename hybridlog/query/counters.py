@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -42,6 +42,10 @@ class Counters:
         """Set every counter to zero."""
         for each in fields(self):
             setattr(self, each.name, each.default)
+
+    def copy(self) -> Counters:
+        """The same counts."""
+        return replace(self)
 
     def add(self, other: Counters) -> None:
         """Add the counts of a part of the answer; the wall time is unchanged."""

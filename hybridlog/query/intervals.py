@@ -229,6 +229,33 @@ class Intervals:
             parts.append((name, np.stack([begin, end, np.zeros_like(begin)], axis=1)))
         return Intervals.of(parts)
 
+    def union(self, other: Intervals) -> Intervals:
+        """Times of a recording that intervals of either cover, joined.
+
+        `messages` is 0, since no messages belong to the new intervals.
+        """
+        parts = []
+        for one in (self, other):
+            for name in one.recordings:
+                rows = one.of_recording(name)
+                parts.append((name, np.insert(rows, 2, 0, axis=1)))
+        return Intervals.of(parts).merged()
+
+    def without(self, other: Intervals) -> Intervals:
+        """Times of a recording that these intervals cover and the other ones do not.
+
+        `messages` is 0, since no messages belong to the new intervals.
+        """
+        parts = []
+        for name in self._recordings:
+            taken = other.of_recording(name)
+            # What is between the others, from the first time to the last.
+            begin = np.concatenate([[0], taken[:, 1]])
+            end = np.concatenate([taken[:, 0], [_LAST]])
+            rows = np.stack([begin, end, np.zeros_like(begin)], axis=1)
+            parts.append((name, rows[end > begin]))
+        return self.common(Intervals.of(parts))
+
     def containing(self, events: Events) -> Intervals:
         """The intervals that contain the log time of at least one message of a question.
 

@@ -24,7 +24,7 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import parse_time
+from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import IndexChangedError, PayloadError, TopicError, UsageError
 
@@ -58,11 +58,15 @@ class Query:
     Attributes:
         question: The question, as a value that can be compared, hashed and pickled.
         counters: The cost of the last answer.
+        conditions: Queries about other topics, whose answers are in the question.
     """
 
-    def __init__(self, session: Session, question: Question) -> None:
+    def __init__(
+        self, session: Session, question: Question, conditions: tuple[Query, ...] = ()
+    ) -> None:
         self.question = question
         self.counters = Counters()
+        self.conditions = conditions
         self._session = session
 
     def __repr__(self) -> str:
@@ -95,11 +99,19 @@ class Query:
         summaries = self._session.snapshot().summaries
         return tuple(summaries[n].id for n in self._session.chosen(self.question).tolist())
 
+    @property
+    def spent(self) -> Counters:
+        """The cost of its conditions on other topics, which were answered before."""
+        found = Counters()
+        for condition in self.conditions:
+            found.add(condition.counters)
+        return found
+
     # Steps.
 
     def copy(self) -> Query:
         """The same question with separate counters."""
-        return Query(self._session, self.question)
+        return Query(self._session, self.question, self.conditions)
 
     def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
         """Only messages with `begin <= time < end`.
@@ -126,25 +138,81 @@ class Query:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return self._with(clock=cast(Clock, clock))
 
-    def where(self, predicate: str | Mapping[str, object]) -> Query:
+    def where(
+        self,
+        predicate: str | Mapping[str, object],
+        within: DurationLike | tuple[DurationLike, DurationLike] | None = None,
+    ) -> Query:
         """Only messages that satisfy a predicate; several are joined by *and*.
 
         Args:
             predicate: `"ranges.min < 0.5 and header.frame_id == 'laser'"`, or a MongoDB
-                filter.
+                filter. `"/odom: twist.twist.linear.x > 0.5"` asks for a message of another
+                topic, near in log time, in the same recording. Such conditions are answered
+                now, and joined by `and`, `or`, `not` and brackets.
+            within: Greatest distance in time of these messages, either way; or how long
+                before and after such a message: `t - before <= time < t + after`.
 
         Raises:
             WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
+            UsageError: `within` lacks for other topics, or there are none for it.
+            TopicError: no such topic exists.
+            TimeError: `within` is no duration.
         """
         if isinstance(predicate, str):
+            if ":" in predicate:
+                from hybridlog.query.predicate.across import names_topics
+
+                if names_topics(predicate):
+                    return self._near(predicate, within)
             checked = self._session.predicate(predicate, self.topics, self.question.recordings)
         else:
             from hybridlog.query.predicate.from_mongo import from_mongo
 
             checked = from_mongo(predicate)
+        if within is not None:
+            raise UsageError(
+                "A time within which is for other topics: '/odom: twist.twist.linear.x > 0.5'."
+            )
         if self.question.predicate is not None:
             checked = self.question.predicate & checked
         return self._with(predicate=checked or None)
+
+    def _near(
+        self, text: str, within: DurationLike | tuple[DurationLike, DurationLike] | None
+    ) -> Query:
+        """The query with the conditions on other topics as intervals."""
+        from hybridlog.query.near import everything, intervals_of, question_about, split_own
+        from hybridlog.query.predicate.across import Near, parse_across
+
+        if within is None:
+            raise UsageError(
+                "A condition on another topic needs a time within which its message is, such as "
+                "0.1s."
+            )
+        if isinstance(within, tuple):
+            before, after = within
+        else:
+            # The message that is exactly so far away belongs to it.
+            before, after = within, f"{parse_duration(within) + 1}ns"
+        own, others = split_own(parse_across(text))
+        query = self.copy()
+        for predicate in own:
+            query = query.where(predicate)
+        asked: list[Query] = []
+
+        def windows(condition: Near) -> Intervals:
+            question = question_about(self._session, query.question, condition.topic, before, after)
+            events = Query(self._session, question)
+            if condition.predicate:
+                events = events.where(condition.predicate)
+            asked.append(events)
+            return events.windows(before, after)
+
+        whole = everything(self._session, self.question)
+        for condition in others:
+            query = query.during(intervals_of(condition, windows, whole))
+        return Query(self._session, query.question, (*self.conditions, *asked))
 
     def limit(self, count: int) -> Query:
         """At most this many messages.
@@ -272,7 +340,7 @@ class Query:
         Raises:
             TimeError: `length` is no duration.
         """
-        return self.during(events.windows(before=length))
+        return self.around(events, before=length)
 
     def around(self, events: Query, before: DurationLike = 0, after: DurationLike = 0) -> Query:
         """Only messages near an event, in its recording: `t - before <= time < t + after`.
@@ -286,7 +354,9 @@ class Query:
             TimeError: `before` or `after` is no duration.
             UsageError: both are zero.
         """
-        return self.during(events.windows(before, after))
+        events = events.copy()
+        query = self.during(events.windows(before, after))
+        return Query(self._session, query.question, (*query.conditions, events))
 
     def at_time(self, moment: TimeLike) -> Query:
         """Only the message that was current at a time: the last one not after it.
@@ -299,7 +369,8 @@ class Query:
 
         found = self.at(moment)
         time = found.log_time_ns
-        return Query(self._session, just_before(self.question, found.recording, time, time))
+        question = just_before(self.question, found.recording, time, time)
+        return Query(self._session, question, self.conditions)
 
     # Answers.
 
@@ -664,8 +735,12 @@ class Query:
 
         if is_empty is None:
             is_empty = not self.counters.messages
-        found = remarks(self._session, self.question, self.counters, names, is_empty=is_empty)
-        return [*found]
+        found: list[str] = []
+        for one in self.conditions:
+            nothing = not self.question.during
+            found += remarks(self._session, one.question, one.counters, (), is_empty=nothing)
+        found += remarks(self._session, self.question, self.counters, names, is_empty=is_empty)
+        return [*dict.fromkeys(found)]
 
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
@@ -687,7 +762,7 @@ class Query:
     # Helpers.
 
     def _with(self, **changes: Any) -> Query:
-        return Query(self._session, replace(self.question, **changes))
+        return Query(self._session, replace(self.question, **changes), self.conditions)
 
     def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Query:
         """The same conditions on other topics and recordings."""

@@ -456,7 +456,7 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
     assert "messages could not be asked: they do not fit their definition" in done.err
     silent = run("fetch", "-t", "/long", "--where", "data > 0", "--count", "-q", store=store)
     assert (silent.out, silent.err) == (done.out, "")
-    events = ("--event", "/long", "data > 9", "--before", "1s")
+    events = ("--where", "/long: data > 9", "--before", "1s")
     done = run("fetch", "-t", "/json", *events, "--count", store=store)
     assert "messages could not be asked" in done.err
     assert "No time is asked for: there are no events" in done.err

@@ -1,4 +1,4 @@
-"""`hybridlog intervals`, `changes`, and `fetch --event`."""
+"""`hybridlog intervals`, `changes`, and `fetch` near messages of other topics."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
         if message.level >= 2
     ]
     assert errors
-    near = ("fetch", "-t", "**", "-r", "robot", "--event", "rosout", "level >= 2")
+    near = ("fetch", "-t", "**", "-r", "robot", "--where", "rosout: level >= 2")
 
     def wanted(before: int, after: int) -> list[Seen]:
         return [m for m in seen if any(t - before <= m.log_time < t + after for t in errors)]
@@ -117,13 +117,13 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("fetch", "-t", "odom", "--before", "5s"), "--event TOPIC PREDICATE"),
-        (("fetch", "-t", "odom", "--event", "rosout", "level > 1"), "--before or --after"),
-        (("fetch", "-t", "odom", "--event", "rosout", "levl > 1", "--after", "1s"), "levl"),
-        (("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "x"), "duration"),
+        (("fetch", "-t", "odom", "--before", "5s"), "add --where 'TOPIC: PREDICATE'"),
+        (("fetch", "-t", "odom", "--where", "rosout: level > 1"), "--before or --after"),
+        (("fetch", "-t", "odom", "--where", "rosout: levl > 1", "--after", "1s"), "levl"),
+        (("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "x"), "duration"),
         (
-            ("fetch", "-t", "odom", "--event", "rosout", "level > 1", "--after", "1s", "--at", "0"),
-            "leave out --event",
+            ("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "1s", "--at", "0"),
+            "leave out --where",
         ),
         (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
         (("intervals", *GRIPPER, "--where", "position ="), "value"),

@@ -1,0 +1,246 @@
+"""Predicates on one topic, messages of another, against loops over what was written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridlog.query.intervals import Intervals
+from hybridlog.query.predicate.across import (
+    All,
+    AnyOf,
+    Condition,
+    Near,
+    NoneOf,
+    Own,
+    names_topics,
+    parse_across,
+)
+from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
+from tests.cli.running import run
+from tests.independent import read_mcap
+
+from .conftest import MS, Logs, Said
+
+ODOM = Near("/odom", "v > 0.5")
+
+
+@pytest.mark.parametrize(
+    ("text", "want"),
+    [
+        ("/odom: v > 0.5", ODOM),
+        ("  odom:   v > 0.5 ", Near("odom", "v > 0.5")),
+        ("/odom:", Near("/odom", "")),
+        ("/odom: v > 1 and w < 2", Near("/odom", "v > 1 and w < 2")),
+        ("x < 1 and /odom: v > 0.5", All((Own("x < 1"), ODOM))),
+        ("x between 1 and 2 and /odom: v > 0.5", All((Own("x between 1 and 2"), ODOM))),
+        ("/odom: v > 0.5 and /a: b == ': c /d: e'", All((ODOM, Near("/a", "b == ': c /d: e'")))),
+        ("/odom: v > 0.5 or /a: b && /c:", AnyOf((ODOM, All((Near("/a", "b"), Near("/c", "")))))),
+        ("/odom: v > 0.5 && !/a: b", All((ODOM, NoneOf(Near("/a", "b"))))),
+        (
+            "not (/odom: v > 0.5 || /a: b) and x",
+            All((NoneOf(AnyOf((ODOM, Near("/a", "b")))), Own("x"))),
+        ),
+        ("(/odom: v > 0.5) and (x > 1 or y > 2)", All((ODOM, Own("(x > 1 or y > 2)")))),
+        (
+            "/odom: (v > 1 or v < 0) and /a: b",
+            All((Near("/odom", "(v > 1 or v < 0)"), Near("/a", "b"))),
+        ),
+        ("/odom: not v > 1 or /a: b", AnyOf((Near("/odom", "not v > 1"), Near("/a", "b")))),
+        (
+            "re:/tf(_static)?: x and /camera/*/image_[rb]aw: y",
+            All((Near("re:/tf(_static)?", "x"), Near("/camera/*/image_[rb]aw", "y"))),
+        ),
+        ('/odom: t >= t"2025-06-03 08:00" and a', Near("/odom", 't >= t"2025-06-03 08:00" and a')),
+        ("((/odom: v > 0.5))", ODOM),
+        ("/odom: name != 'x' and v !~ 'y'", Near("/odom", "name != 'x' and v !~ 'y'")),
+    ],
+)  # fmt: skip
+def test_conditions_on_topics(text: str, want: Condition) -> None:
+    assert names_topics(text)
+    assert parse_across(text) == want
+
+
+@pytest.mark.parametrize(
+    "text", ["x > 1", "x == ': y'", "`a: b` > 1", 't == t"08:00: 1"', "a:b > 1"]
+)
+def test_predicates_without_topics(text: str) -> None:
+    assert not names_topics(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x > 1 or y > 2 and /odom: v", "brackets around"),
+        ("/odom: v > 1 or v < 0 and /a: b", "brackets around"),
+        ("x and /odom: v > 1 or v < 0", "brackets around"),
+        ("x > 1 /odom: v", "missing before a topic"),
+        ("x > (1 /odom: v)", "missing before a topic"),
+        ("and /odom: v", "a condition is missing"),
+        ("(/odom: v > 1", "closing bracket is missing"),
+        ("/odom: v > 1) and x", "should end here"),
+        ("/odom: v and", "and"),
+        ("not " * 60 + "/odom: v", "deeper than 50"),
+        ("(" * 60 + "/odom: v" + ")" * 60, "deeper than 50"),
+        ("/a: b or " * 3000 + "/a: b", "at most 10000"),
+    ],
+)
+def test_conditions_that_are_refused(logs: Logs, text: str, said: str) -> None:
+    with pytest.raises(WhereError, match=said):
+        logs.store.topic("base").where(text.replace("/odom", "/left/pose"), within="1ms")
+
+
+spans = st.lists(
+    st.tuples(st.sampled_from("ab"), st.integers(0, 20), st.integers(0, 6)), max_size=8
+)
+
+
+@given(spans, spans)
+def test_union_and_difference(
+    one: list[tuple[str, int, int]], other: list[tuple[str, int, int]]
+) -> None:
+    def made(rows: list[tuple[str, int, int]]) -> Intervals:
+        return Intervals.of((n, np.array([[b, b + d, 1]], np.int64)) for n, b, d in rows)
+
+    def covered(found: Intervals) -> set[tuple[str, int]]:
+        return {(i.recording, t) for i in found for t in range(i.begin_ns, i.end_ns)}
+
+    left, right = made(one), made(other)
+    assert covered(left.union(right)) == covered(left) | covered(right)
+    assert covered(left.without(right)) == covered(left) - covered(right)
+    assert all(i.begin_ns < i.end_ns for i in left.without(right))
+
+
+Holds = Callable[[Callable[[str, Callable[[Said], bool]], bool], Said], bool]
+ON: Callable[[Said], bool] = lambda m: bool(m.fields["on"])  # noqa: E731
+STOP: Callable[[Said], bool] = lambda m: m.fields["state"] == "stop"  # noqa: E731
+
+
+@pytest.mark.parametrize(
+    ("text", "holds"),
+    [
+        ("/left/pose: on == true", lambda near, m: near("/left/pose", ON)),
+        (
+            "x > 0 and left/pose: on == true and state == 'stop'",
+            lambda near, m: m.fields["x"] > 0 and near("/left/pose", lambda o: ON(o) and STOP(o)),
+        ),
+        (
+            "left/pose: on == true and right/pose: state == 'stop'",
+            lambda near, m: near("/left/pose", ON) and near("/right/pose", STOP),
+        ),
+        (
+            "left/pose: state == 'stop' or right/pose:",
+            lambda near, m: near("/left/pose", STOP) or near("/right/pose", lambda o: True),
+        ),
+        (
+            "(x > 0 or x < -1) and not left/pose: on == true",
+            lambda near, m: (
+                not near("/left/pose", ON) and (m.fields["x"] > 0 or m.fields["x"] < -1)
+            ),
+        ),
+        (
+            "not (left/pose: on == true or right/pose: on == true)",
+            lambda near, m: not (near("/left/pose", ON) or near("/right/pose", ON)),
+        ),
+    ],
+)
+@pytest.mark.parametrize("between", [None, ("+150ms", "+600ms")])
+@pytest.mark.parametrize("within", [0, 3])
+def test_messages_near_others(
+    logs: Logs, text: str, holds: Holds, between: tuple[str, str] | None, within: int
+) -> None:
+    query = logs.store.topic("base")
+    query = query if between is None else query.between(*between)
+    query = query.where(text, within=f"{within}ms")
+    want = []
+    for label in logs.said:
+        start = logs.said[label][0].time
+        for message in logs.of(label, "/base"):
+
+            def near(topic: str, fits: Callable[[Said], bool], at: int = message.time) -> bool:
+                return any(
+                    abs(o.time - at) <= within * MS and fits(o)
+                    for o in logs.of(label, topic)  # noqa: B023
+                )
+
+            inside = between is None or 150 * MS <= message.time - start < 600 * MS
+            if inside and holds(near, message):
+                want.append((label, message.number))
+    found = [
+        (logs.store.entry(m.recording).label, m.fields["header"]["seq"])  # type: ignore[index]
+        for m in query
+    ]
+    assert sorted(found) == sorted(want)
+    assert query.count() == len(want)
+
+
+def test_before_and_after(logs: Logs) -> None:
+    text = "right/pose: state == 'stop'"
+    events = logs.store.topic("right/pose").where("state == 'stop'")
+    base = logs.store.topic("base")
+    assert base.where(text, within=("5ms", "9ms")) == base.around(events, "5ms", "9ms")
+    assert base.where(text, within=("5ms", 0)) == base.before(events, "5ms")
+
+
+def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
+    base = logs.store.topic("base").in_recording("b")
+    whole = base.copy()
+    list(whole)
+    few = base.where("right/pose: header.seq < 440", within="2ms")
+    assert few.spent.bytes_read > 0
+    assert few.spent.chunks_read == 0  # columns of the table
+    messages = list(few)
+    assert 0 < len(messages) < 20
+    assert few.counters.bytes_read < whole.counters.bytes_read / 3
+    assert few.limit(1).spent.bytes_read == few.spent.bytes_read
+    # A range bounds what is asked about the other topic.
+    assert few.between("+0ms", "+100ms").count() <= len(messages)
+    none = base.where("right/pose: header.seq < 0", within="2ms")
+    assert (none.count(), len(list(none)), none.counters.chunks_read) == (0, 0, 0)
+
+
+def test_what_is_refused(logs: Logs) -> None:
+    base = logs.store.topic("base")
+    with pytest.raises(UsageError, match="time within which"):
+        base.where("left/pose: x > 1")
+    with pytest.raises(UsageError, match="for other topics"):
+        base.where("x > 1", within="1s")
+    with pytest.raises(UsageError, match="for other topics"):
+        base.where({"x": 1}, within="1s")
+    with pytest.raises(WhereError, match="joined by `and`"):
+        base.where("x > 1 or left/pose: x > 1", within="1s")
+    with pytest.raises(WhereError, match="joined by `and`"):
+        base.where("not (x > 1 and left/pose: x > 1)", within="1s")
+    with pytest.raises(TopicError, match="no topic"):
+        base.where("nothing: x > 1", within="1s")
+    with pytest.raises(TopicError):
+        base.in_recording("c").where("right/pose: x > 1", within="1s")
+    with pytest.raises(WhereError, match="xx"):
+        base.where("left/pose: xx > 1", within="1s")
+    with pytest.raises(TimeError):
+        base.where("left/pose: x > 1", within="soon")
+
+
+def test_a_slice_of_another_topic(logs: Logs, tmp_path: Path) -> None:
+    store = logs.store.directory.path
+    path = tmp_path / "slice.mcap"
+    asked = ("fetch", "-t", "base", "--where", "/left/pose: on == true and right/pose: x > -100")
+    done = run(*asked, "--within", "4ms", "-o", path, store=store)
+    query = logs.store.topic("base").where(asked[-1], within="4ms")
+    assert [m.payload for m in read_mcap(path)] == [m.raw for m in query]
+    cost = query.counters.bytes_read + query.spent.bytes_read
+    assert 0 < cost < 200_000
+    assert f"{cost / 1000:.1f} kB read from disk" in done.err
+    for code, arguments in (
+        (0, ("--before", "2ms", "--count")),
+        (2, ()),
+        (2, ("--within", "1s", "--after", "1s")),
+        (2, ("--within", "1s", "--at", "+1s")),
+    ):
+        run(*asked, *arguments, store=store, code=code)
+    run("fetch", "-t", "base", "--within", "1s", store=store, code=2)
