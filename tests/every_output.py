@@ -15,6 +15,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from mcap.reader import make_reader
+from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader
 
 from hybridlog.cli.write_answer import write_answer
@@ -120,6 +121,8 @@ def compare_rows(found: list[dict[str, Any]], wanted: list[dict[str, Any]]) -> N
 
 def same(found: Any, wanted: Any) -> bool:
     """True for the same value; texts of numbers that JSON lacks are these numbers."""
+    if isinstance(wanted, np.ndarray):
+        return same_numbers(found, wanted)
     if isinstance(wanted, list):
         items = list(found)
         return len(items) == len(wanted) and all(map(same, items, wanted))
@@ -133,10 +136,33 @@ def same(found: Any, wanted: Any) -> bool:
         number = type(wanted)(found)
         if math.isnan(wanted):
             return math.isnan(number)
-        return bool(number == wanted)
+        return bool(number == wanted) and math.copysign(1, number) == math.copysign(1, wanted)
     if isinstance(wanted, (bool, int)):
         return isinstance(found, (bool, np.bool_)) == isinstance(wanted, bool) and found == wanted
     return bool(found == wanted)
+
+
+def same_numbers(found: Any, wanted: NDArray[Any]) -> bool:
+    """True for the same numbers; a list may have texts in place of what JSON lacks."""
+    if len(found) != len(wanted):
+        return False
+    if not isinstance(found, np.ndarray):
+        if wanted.dtype.kind == "f":
+            found = np.array([float(value) for value in found], wanted.dtype)
+        elif len(found):
+            found = np.array(found)
+    if len(found) and (found.dtype.kind == "b") != (wanted.dtype.kind == "b"):
+        return False
+    if len(found) and found.dtype.kind == "f" and wanted.dtype.kind != "f":
+        return False
+    equal = np.array_equal(found, wanted, equal_nan=wanted.dtype.kind == "f")
+    return equal and (wanted.dtype.kind != "f" or same_signs(found, wanted))
+
+
+def same_signs(found: NDArray[Any], wanted: NDArray[Any]) -> bool:
+    """True if also zeros have the same signs."""
+    is_number = ~np.isnan(wanted)
+    return np.array_equal(np.signbit(found[is_number]), np.signbit(wanted[is_number]))
 
 
 def of_cell(text: str, wanted: Any) -> Any:
@@ -147,7 +173,7 @@ def of_cell(text: str, wanted: Any) -> Any:
         return {"true": True, "false": False}[text]
     if isinstance(wanted, int):
         return int(text)
-    if isinstance(wanted, list):
+    if isinstance(wanted, (list, np.ndarray)):
         return json.loads(text)
     return text
 
@@ -169,14 +195,14 @@ def _npz_rows(arrays: dict[str, Any], rows: int) -> list[dict[str, Any]]:
             inner = f"{own}.values"
             total = int(array[-1])
             if inner in arrays:
-                values = [_number(value) for value in arrays[inner]]
+                values = _numbers(arrays[inner])
             else:
                 parts = {k[len(inner) + 1 :]: a for k, a in arrays.items() if k.startswith(inner)}
                 values = [_nested(row) for row in _npz_rows(parts, total)]
             at = array.tolist()
             columns[own] = [values[a:b] for a, b in pairwise(at)]
         else:
-            columns[name] = [_number(value) for value in array]
+            columns[name] = list(_numbers(array))
     return [{name: column[row] for name, column in columns.items()} for row in range(rows)]
 
 
@@ -191,5 +217,5 @@ def _nested(row: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _number(value: Any) -> Any:
-    return value.astype(np.int64) if value.dtype.kind in "mM" else value
+def _numbers(array: NDArray[Any]) -> NDArray[Any]:
+    return array.astype(np.int64) if array.dtype.kind in "mM" else array

@@ -106,7 +106,10 @@ class Duration(int):
 
 
 def plain_of(store: Typestore, name: str, message: Any) -> Any:
-    """A message as dicts and lists; times are `Time` and `Duration`, floats keep their width."""
+    """A message as dicts and lists; times are `Time` and `Duration`, floats keep their width.
+
+    Arrays of numbers are numpy arrays.
+    """
     if name in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
         kind = Time if name.endswith("Time") else Duration
         return kind(int(message.sec) * 10**9 + int(message.nanosec))
@@ -126,4 +129,8 @@ def _plain(store: Typestore, desc: Any, value: Any) -> Any:
         if detail[0] == "float32":
             return np.float32(value)
         return value if detail[0] == "string" else np.dtype(_dtype(detail[0])).type(value).item()
-    return [_plain(store, detail[0], item) for item in value]
+    inner, _ = detail
+    if inner[0] == Nodetype.BASE and inner[1][0] != "string":
+        numbers = np.asarray(value)
+        return numbers.view(np.uint8) != 0 if inner[1][0] == "bool" else numbers
+    return [_plain(store, inner, item) for item in value]

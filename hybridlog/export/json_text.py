@@ -62,6 +62,9 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
 
 def _floats(array: pa.Array) -> pa.Array:
     text = array.cast(pa.string())
+    if pc.any(pc.equal(array, 0)).as_py():
+        # Readers take -0 for an integer, which has no sign.
+        text = pc.if_else(pc.equal(text, "-0"), "-0.0", text)
     if pc.all(pc.is_finite(array)).as_py() is not False:
         return text
     infinite = pc.if_else(pc.less(array, 0), '"-Infinity"', '"Infinity"')
