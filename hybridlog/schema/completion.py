@@ -25,7 +25,7 @@ from hybridlog.schema.definition import (
 )
 from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.wire import WireReader
-from hybridlog.schema.wire_scan import MisfitError
+from hybridlog.schema.wire_scan import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import SUPPLIED, Schema
 
@@ -40,7 +40,6 @@ TRIED_MESSAGES = 64
 
 _EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
-_PADDING = 3  # bytes behind a CDR message that fits exactly
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +187,7 @@ def _fitting(
             except MisfitError:
                 continue
             fits += 1
-            exact += rest <= (_PADDING if wire == "cdr" else 0)
+            exact += rest <= MAX_PADDING[wire]
         if (exact, fits) > most:
             best, most = candidate, (exact, fits)
     return best

@@ -119,7 +119,7 @@ def _lines(text: str) -> Iterator[str]:
             end = line.rindex("=") + 1
             before, behind = line[:end].rstrip("="), line[end:].strip()
             following = lines[number + 1] if number + 1 < len(lines) else ""
-            if end - len(before) >= len(_RULE) and _HEADER.match(behind or following.strip()):
+            if _HEADER.match(behind or following.strip()):
                 yield from (before, _RULE, behind)
                 continue
         yield line

@@ -28,7 +28,6 @@ _WANTED = frozenset(
         "message_count",
         "path",
         "relative_file_paths",
-        "ros_distro",
         "rosbag2_bagfile_information",
         "storage_identifier",
     }
@@ -44,14 +43,12 @@ class BagMetadata:
         counts: Number of messages of each file, if stated.
         message_count: Total number of messages, None if unknown.
         packed_messages: Whether each payload is a zstd frame.
-        ros_distro: Name of the ROS release, empty if unknown.
     """
 
     files: list[str] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     message_count: int | None = None
     packed_messages: bool = False
-    ros_distro: str = ""
 
 
 def parse_metadata(text: str) -> BagMetadata:
@@ -79,13 +76,11 @@ def parse_metadata(text: str) -> BagMetadata:
         raise YamlError(f"it lists more than {MAX_FILES} files")
     total = _count(bag.get("message_count"))
     mode = bag.get("compression_mode")
-    distro = bag.get("ros_distro")
     return BagMetadata(
         files=list(dict.fromkeys(name for name in files if name not in _NO_FILES)),
         counts=counts,
         message_count=total,
         packed_messages=isinstance(mode, str) and mode.lower() == "message",
-        ros_distro=distro if isinstance(distro, str) else "",
     )
 
 
