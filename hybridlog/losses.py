@@ -148,6 +148,11 @@ def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
             yield row["from"], row["to"]
 
 
+def was_cut_short(entry: RecordingEntry) -> bool:
+    """True for a recording that a crash ended, whatever its status is."""
+    return "recovered" in {entry.status, entry.end.get("status")}
+
+
 def extent_of(entry: RecordingEntry) -> tuple[int, int]:
     """Log time `[begin, end)` of a recording, ns; empty at 0 without messages.
 

@@ -524,6 +524,7 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.answers.lost import Lost
     from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.recorder import RecordReport
@@ -533,7 +534,7 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
-    answers = [FieldStatistics, Aligned, Synced, Intervals, Interval]
+    answers = [Lost, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]

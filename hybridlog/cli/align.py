@@ -82,6 +82,7 @@ def command(
     output: Path | None,
     force: bool,
     limit: int | None,
+    strict: bool,
     mongo: str | None,
     quiet: bool,
 ) -> None:
@@ -99,6 +100,9 @@ def command(
                 add(opened, queries, text)
         if between is not None:
             queries[0] = queries[0].between(*between)
+        if strict:
+            for query in queries:
+                query.check_complete()
         aligned = opened.align(queries[0], queries[1:], how=how, tolerance=tolerance, clock=clock)
         write_tables(aligned.to_tables(), aligned.schema, choices)
         sys.stdout.flush()

@@ -50,6 +50,13 @@ def print_gaps(query: Query, between: tuple[str, str] | None) -> None:
         output.note(line)
 
 
+def print_lost(query: Query, count: int) -> None:
+    """Print the limits of a count of messages, if any of the range are lost."""
+    lost = query.lost()
+    if lost:
+        output.note(lost.describe(count, query.question.limit))
+
+
 def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None = None) -> None:
     """Print what is to be known about an answer, a line each.
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     help="Numbers that differ by at most this are equal.",
 )
 @options.at_least
+@options.strict
 @options.count
 @options.mongo
 @options.as_json

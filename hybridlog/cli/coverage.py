@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli.output import counted
-from hybridlog.losses import Cause
+from hybridlog.losses import Cause, was_cut_short
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
@@ -50,11 +50,6 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
             for reason in entry.end.get("damage", [])
         )
     return losses
-
-
-def was_cut_short(entry: RecordingEntry) -> bool:
-    """True for a recording that a crash ended, whatever its status is."""
-    return "recovered" in {entry.status, entry.end.get("status")}
 
 
 def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:

@@ -14,6 +14,7 @@ from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import (
     print_cost,
     print_gaps,
+    print_lost,
     print_reduced,
     print_remarks,
     print_unreadable,
@@ -67,6 +68,7 @@ class _Choices:
     within: str | None
     before: str | None
     after: str | None
+    strict: bool
     count: bool
     form: str | None
     output: Path | None
@@ -121,6 +123,7 @@ class _Choices:
     "--before", metavar="DURATION", help="Instead: start this long before each of these: 5min."
 )
 @click.option("--after", metavar="DURATION", help="Instead: end this long after each of these.")
+@options.strict
 @options.count
 @click.option(
     "--format",
@@ -163,8 +166,12 @@ def command(**parameters: Any) -> None:
                 raise
             begin, _ = query.question.bounds or ("start", None)
             between = str(begin), choices.at  # what is lost from there on may be later
+        count = None
+        if choices.strict:
+            query.check_complete(payloads=not choices.count)
         if choices.count:
-            output.say(str(query.count()))
+            count = query.count()
+            output.say(str(count))
         else:
             query = _answer(query, form, path, choices)
         sys.stdout.flush()
@@ -173,6 +180,8 @@ def command(**parameters: Any) -> None:
             cost.add(query.spent)
             print_cost(cost, time.monotonic() - started, count=choices.count)
             print_remarks(query, choices.topic)
+            if count is not None:
+                print_lost(query, count)
             print_gaps(asked, between)
 
 

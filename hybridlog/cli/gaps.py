@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 @options.between
 @options.where
 @options.choice
+@options.strict
 @options.count
 @options.mongo
 @options.as_json

@@ -31,12 +31,24 @@ if TYPE_CHECKING:
     metavar="DURATION",
     help="A message is valid for at most this long; without, until the next one.",
 )
+@click.option(
+    "--state",
+    type=click.Choice(["held", "not-held", "unknown"]),
+    help="When it certainly held, certainly did not, or when lost messages leave it open; "
+    "without, what the stored messages say.",
+)
+@options.strict
 @options.count
 @options.mongo
 @options.as_json
 @options.quiet
 def command(
-    *, at_least: str | None, length: str | None, max_gap: str | None, **parameters: Any
+    *,
+    at_least: str | None,
+    length: str | None,
+    max_gap: str | None,
+    state: str | None,
+    **parameters: Any,
 ) -> None:
     """Show when the messages of a topic satisfied a predicate.
 
@@ -44,6 +56,6 @@ def command(
     """
 
     def answer(query: Query) -> Intervals:
-        return query.intervals(at_least, length, max_gap)
+        return query.intervals(at_least, length, max_gap, state and state.replace("-", " "))
 
     print_intervals(IntervalChoices(**parameters), answer)

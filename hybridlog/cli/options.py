@@ -51,6 +51,11 @@ cache_size = click.option(
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for scripts.")
 quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
 force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")
+strict = click.option(
+    "--strict",
+    is_flag=True,
+    help="Fail, with exit code 11, if the ledger knows of losses in this range.",
+)
 count = click.option("--count", is_flag=True, help="Only print how many.")
 _CHOICE: Final = (
     click.option(

@@ -30,6 +30,7 @@ class IntervalChoices:
     between: tuple[str, str] | None
     where: tuple[str, ...]
     choice: Choice
+    strict: bool
     count: bool
     mongo: str | None
     as_json: bool
@@ -51,6 +52,8 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
             query = query.between(*choices.between)
         for predicate in choices.where:
             query = query.where(predicate)
+        if choices.strict:
+            query.check_complete()
         found = answer(query)
         labels = {recording.id: recording.label for recording in store.summaries()}
         if choices.count:
@@ -66,6 +69,9 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
             output.note("No interval.")
         print_cost(query.counters, time.monotonic() - started, count=True)
         print_remarks(query, [choices.topic], is_empty=not len(found))
+        lost = query.lost()
+        if lost:
+            output.note(f"{lost.told} in this range: intervals may be others.")
         print_gaps(query, choices.between)
 
 

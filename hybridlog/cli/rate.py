@@ -39,6 +39,7 @@ def command(
     output: Path | None,
     force: bool,
     limit: int | None,
+    strict: bool,
     mongo: str | None,
     quiet: bool,
 ) -> None:
@@ -51,6 +52,8 @@ def command(
             query = query.between(*between)
         for predicate in where:
             query = query.where(predicate)
+        if strict:
+            query.check_complete()
         write_tables([query.rate(window)], lambda: None, choices)
         sys.stdout.flush()
         if not quiet:

@@ -54,6 +54,7 @@ def command(
     output: Path | None,
     force: bool,
     limit: int | None,
+    strict: bool,
     mongo: str | None,
     quiet: bool,
 ) -> None:
@@ -68,6 +69,8 @@ def command(
             query = query.where(predicate)
         if fields is not None:
             query = query.fields(*parse_fields(fields))
+        if strict:
+            query.check_complete()
         rows = query.resample(step, how, tolerance)
         write_tables(rows.to_tables(), rows.schema, choices)
         sys.stdout.flush()

@@ -44,6 +44,7 @@ _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 @options.between
 @options.where
 @options.choice
+@options.strict
 @options.mongo
 @options.as_json
 @options.quiet
@@ -55,6 +56,7 @@ def command(
     between: tuple[str, str] | None,
     where: tuple[str, ...],
     choice: Choice,
+    strict: bool,
     mongo: str | None,
     as_json: bool,
     quiet: bool,
@@ -67,6 +69,8 @@ def command(
             query = query.between(*between)
         for predicate in where:
             query = query.where(predicate)
+        if strict:
+            query.check_complete()
         found = query.stats(*([] if fields is None else parse_fields(fields)))
         if as_json:
             from hybridlog.schema.plain import without_nan

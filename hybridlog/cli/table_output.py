@@ -40,6 +40,7 @@ def table_options(command: Callable[..., Any]) -> Callable[..., Any]:
         options.quiet,
         options.mongo,
         options.force,
+        options.strict,
         click.option(
             "--output",
             "-o",

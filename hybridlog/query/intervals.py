@@ -256,6 +256,34 @@ class Intervals:
             parts.append((name, rows[end > begin]))
         return self.common(Intervals.of(parts))
 
+    def until_next(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
+        """Each extended to the first of some times of its recording after it, or without end.
+
+        Args:
+            times: int64[n], log times, ns, ascending, by id of the recording.
+        """
+        parts = []
+        for name in self._recordings:
+            rows = self._rows_of(name)
+            known = np.append(times.get(name, np.empty(0, np.int64)), _LAST)
+            rows[:, 1] = known[np.searchsorted(known[:-1], rows[:, 1])]
+            parts.append((name, rows))
+        return Intervals.of(parts).merged()
+
+    def counted(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
+        """The same with the number of some times in each as `messages`.
+
+        Args:
+            times: int64[n], log times, ns, ascending, by id of the recording.
+        """
+        parts = []
+        for name in self._recordings:
+            rows = self._rows_of(name)
+            places = np.searchsorted(times.get(name, np.empty(0, np.int64)), rows[:, :2])
+            rows[:, 2] = places[:, 1] - places[:, 0]
+            parts.append((name, rows))
+        return Intervals.of(parts)
+
     def containing(self, events: Events) -> Intervals:
         """The intervals that contain the log time of at least one message of a question.
 

@@ -26,7 +26,13 @@ from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
-from hybridlog_storage.errors import IndexChangedError, PayloadError, TopicError, UsageError
+from hybridlog_storage.errors import (
+    IncompleteError,
+    IndexChangedError,
+    PayloadError,
+    TopicError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +44,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.interval_queries import IntervalQueries
+    from hybridlog.query.answers.lost import Lost
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import RecordedChannel
     from hybridlog.query.times import DurationLike, TimeLike
@@ -453,6 +460,7 @@ class Query:
         at_least: DurationLike | None = None,
         length: DurationLike | None = None,
         max_gap: DurationLike | None = None,
+        state: str | None = None,
     ) -> Intervals:
         """The longest intervals in which the predicate of `where` holds.
 
@@ -467,17 +475,21 @@ class Query:
             length: Each interval cut into as many pieces of exactly this length as fit,
                 one after the other from its beginning.
             max_gap: Longest time for which a message is valid; by default, until the next one.
+            state: `held`, `not held` or `unknown`: three parts of the asked time, without
+                each other. Unknown is the time before the first message, after `max_gap`, and
+                from a loss to the next stored message. Without, what the stored messages say.
 
         Returns:
-            Intervals; their `messages` are those that satisfy the predicate.
+            Intervals; their `messages` are those that satisfy the predicate, with `state` all
+            of the topic in them.
 
         Raises:
-            UsageError: several topics, `limit`, `every`, `reverse`, or another clock than
-                the log's.
+            UsageError: several topics, `limit`, `every`, `reverse`, another clock than the
+                log's, or an unknown state.
             TimeError: no duration, or a range outside of all recordings.
         """
         with self.counters.timed():
-            found = self._intervals().states(max_gap)
+            found = self._intervals().states(max_gap, state)
         if at_least is not None:
             found = found.at_least(at_least)
         return found if length is None else found.cut(length)
@@ -720,6 +732,43 @@ class Query:
     def doubtful(self) -> list[RecordingEntry]:
         """The recordings that have losses, have not ended, or are not proved to be whole."""
         return self._session.doubtful(self.question)
+
+    def lost(self) -> Lost:
+        """What is missing from the asked range, as the loss ledger knows.
+
+        Losses of topics in conditions count as an unknown number.
+
+        Raises:
+            TimeError: the range is empty, or outside all recordings.
+        """
+        from hybridlog.query.answers.lost import Lost, lost_in
+
+        found = lost_in(self._session, self.question)
+        if any(lost_in(self._session, one.question) for one in self.conditions):
+            found = Lost(found.messages, False, found.reduced, found.rows)
+        return found
+
+    def check_complete(self, *, payloads: bool = False) -> None:
+        """Check that no message of the asked range is lost.
+
+        Args:
+            payloads: True to check that no payload is missing, too.
+
+        Raises:
+            IncompleteError: some are.
+            TimeError: the range is empty, or outside all recordings.
+        """
+        found = self.lost()
+        if found:
+            raise IncompleteError(
+                f"{found.told} in this range; `hybridlog losses` says where. Without --strict the "
+                "rest is given."
+            )
+        if payloads and found.reduced:
+            raise IncompleteError(
+                f"Of {found.reduced} messages in this range only the fields are stored. Without "
+                "--strict the rest is given."
+            )
 
     def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
         """Sentences about the last answer.

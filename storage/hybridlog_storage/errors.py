@@ -149,6 +149,12 @@ class DefinitionError(HybridlogError):
     exit_code = 10
 
 
+class IncompleteError(HybridlogError):
+    """Messages of the asked range are lost, and the answer had to be complete."""
+
+    exit_code = 11
+
+
 class PayloadError(HybridlogError):
     """A payload that does not fit its definition."""
 

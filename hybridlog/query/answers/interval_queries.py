@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, islice
 from operator import itemgetter
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.losses import extent_of
+from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
@@ -42,9 +44,11 @@ class IntervalQueries:
         self._question = question
         self._planner = Planner(session, question, counters)
 
-    def states(self, max_gap: DurationLike | None) -> Intervals:
-        """Intervals in which the predicate holds; see `Query.intervals`."""
+    def states(self, max_gap: DurationLike | None, state: str | None = None) -> Intervals:
+        """Intervals in which the predicate holds, or in another state; see `Query.intervals`."""
         self._check("A state")
+        if state is not None:
+            return self._certain(max_gap, state)
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
@@ -58,6 +62,36 @@ class IntervalQueries:
             for part, span, inner, before in spans
             for rows in self._states_in(part, span, gap, inner, before)
         )
+
+    def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
+        """The time in which a state is certain, or the time in which none is."""
+        if state not in {"held", "not held", "unknown"}:
+            raise UsageError(f"Unknown state {state!r}; choose held, not held or unknown.")
+        plain = IntervalQueries(
+            self._session, replace(self._question, predicate=None), self._planner.counters
+        )
+        spans = RangeResolver(self._session, self._question).spans()
+        by_recording = plain.times_in({summary.id: summary for summary, _ in spans})
+        asked = Intervals.of(
+            (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
+        )
+        # What was lost before the range may have changed the state at its beginning.
+        everywhere = replace(self._question, bounds=None, during=None)
+        lost = lost_times(self._session, everywhere).until_next(by_recording)
+        known = plain.states(max_gap).without(lost)
+        if state == "unknown":
+            return asked.without(known).counted(by_recording)
+        held = self.states(max_gap)
+        found = held.common(known) if state == "held" else known.without(held)
+        return found.counted(by_recording)
+
+    def times_in(self, summaries: Mapping[str, RecordingSummary]) -> dict[str, NDArray[np.int64]]:
+        """Log times of the messages of recordings, at any time, ns, ascending, by id."""
+        found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+        for name, summary in summaries.items():
+            for part in self._planner.parts_in(summary, None, None):
+                found[name] += [o.log_time[o.holds] for o in self._planner.outcomes(part)]
+        return {name: np.concatenate(parts) for name, parts in found.items() if parts}
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
         """Intervals in which fields change; see `Query.changes`."""
@@ -147,9 +181,10 @@ class IntervalQueries:
         """The one part of each recording, without a time range, with each span of the question."""
         ranges = RangeResolver(self._session, self._question).spans()
         for summary, spans in groupby(ranges, key=itemgetter(0)):
-            (part,) = self._planner.parts_in(summary, None, None)
-            for _, span in spans:
-                yield part, span
+            # All stored messages of the topic may be lost: then nothing is known of its state.
+            for part in self._planner.parts_in(summary, None, None):
+                for _, span in spans:
+                    yield part, span
 
     def _states_in(
         self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]

@@ -1,0 +1,157 @@
+"""What an answer lacks: messages of the asked range that the ledger knows to be lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.losses import Cause, was_cut_short
+from hybridlog.query.intervals import Intervals
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import TIME_LIMIT
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.question import Question, Span
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+
+_EVERYTHING = np.array([[0, TIME_LIMIT - 1]], np.int64)
+_CRASH = "cut short by a crash"
+_UNPROVEN = "journal lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Messages that are missing from the range of a question.
+
+    Attributes:
+        messages: Number of messages that are known to be lost; of a loss that reaches out of
+            the range, all of it.
+        is_exact: False if an unknown number is lost besides.
+        reduced: Messages of which only the fields are stored.
+        rows: Rows of the loss ledger, with the label of their `recording`.
+    """
+
+    messages: int
+    is_exact: bool
+    reduced: int
+    rows: tuple[Mapping[str, Any], ...]
+
+    def __bool__(self) -> bool:
+        """True if any message is lost."""
+        return bool(self.messages) or not self.is_exact
+
+    @property
+    def told(self) -> str:
+        """The losses in words: `4 messages are lost`."""
+        if not self.messages:
+            return "an unknown number of messages are lost"
+        is_one = self.messages == 1 and self.is_exact
+        number = f"{'' if self.is_exact else 'at least '}{self.messages}"
+        return f"{number} message is lost" if is_one else f"{number} messages are lost"
+
+    def limits(self, count: int, limit: int | None = None) -> tuple[int, int | None]:
+        """Least and greatest number of messages if none had been lost; None for any number.
+
+        Args:
+            count: Number of messages that are there.
+            limit: Greatest number that was asked for; None for any.
+        """
+        most = count + self.messages if self.is_exact else limit
+        return count, most if limit is None or most is None else min(most, limit)
+
+    def describe(self, count: int, limit: int | None = None) -> str:
+        """A count with its limits in words: `297; 4 lost in this range: 297 to 301`."""
+        least, most = self.limits(count, limit)
+        known = str(self.messages) if self.messages else "an unknown number"
+        if self.messages and not self.is_exact:
+            known = f"at least {self.messages}"
+        limits = f"{least} or more" if most is None else f"{least} to {most}"
+        return f"{count}; {known} lost in this range: {limits}"
+
+
+def lost_in(session: Session, question: Question) -> Lost:
+    """What is missing from the range of a question.
+
+    Raises:
+        TimeError: the range is empty, or outside all recordings.
+    """
+    messages = reduced = 0
+    is_exact = True
+    found = []
+    for entry, row in _rows(session, question):
+        count = row["count"]
+        if row["cause"] == Cause.DEGRADE:
+            reduced += count or 0
+            continue
+        is_exact = is_exact and count is not None
+        messages += count or 0
+        found.append({"recording": entry.label, **row})
+    return Lost(messages, is_exact, reduced, tuple(found))
+
+
+def lost_times(session: Session, question: Question) -> Intervals:
+    """Log time in which messages were lost, cut to nothing; ends are included."""
+    parts = []
+    for entry, row in _rows(session, question):
+        if row["cause"] == Cause.DEGRADE:
+            continue
+        low, high = _span_of(entry, row) or (0, TIME_LIMIT - 2)
+        parts.append((entry.id, np.array([[low, high + 1, 0]], np.int64)))
+    return Intervals.of(parts)
+
+
+def _rows(
+    session: Session, question: Question
+) -> Iterator[tuple[RecordingEntry, Mapping[str, Any]]]:
+    """Rows of the ledger about topics and times of a question, not those a user wished for."""
+    doubtful = {entry.id: entry for entry in session.doubtful(question)}
+    if not doubtful:
+        return
+    for summary, bounds, windows in RangeResolver(session, question).resolve():
+        entry = doubtful.get(summary.id)
+        if entry is None:
+            continue
+        asked = _asked(bounds if question.clock == "log" else None, windows)
+        for row in _ledger(entry):
+            if row["cause"] == Cause.THROTTLE or row["count"] == 0:
+                continue
+            if row.get("topic") is not None and row["topic"] not in question.topics:
+                continue
+            span = _span_of(entry, row)
+            if span is None or bool(((asked[:, 0] <= span[1]) & (span[0] < asked[:, 1])).any()):
+                yield entry, row
+
+
+def _asked(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    asked = _EVERYTHING if windows is None else windows
+    if bounds is not None:
+        asked = np.clip(asked, *bounds)
+    return asked[asked[:, 1] > asked[:, 0]]
+
+
+def _ledger(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
+    """The loss ledger of a recording, with rows for what nobody could count."""
+    yield from entry.end.get("losses", ())
+    nothing: dict[str, Any] = {"count": None, "topic": None, "from": None, "to": None}
+    if entry.status == "unfinished" or was_cut_short(entry):
+        yield nothing | {"cause": _CRASH}
+    if entry.status == "unproven":
+        yield nothing | {"cause": _UNPROVEN}
+    if was_cut_short(entry):
+        for reason in entry.end.get("damage", ()):
+            yield nothing | {"cause": Cause.SEGMENT, "reason": str(reason)}
+
+
+def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
+    """First and last log time of a loss, ns; None if it may be anywhere."""
+    if row["cause"] == _CRASH and entry.span is not None:
+        return entry.span[1] + 1, TIME_LIMIT - 2
+    if row.get("from") is None or row.get("to") is None:
+        return None
+    return int(row["from"]), int(row["to"])

@@ -1,0 +1,164 @@
+"""What answers say about losses, against what was taken away."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.answers.lost import Lost
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import IncompleteError, UsageError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.cli.running import run
+
+BASE = 1_750_000_000 * 10**9
+SECOND = 10**9
+VALUES = [1, 1, 0, 1, 0, 0, 1, 1, 1, 0, 1, 1]
+GONE = {4, 5, 8}
+"""Messages whose segments are taken away."""
+
+
+@dataclass
+class Damaged:
+    store: hl.Store
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Damaged]:
+    """A message a second and segment on /n, and one on /other before each."""
+    path = tmp_path_factory.mktemp("lost") / "store"
+    n, other = (Channel(name, "json", None, {}) for name in ("/n", "/other"))
+    with hl.open(path, create=True) as store:
+        settings = SegmentSettings(chunk_size=1 << 10, segment_size=1)
+        with store.start("part", settings=settings) as recording:
+            for second, value in enumerate(VALUES):
+                payload = json.dumps({"v": value, "pad": "-" * 2000}).encode()
+                recording.write(n, payload, log_time=BASE + second * SECOND)
+            recording.write(other, payload, log_time=BASE + 12 * SECOND)
+        with store.start("whole", settings=settings) as recording:
+            recording.write(n, payload, log_time=BASE)
+    journal = (path / "recordings" / "part" / "journal").read_text().splitlines()
+    sealed = [json.loads(line[9:]) for line in journal]
+    for line in sealed:
+        for channel in line.get("channels", ()) if line["event"] == "sealed" else ():
+            if channel["topic"] == "/n" and (channel["first"] - BASE) // SECOND in GONE:
+                (path / "recordings" / "part" / line["file"]).unlink()
+    with hl.open(path) as store:
+        yield Damaged(store, path)
+
+
+def test_counts_have_limits(damaged: Damaged) -> None:
+    topic = damaged.store.topic("n").in_recording("part")
+    for query, lost in (
+        (topic, 3),
+        (topic.where("v == 1"), 3),
+        (topic.between("+0s", "+4s"), 0),
+        (topic.between("+4s", "+5s"), 1),
+        (topic.between("+5s", "+9s").where("v == 1"), 2),
+        (topic.between("+8001ms", "end"), 0),
+        (damaged.store.topic("other"), 0),
+        (damaged.store.topic("n").in_recording("whole"), 0),
+        (topic.during(topic.between("+6s", "+7s").windows("1s", "500ms")), 1),
+    ):
+        found = query.lost()
+        assert (found.messages, found.is_exact, bool(found)) == (lost, True, lost > 0)
+        assert len(found.rows) == lost
+        count = query.count()
+        assert found.limits(count) == (count, count + lost)
+    assert topic.lost().describe(9) == "9; 3 lost in this range: 9 to 12"
+    assert topic.limit(2).lost().describe(2, 2) == "2; 3 lost in this range: 2 to 2"
+    # A condition on a topic with losses may hold at other times, too.
+    near = damaged.store.topic("other").where("n: v == 1", within="2s")
+    assert (near.lost().messages, near.lost().is_exact) == (0, False)
+
+
+def test_numbers_that_nobody_knows() -> None:
+    assert Lost(4, False, 0, ()).describe(297) == "297; at least 4 lost in this range: 297 or more"
+    unknown = Lost(0, False, 0, ())
+    assert unknown.describe(1) == "1; an unknown number lost in this range: 1 or more"
+    assert unknown.limits(3, 7) == (3, 7)
+    assert Lost(4, True, 0, ()).limits(297) == (297, 301)
+    assert not Lost(0, True, 9, ())
+    assert Lost(1, True, 0, ()).told == "1 message is lost"
+    assert Lost(1, False, 0, ()).told == "at least 1 messages are lost"
+    assert unknown.told == "an unknown number of messages are lost"
+
+
+def seconds(found: Intervals) -> list[tuple[float, float, int]]:
+    return [
+        ((i.begin_ns - BASE) / SECOND, round((i.end_ns - BASE) / SECOND, 3), i.messages)
+        for i in found
+    ]
+
+
+def test_states_with_losses(damaged: Damaged) -> None:
+    query = damaged.store.topic("n").in_recording("part").where("v == 1")
+    # As stored, a lost message changes nothing.
+    assert seconds(query.intervals()) == [(0, 2, 2), (3, 9, 3), (10, 12, 2)]
+    assert seconds(query.intervals(state="held")) == [(0, 2, 2), (3, 4, 1), (6, 8, 2), (10, 12, 2)]
+    assert seconds(query.intervals(state="not held")) == [(2, 3, 1), (9, 10, 1)]
+    assert seconds(query.intervals(state="unknown")) == [(4, 6, 0), (8, 9, 0)]
+    # A loss before the range leaves its beginning open.
+    late = query.between("+5500ms", "+8500ms")
+    assert seconds(late.intervals(state="unknown")) == [(5.5, 6, 0), (8, 8.5, 0)]
+    assert seconds(late.intervals(state="held")) == [(6, 8, 2)]
+    short = query.between("+0s", "+4s")
+    assert seconds(short.intervals(max_gap="500ms", state="unknown")) == [
+        (0.5, 1, 0), (1.5, 2, 0), (2.5, 3, 0), (3.5, 4, 0),
+    ]  # fmt: skip
+    with pytest.raises(UsageError, match="choose held"):
+        query.intervals(state="maybe")
+    # Before the first message, nothing is known.
+    other = damaged.store.topic("other").in_recording("part")
+    assert seconds(other.intervals(state="unknown")) == [(0, 12, 0)]
+
+
+def test_the_three_states_share_out_the_time(damaged: Damaged) -> None:
+    for query in (
+        damaged.store.topic("n").where("v == 1"),
+        damaged.store.topic("n").where("v == 0").between("+1500ms", "+9s"),
+    ):
+        parts = [query.intervals(state=state) for state in ("held", "not held", "unknown")]
+        whole = query.intervals(max_gap="1h").union(parts[0]).union(parts[1]).union(parts[2])
+        assert sum(part.duration_ns for part in parts) == whole.duration_ns
+        for one in parts:
+            for other in parts:
+                assert one is other or not len(one.common(other))
+
+
+def test_an_answer_that_must_be_complete(damaged: Damaged) -> None:
+    topic = damaged.store.topic("n")
+    topic.between("+0s", "+4s").check_complete(payloads=True)
+    with pytest.raises(IncompleteError, match="3 messages are lost in this range"):
+        topic.check_complete()
+    assert IncompleteError.exit_code == 11
+
+
+def test_the_commands(damaged: Damaged) -> None:
+    asked = ("fetch", "-t", "n", "-r", "part", "--where", "v == 1", "--count")
+    done = run(*asked, store=damaged.path)
+    assert done.out == "7\n"
+    assert "7; 3 lost in this range: 7 to 10" in done.err.splitlines()
+    early = run(*asked, "--between", "+0s", "+4s", "--strict", store=damaged.path)
+    assert early.out == "3\n"
+    assert "lost in this range" not in early.err
+    refused = run(*asked, "--strict", store=damaged.path, code=11)
+    assert refused.out == ""
+    for command in (
+        ("intervals", "-t", "n", "--where", "v == 1"),
+        ("stats", "-t", "n", "--fields", "v"),
+        ("rate", "-t", "n"),
+        ("align", "--to", "other", "-t", "n"),
+    ):
+        run(*command, "--strict", store=damaged.path, code=11)
+    states = ("intervals", "-t", "n", "-r", "part", "--where", "v == 1", "--json")
+    rows = run(*states, "--state", "not-held", store=damaged.path)
+    assert [(r["begin_ns"] - BASE) // SECOND for r in rows.json] == [2, 9]
+    assert "3 messages are lost in this range" in rows.err
