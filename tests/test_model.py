@@ -470,7 +470,12 @@ class Machine(RuleBasedStateMachine):
         assert report.skipped == len(everything) - len(kept)
         entry = report.entry
         numbered = [replace(m, recording=entry.id, seq=seq) for seq, m in enumerate(kept)]
-        kinds = {Kind(m.topic, m.has_header, not is_bag) for m in kept}
+        # Channels without messages are kept, too.
+        kinds = {
+            Kind(spec.topic, spec.stamped and spec.encoding in {"ros1", "cdr"}, not is_bag)
+            for spec in (BAG_CHANNELS if is_bag else MCAP_CHANNELS)
+            if wanted is None or spec.topic in wanted
+        }
         label = self.free_label(path.stem)
         self.model[entry.id] = Recording(numbered, kinds, label, path.stem, tags)
         self.changed = True
