@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -15,9 +16,12 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog import latched_front
 from hybridlog.cli.write_answer import Front, write_answer
+from hybridlog.latched_front import LatchedFront
 from hybridlog.latching import KEEP_ALL, depth_of
 from hybridlog.query.query import Query
-from hybridlog_storage.messages import Channel
+from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.reduced_codec import reduce, reduced_channel
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -252,6 +256,44 @@ def test_a_recorded_slice_begins_with_the_same(
         assert bytes(query.at(end - 1).raw).decode() == newest.text
         at_begin = max(m for m in [*front, *inside] if m.topic == topic and m.time <= begin)
         assert bytes(query.at(begin).raw).decode() == at_begin.text
+
+
+def test_a_latched_message_without_payload_is_counted(store: hl.Store) -> None:
+    channel = Channel("/reduced", "ros1", Schema("p/T", "ros1msg", b"uint8 x"), latch("/n4"))
+    small = reduced_channel(channel)
+    with store.start("reduced") as recording:
+        recording.write(channel, b"a", log_time=BEGIN)
+        recording.write(small, reduce(codec_for(channel), b"b"), log_time=BEGIN + 1)
+        recording.write(channel, b"c", log_time=BEGIN + 2)
+    query = store.topic("/reduced").between(BEGIN + 2, None)
+    assert list(query.latched()) == []
+    assert (query.counters.latched, query.counters.reduced) == (0, 1)
+
+
+def test_times_of_a_front_without_publish_times() -> None:
+    channels = [
+        Channel("/map", "ros1", None, latch("/n"), has_publish_time=False),
+        Channel("/map", "ros1", None, latch("/m"), has_publish_time=True),
+        Channel("/log", "cdr", None, offered(ALL), has_publish_time=False),
+    ]
+    times = np.array([1, 2, 3], np.int64)
+    rows = np.arange(3)
+    batch = Batch(
+        b"abc",
+        rows,
+        np.ones(3, np.int64),
+        rows.astype(np.int32),
+        times,
+        times.copy(),
+        rows.astype(np.uint32),
+    )
+    front = LatchedFront(10, original_times=False)
+    at_once, mask = front.split(batch, np.zeros(3, np.bool_), channels)
+    (held,) = front.batches()
+    found = [at_once.take(mask), held]
+    assert [b.log_time.tolist() for b in found] == [[10], [10, 10]]
+    assert [b.publish_time.tolist() for b in found] == [[10], [10, 2]]
+    assert front.messages == 3
 
 
 def test_a_recorded_slice_without_latched_messages(store: hl.Store, log: Path) -> None:
