@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.across.sync import Synced
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
+    from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.compact import CompactedTopic
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
@@ -425,6 +426,37 @@ class Store:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         again = partial(open_store, self.directory.path.absolute())
         return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
+
+    def rehearse(
+        self,
+        trigger: str,
+        *,
+        since: TimeLike | None = None,
+        before: DurationLike = "10s",
+        after: DurationLike = 0,
+        recordings: Sequence[str] | None = None,
+    ) -> Rehearsal:
+        """Rehearse a trigger of live recordings on what is stored.
+
+        Args:
+            trigger: `/diagnostics: status[*].level >= 2`, or a topic alone.
+            since: Only messages from this time on, or from so long ago (`30d`); None for all.
+            before: Time before a message that fires, a duration.
+            after: Time after it.
+            recordings: Recordings by id, label or name; None for all.
+
+        Raises:
+            TopicError: the trigger matches no topic, or a recording does not exist.
+            UsageError: the trigger names no topic.
+            WhereError: its predicate cannot be parsed.
+            TimeError: no time, or no duration.
+        """
+        from hybridlog.live.rehearsal import rehearse
+
+        chosen = None if recordings is None else tuple(recordings)
+        return rehearse(
+            self.session, trigger, recordings=chosen, since=since, before=before, after=after
+        )
 
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
         """A query about a topic, with its share of the fields, which is taken out of them."""

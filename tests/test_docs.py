@@ -519,6 +519,7 @@ def documented_classes() -> list[type]:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.live import LiveOptions, LiveRecording
+    from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import RepairReport
@@ -534,7 +535,7 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
-    answers = [Lost, FieldStatistics, Aligned, Synced, Intervals, Interval]
+    answers = [Rehearsal, Lost, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
