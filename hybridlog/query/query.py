@@ -27,6 +27,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
+    DefinitionError,
     IncompleteError,
     IndexChangedError,
     PayloadError,
@@ -702,14 +703,15 @@ class Query:
 
         Raises:
             PayloadError: None of the messages can be an array.
+            DefinitionError: The first of them has no definition.
         """
         arrays: list[NDArray[Any]] = []
-        refused: PayloadError | None = None
+        refused: PayloadError | DefinitionError | None = None
         unreadable = 0
         for message in self:
             try:
                 arrays.append(message.to_numpy())
-            except PayloadError as error:
+            except (PayloadError, DefinitionError) as error:
                 refused = refused or error
                 unreadable += 1
         if refused is not None and not arrays:

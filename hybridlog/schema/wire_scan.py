@@ -18,10 +18,8 @@ if TYPE_CHECKING:
 
 MAX_EMPTY_ELEMENTS = 1_000_000
 """Most elements of an array whose elements take no bytes."""
-MAX_PADDING = {"ros1": 0, "cdr": 7}
-"""Most bytes behind the message in its payload that are not worth a remark."""
-MAX_EMPTY = {"ros1": 0, "cdr": 3}
-"""Most bytes behind a message without fields."""
+MAX_PADDING = {"ros1": 0, "cdr": 3}
+"""Most bytes that fill up a payload; in CDR to a multiple of four."""
 
 _U4 = {"<": Struct("<I"), ">": Struct(">I")}
 
@@ -38,7 +36,7 @@ class Scanner:
         self._u4 = _U4[source.order].unpack_from
         self._cdr = wire == "cdr"
         self._mask = 7 if self._cdr else 0
-        self._most_empty = MAX_EMPTY[wire]
+        self._padding = MAX_PADDING[wire]
 
     def check(self, program: Program, start: int, end: int) -> None:
         """Walk over a whole message. Bytes may be left over, except of a type without fields.
@@ -52,7 +50,7 @@ class Scanner:
             MisfitError: The payload does not fit.
         """
         rest = end - self.walk(program, start, end, start)
-        if program.empty and rest > self._most_empty:
+        if program.empty and rest > self._padding:
             raise MisfitError(f"{rest} bytes left over: the definition has no fields")
 
     def walk(self, program: Program, at: int, end: int, origin: int) -> int:

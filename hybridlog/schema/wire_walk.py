@@ -31,7 +31,6 @@ from hybridlog.schema.wire_program import (
     assemble,
 )
 from hybridlog.schema.wire_scan import (
-    MAX_EMPTY,
     MAX_EMPTY_ELEMENTS,
     MAX_PADDING,
     MisfitError,
@@ -121,7 +120,6 @@ class Walker:
         self._mask = 7 if self._cdr else 0
         self._count_align = 4 if self._cdr else 1
         self._padding = MAX_PADDING[wire]
-        self._most_empty = MAX_EMPTY[wire]
 
     def read(
         self, program: Program, start: NDArray[np.int64], end: NDArray[np.int64]
@@ -146,11 +144,14 @@ class Walker:
         cursor = _Cursor(start, end, start)
         self._walk(program, cursor, slots)
         surplus = None
-        most = int((end - cursor.base).max()) - cursor.delta
-        if program.empty and most > self._most_empty:
+        rest = end - cursor.base - cursor.delta
+        most = int(rest.max())
+        if program.empty and most > self._padding:
             raise MisfitError
-        if most > self._padding:
-            surplus = end - cursor.base > cursor.delta + self._padding
+        if most > 0:
+            surplus = rest > self._padding
+            if self._cdr:
+                surplus |= (rest > 0) & ((end - start) & 3 > 0)
         column = None if program.root is None else assemble(program.root, slots, len(start))
         return column, surplus
 

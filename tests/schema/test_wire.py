@@ -577,7 +577,7 @@ def test_messages_without_fields():
 def test_bytes_left_over_are_told_and_the_message_is_read(count):
     text = "uint32 a\nstring s\n"
     whole = u4(7, 2) + b"hi"
-    for wire, head, padding in (("ros1", b"", 0), ("cdr", HEADER, 7)):
+    for wire, head, padding in (("ros1", b"", 0), ("cdr", HEADER, 1)):
         body = head + (whole if wire == "ros1" else u4(7, 3) + b"hi\0")
         payloads = [body, body + bytes(padding), body + bytes(padding + 1), u4(1), body * 3]
         decoded = read(text, [payload for payload in payloads for _ in range(count)], wire=wire)
@@ -589,6 +589,16 @@ def test_bytes_left_over_are_told_and_the_message_is_read(count):
     decoded = read(text, [body, big + bytes(8), body + bytes(8), big], wire="cdr")
     assert decoded.surplus.tolist() == [1, 2]
     assert decoded.records.fields["a"].values.tolist() == [7] * 4
+
+
+def test_padding_of_cdr_fills_up_to_four_bytes():
+    for size in range(1, 9):
+        payloads = [HEADER + bytes(size + rest) for rest in range(9)]
+        text = "".join(f"uint8 a{n}\n" for n in range(size))
+        padding = {0, -size % 4}
+        decoded = read(text, payloads, wire="cdr")
+        assert decoded.rows.tolist() == list(range(9))
+        assert decoded.surplus.tolist() == [rest for rest in range(9) if rest not in padding]
 
 
 def test_arrays_within_elements_without_bytes_are_refused():
