@@ -76,6 +76,7 @@ BLOCK = 1 << 20  # payload bytes that are compared at once
 
 
 @pytest.mark.exhaustive
+@pytest.mark.timeout(7200)
 @needs_data
 @pytest.mark.parametrize("path", LOGS, ids=lambda path: str(path.relative_to(DATA)))
 def test_every_value_of_real_logs(tmp_path: Path, path: Path) -> None:
