@@ -223,11 +223,11 @@ def test_only_chunks_of_what_is_in_force_are_read(store: hl.Store) -> None:
     # Those of ten messages, once to find the first and once to give them.
     assert read("/in_order/a") <= 2 * 11
     # Three messages are fewer than ten: the rest of the topic is not searched for more.
-    assert read("/in_order/b") == 1
+    assert read("/in_order/b") <= 3
 
 
 def test_a_range_by_another_clock_begins_with_its_first_message(store: hl.Store) -> None:
-    query = store.all_topics().clock("publish")
+    query = store.all_topics().in_recording("log").clock("publish")
     begin = BEGIN + 41 * SECOND
     # Messages are published 5 ns before they are logged.
     found = written(query.between(begin - 5, begin + SECOND))
