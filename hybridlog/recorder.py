@@ -19,6 +19,7 @@ from hybridlog.capture import Capture
 from hybridlog.entries import text
 from hybridlog.latched_front import LatchedFront
 from hybridlog.schema.completion import TRIED_MESSAGES, completed
+from hybridlog.wording import listed
 from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.distinct import distinct
@@ -38,9 +39,12 @@ if TYPE_CHECKING:
 
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.sources.base import Damage, Source
+    from hybridlog.sources.fingerprint import Fingerprint
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
+
+_MOST_PARTS = 1000  # of a log, whose fingerprints the recording has
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +110,7 @@ def record(
     catalog: Catalog,
     database: Database,
     *,
-    fingerprint: str,
+    fingerprint: Fingerprint,
     options: RecordOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> RecordReport:
@@ -143,7 +147,7 @@ def record(
             "kind": source.kind,
             "profile": source.profile,
             "bytes": source.size_bytes,
-            "fingerprint": fingerprint,
+            **_identity(fingerprint),
         },
         settings=options.settings,
         no_index=options.no_index,
@@ -322,8 +326,23 @@ def _end_of(source: Source) -> dict[str, Any]:
     return {"status": "damaged" if losses else "complete", "losses": losses}
 
 
-def _refuse_known(catalog: Catalog, source: Source, fingerprint: str) -> None:
-    known = catalog.with_fingerprint(fingerprint)
+def _identity(fingerprint: Fingerprint) -> dict[str, object]:
+    """The fingerprint of a log in the description of its recording."""
+    several = 1 < len(fingerprint.parts) <= _MOST_PARTS
+    parts = {"parts": list(fingerprint.parts)} if several else {}
+    return {"fingerprint": fingerprint.whole, **parts}
+
+
+def _refuse_known(catalog: Catalog, source: Source, fingerprint: Fingerprint) -> None:
+    known = catalog.with_fingerprint(fingerprint.whole)
+    if known is None and len(fingerprint.parts) > 1:
+        parts = [catalog.with_fingerprint(part) for part in fingerprint.parts]
+        labels = dict.fromkeys(one.label for one in parts if one is not None)
+        if None not in parts:
+            raise AlreadyRecordedError(
+                f"{source.path} is in the store already, part by part: {listed(labels)}. "
+                "Use --again to record it once more."
+            )
     if known is not None:
         state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
         raise AlreadyRecordedError(

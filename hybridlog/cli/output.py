@@ -137,6 +137,11 @@ def print_json(value: object) -> None:
     print(json.dumps(value, default=_plain, indent=2, ensure_ascii=False))  # noqa: T201
 
 
+def print_json_line(value: object) -> None:
+    """Print a value as JSON on one line, at once."""
+    print(json.dumps(value, default=_plain, ensure_ascii=False), flush=True)  # noqa: T201
+
+
 def note(text: str) -> None:
     """A line for the person, on standard error."""
     print(printable(text), file=sys.stderr)  # noqa: T201

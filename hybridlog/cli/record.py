@@ -60,7 +60,8 @@ def _is_file(word: str) -> bool:
     nargs=-1,
     type=options.PATH,
     metavar="[PATH]...",
-    help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files.",
+    help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files, and directories with any "
+    "of them.",
 )
 @options.store
 @click.option(
@@ -83,6 +84,18 @@ def _is_file(word: str) -> bool:
 @click.option("--name", metavar="NAME", help="Name of the recording; without, the file's.")
 @options.tags
 @click.option("--again", is_flag=True, help="Record it even if its content is in the store.")
+@click.option(
+    "--watch",
+    is_flag=True,
+    help="Go on recording logs that come into the directories, when they are complete, until "
+    "Ctrl-C.",
+)
+@click.option(
+    "--settle",
+    default="60s",
+    metavar="TIME",
+    help="With --watch: a file that does not say so is complete when unchanged for this time.",
+)
 @click.option(
     "--chunk-size",
     default="2MiB",
@@ -237,8 +250,9 @@ def command(context: click.Context, /, **parameters: Any) -> None:
     """Record logs, or a running robot, into the store.
 
     Each path becomes a recording: a ROS 1 bag, a ROS 2 bag (its directory or one file), an
-    MCAP file. Content that is in the store already is refused unless --again. The readable
-    part of a damaged log is stored, and the rest is reported.
+    MCAP file. All logs below a directory are recorded. Content that is in the store already is
+    refused unless --again, or left out below a directory. The readable part of a damaged log is
+    stored, and the rest is reported.
 
     With --ros1, --ros2, --foxglove or --replay, messages are recorded as they arrive, until
     Ctrl-C. Lost messages are counted: see `hybridlog losses`. Options marked "Live" are for
@@ -250,6 +264,10 @@ def command(context: click.Context, /, **parameters: Any) -> None:
         from hybridlog.cli.record_live import record_live
 
         record_live(choices)
+    elif choices.watch:
+        from hybridlog.cli.record_watch import record_watched
+
+        record_watched(choices)
     else:
         from hybridlog.cli.record_logs import record_logs
 

@@ -34,6 +34,8 @@ class RecordChoices:
     name: str | None
     tag: tuple[str, ...]
     again: bool
+    watch: bool
+    settle: str
     chunk_size: str
     compression: str
     level: int
@@ -90,7 +92,10 @@ def check_choices(choices: RecordChoices) -> None:
         check_latched(
             no_latched=choices.no_latched, original_times=choices.original_times, form=None
         )
+        _check_watch(choices)
         return
+    if choices.watch:
+        raise UsageError("--watch is for directories of logs, not for a running robot.")
     if choices.between is not None or choices.again:
         raise UsageError("--between and --again are for logs, not for a running robot.")
     if choices.no_latched or choices.original_times:
@@ -101,6 +106,16 @@ def check_choices(choices: RecordChoices) -> None:
         raise UsageError("--qos is for --ros2.")
     if "--speed" in choices.live_options and choices.replay is None:
         raise UsageError("--speed is for --replay.")
+
+
+def _check_watch(choices: RecordChoices) -> None:
+    if not choices.watch:
+        return
+    if choices.name is not None:
+        raise UsageError("--name names one recording; --watch makes many: leave it out.")
+    for path in choices.paths:
+        if not path.is_dir():
+            raise UsageError(f"--watch takes directories, and {path} is none.")
 
 
 def _check_sources(choices: RecordChoices) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,53 +30,195 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from hybridlog.cli.progress import Bar
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
+    from hybridlog.sources.find import Found, Log
     from hybridlog.store import Store
-    from hybridlog_storage.segment_writer import SegmentSettings
+
+_MOST_FAILED = 20  # errors that are repeated at the end
 
 
 def record_logs(choices: RecordChoices) -> None:
-    """Record each path; an error in one does not stop the others."""
-    paths = choices.paths
-    if choices.name is not None and len(paths) > 1:
-        raise UsageError("--name names one recording; several paths were given.")
+    """Record each path, and each log below a directory; an error does not stop the others."""
+    logs, walked = _find(choices)
+    if choices.name is not None and len(logs) > 1:
+        raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
-    settings = segment_settings(choices)
-    tags = parse_tags(choices.tag)
-    _matcher(choices)
-    _no_index(choices)
-    _check_new_store(choices)
-    done = _Results(choices)
+    recorder = LogRecorder(choices)
+    check_new_store(choices, [log.path for log in logs])
+    done = recorder.results
+    done.expect(logs, is_search=walked is not None)
+    if walked is not None:
+        done.add_walk(walked)
+    total = sum(log.size for log in logs)
     try:
         with (
             if_stopped(done.on_stop),
-            opened_store(
-                choices.store,
-                choices.mongo,
-                create=True,
-                shared=choices.shared,
-                needs_database=True,
-                cache_mb=choices.cache_size,
-                quiet=choices.quiet,
-            ) as store,
+            opened_to_record(choices) as store,
             at_safe_points(),
+            progress_bar(_what(logs), total, quiet=choices.quiet) as bar,
         ):
-            for path in paths:
+            before = 0
+            for log in logs:
                 safe_point()
-                try:
-                    done.add(path, _record_one(store, path, choices, settings, tags))
-                except (SourceError, AlreadyRecordedError, UsageError) as error:
-                    if len(paths) == 1:
-                        raise
-                    done.fail(path, error)
+                recorder.record(store, log, partial(_shown, bar, before, log))
+                before += log.size
     finally:
         done.show()
     done.exit()
 
 
-def _check_new_store(choices: RecordChoices) -> None:
+def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
+    """The store, which is made if there is none."""
+    return opened_store(
+        choices.store,
+        choices.mongo,
+        create=True,
+        shared=choices.shared,
+        needs_database=True,
+        cache_mb=choices.cache_size,
+        quiet=choices.quiet,
+    )
+
+
+def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
+    """The logs to record, and what was met in directories; None if each path is one log."""
+    from hybridlog.sources.find import Found, Log, find_logs
+
+    logs: list[Log] = []
+    walked: Found | None = None
+    for path in choices.paths:
+        found = find_logs(path) if path.is_dir() else Found()
+        is_one = len(found.logs) == 1 and path in {found.logs[0].path, found.logs[0].path.parent}
+        if is_one or not found.logs:
+            size = path.stat().st_size if path.is_file() else sum(log.size for log in found.logs)
+            logs.append(Log(path, (path,), size))
+            print_stores(found.stores)
+            continue
+        walked = walked or Found()
+        logs += found.logs
+        walked.stores += found.stores
+        walked.problems += found.problems
+    return logs, walked
+
+
+def print_stores(stores: Iterable[Path]) -> None:
+    """Print which stores were met and not searched."""
+    for store in stores:
+        output.note(
+            f"{store} is a store and is not searched; `hybridlog import {store}` takes its "
+            "recordings."
+        )
+
+
+def _what(logs: Sequence[Log]) -> str:
+    return logs[0].path.name if len(logs) == 1 else f"{len(logs)} logs"
+
+
+def _shown(bar: Bar, before: int, log: Log, read: int, messages: int) -> None:
+    """Show the progress of a log after others."""
+    bar(before + read, f"{log.path.name}: {output.counted(messages, 'message')}")
+
+
+class LogRecorder:
+    """Records logs with the options of the command.
+
+    Args:
+        choices: The parameters of the command.
+
+    Attributes:
+        results: What came of the logs.
+
+    Raises:
+        UsageError: An option is wrong.
+    """
+
+    def __init__(self, choices: RecordChoices) -> None:
+        self.results = Results(choices)
+        self._choices = choices
+        self._settings = segment_settings(choices)
+        self._tags = parse_tags(choices.tag)
+        _matcher(choices)
+        _no_index(choices)
+
+    def record(self, store: Store, log: Log, progress: Callable[[int, int], None]) -> None:
+        """Record a log, or those parts of it that are not in the store yet.
+
+        Raises:
+            HybridlogError: It was the only one, and cannot be recorded.
+        """
+        for piece in self._pieces(store, log):
+            self.results.begin(piece.path)
+            try:
+                self.results.add(piece.path, self._record_one(store, piece, progress))
+            except AlreadyRecordedError as error:
+                self.results.known(piece.path, error)
+            except (SourceError, UsageError) as error:
+                self.results.fail(piece.path, error)
+
+    def _pieces(self, store: Store, log: Log) -> Iterator[Log]:
+        """The log; the missing parts of it if others were recorded on their own."""
+        from hybridlog.sources.find import Log
+        from hybridlog.sources.fingerprint import fingerprint
+
+        if self._choices.again or len(log.files) == 1:
+            yield log
+            return
+        try:
+            with _opened(log) as source:
+                files = source.files
+            prints = fingerprint(files)
+        except SourceError:
+            yield log  # the error is told when it is recorded
+            return
+        find = store.catalog.with_fingerprint
+        missing = [f for f, p in zip(files, prints.parts, strict=True) if find(p) is None]
+        if not missing or len(missing) == len(files) or find(prints.whole) is not None:
+            yield log
+            return
+        for file in missing:
+            yield Log(file, (file,), file.stat().st_size)
+
+    def _record_one(
+        self, store: Store, log: Log, progress: Callable[[int, int], None]
+    ) -> RecordReport:
+        from hybridlog.recorder import RecordOptions
+
+        choices = self._choices
+        with anywhere():
+            source = _opened(log)
+        with source:
+            matcher, no_index = _matcher(choices), _no_index(choices)
+            options = RecordOptions(
+                name=choices.name or log.name,
+                tags=self._tags,
+                matcher=matcher,
+                between=_between(source, choices),
+                latched=not choices.no_latched,
+                original_times=choices.original_times,
+                again=choices.again,
+                settings=self._settings,
+                no_index=no_index,
+            )
+            report = store.record(source, options, progress)
+            _check_not_empty(report, source, store, options)
+        for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
+            output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
+        return report
+
+
+def _opened(log: Log) -> Source:
+    from hybridlog.sources.detect import open_parts, open_source
+
+    is_split = len(log.files) > 1 and log.path == log.files[0]
+    return open_parts(log.files) if is_split else open_source(log.path)
+
+
+def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
     """Fail before a store is made, when no path can be read or the server does not answer."""
     from hybridlog.maintenance.lease import check
     from hybridlog.store import store_path
@@ -84,7 +228,6 @@ def _check_new_store(choices: RecordChoices) -> None:
         return
     from hybridlog.sources.detect import open_source
 
-    paths = choices.paths
     first: SourceError | None = None
     for path in paths:
         try:
@@ -105,43 +248,6 @@ def _check_new_store(choices: RecordChoices) -> None:
 
         with Database.connect(with_password(choices.mongo)) as database:
             check(IndexState(database).mark(), {"id": ""}, database)
-
-
-def _record_one(
-    store: Store,
-    path: Path,
-    choices: RecordChoices,
-    settings: SegmentSettings,
-    tags: dict[str, str],
-) -> RecordReport:
-    from hybridlog.recorder import RecordOptions
-    from hybridlog.sources.detect import open_source
-
-    with anywhere():
-        source = open_source(path)
-    with source:
-        matcher, no_index = _matcher(choices), _no_index(choices)
-        options = RecordOptions(
-            name=choices.name,
-            tags=tags,
-            matcher=matcher,
-            between=_between(source, choices),
-            latched=not choices.no_latched,
-            original_times=choices.original_times,
-            again=choices.again,
-            settings=settings,
-            no_index=no_index,
-        )
-        with progress_bar(path.name, source.size_bytes, quiet=choices.quiet) as bar:
-            report = store.record(
-                source,
-                options,
-                lambda read, messages: bar(read, output.counted(messages, "message")),
-            )
-        _check_not_empty(report, source, store, options)
-    for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
-        output.note(f"{path}: no topic fits {output.quoted(pattern)}.")
-    return report
 
 
 def _check_not_empty(
@@ -198,53 +304,140 @@ def _no_index(choices: RecordChoices) -> TopicMatcher | None:
     return matcher(choices.no_index) if choices.no_index else None
 
 
-class _Results:
-    """Results of the paths, for the table at the end and the exit code."""
+class Results:
+    """Results of logs, for the table at the end and the exit code.
+
+    Args:
+        choices: The parameters of the command.
+    """
 
     def __init__(self, choices: RecordChoices) -> None:
-        self._paths = choices.paths
         self._choices = choices
+        self._logs: Sequence[Log] = ()
+        self._is_search = False
+        self._reports_each = False
+        self._current: Path | None = None
+        self._recorded = self._known = self._failed = 0
+        self._exit_code = 0
+        # Those that are shown at the end.
         self._reports: list[tuple[Path, RecordReport]] = []
         self._summaries: list[dict[str, Any]] = []
-        self._errors: list[HybridlogError] = []
+        self._messages: list[str] = []
+
+    def expect(self, logs: Sequence[Log], *, is_search: bool) -> None:
+        """Set the logs to record.
+
+        Args:
+            logs: The logs.
+            is_search: Whether they were found in directories, so that known ones are no error.
+        """
+        self._logs, self._is_search = logs, is_search
+
+    def report_each(self) -> None:
+        """Print a line for each log when it is recorded; there is no end to the search."""
+        self._is_search = self._reports_each = True
+
+    def add_walk(self, found: Found) -> None:
+        """Report what was met in directories besides logs."""
+        print_stores(found.stores)
+        for problem in found.problems:
+            self.fail(None, problem)
+
+    def begin(self, path: Path) -> None:
+        """The log at a path is recorded now."""
+        self._current = path
 
     def add(self, path: Path, report: RecordReport) -> None:
-        self._reports.append((path, report))
-        self._summaries.append(_summary(path, report))
-        self._errors.extend(_problems(path, report, quiet=self._choices.quiet))
+        """Add a recording."""
+        self._current = None
+        self._recorded += 1
+        for error in _problems(path, report, quiet=self._choices.quiet):
+            self._exit_code = self._exit_code or error.exit_code
+        self._summarise(_summary(path, report))
+        if not self._reports_each:
+            self._reports.append((path, report))
+        elif not self._choices.as_json and not self._choices.quiet:
+            entry = report.entry
+            output.say(
+                f"{entry.label}: {output.counted(entry.messages, 'message')}, "
+                f"{output.size(entry.stored_bytes)}, from {path}"
+            )
+            sys.stdout.flush()
 
-    def fail(self, path: Path, error: HybridlogError) -> None:
+    def known(self, path: Path, error: AlreadyRecordedError) -> None:
+        """Add a log whose content is in the store.
+
+        Raises:
+            AlreadyRecordedError: It is the only one.
+        """
+        if not self._is_search:
+            self.fail(path, error)
+            return
+        self._current = None
+        self._known += 1
+        self._summarise({"path": str(path), "known": str(error)})
+
+    def fail(self, path: Path | None, error: HybridlogError) -> None:
+        """Add an error.
+
+        Raises:
+            HybridlogError: It is of the only log.
+        """
+        self._current = None
+        if len(self._logs) == 1 and not self._is_search:
+            raise error
         output.note(f"hybridlog: {error}")
-        self._errors.append(error)
-        self._summaries.append(
-            {"path": str(path), "error": str(error), "exit_code": error.exit_code}
-        )
+        self._failed += 1
+        self._exit_code = self._exit_code or error.exit_code
+        if len(self._messages) < _MOST_FAILED:
+            self._messages.append(str(error))
+        about = {} if path is None else {"path": str(path)}
+        self._summarise({**about, "error": str(error), "exit_code": error.exit_code})
+
+    def _summarise(self, summary: dict[str, Any]) -> None:
+        if not self._reports_each:
+            self._summaries.append(summary)
+        elif self._choices.as_json:
+            output.print_json_line(summary)
 
     def on_stop(self) -> str:
         """The effect of stopping now on the recordings."""
-        done = len(self._summaries)
-        if done == len(self._paths):
-            return "Everything was recorded."
-        kept = len(self._reports)
-        before = f" {output.counted(kept, 'recording')} stored before." if kept else ""
-        return f"Nothing of {self._paths[done]} is stored.{before}"
+        kept = output.counted(self._recorded, "recording")
+        before = f" {kept} stored before." if self._recorded else ""
+        if self._current is not None:
+            return f"Nothing of {self._current} is stored.{before}"
+        return "" if self._is_search else "Everything was recorded."
 
     def show(self) -> None:
-        """Print the table of the finished recordings."""
+        """Print the table of the finished recordings, and what became of the others."""
         if self._choices.as_json:
             if self._summaries:
-                one = len(self._paths) == 1
+                one = len(self._choices.paths) == 1 and not self._is_search
                 output.print_json(self._summaries[0] if one else self._summaries)
         elif not self._choices.quiet and self._reports:
             if len(self._reports) == 1:
                 _print_one(*self._reports[0])
             else:
                 _print_several([report for _, report in self._reports])
+        if self._is_search:
+            self._sum_up()
+
+    def _sum_up(self) -> None:
+        """Print how many logs were recorded, were there, and could not be read."""
+        for message in self._messages:
+            output.note(f"not recorded: {message}")
+        if self._failed > len(self._messages):
+            output.note(f"and {self._failed - len(self._messages)} more")
+        if not self._choices.quiet:
+            output.note(
+                f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
+                f"already, {self._failed} not recorded."
+            )
 
     def exit(self) -> None:
         """Exit with the code of the first error, if there is one."""
-        if self._errors:
-            raise click.exceptions.Exit(self._errors[0].exit_code)
+        if self._exit_code:
+            raise click.exceptions.Exit(self._exit_code)
 
 
 def _summary(path: Path, report: RecordReport) -> dict[str, Any]:

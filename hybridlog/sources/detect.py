@@ -84,6 +84,38 @@ def read_time_range(path: Path) -> tuple[int, int] | None:
     return (first, last + 1) if first <= last else None
 
 
+def open_parts(paths: Sequence[Path]) -> Source:
+    """Open the parts of one split log, in their order, as one source.
+
+    Raises:
+        SourceError: As `open_source`.
+    """
+    return _join(paths[0], dict.fromkeys(paths), None, gaps=_gaps(paths))
+
+
+def grouped_parts(paths: Sequence[Path]) -> list[list[Path]]:
+    """Files of one directory, with the parts of each split log together and in order.
+
+    The names of parts differ in their number, which begins with 0, and perhaps in their date.
+    """
+    groups: list[list[Path]] = []
+    latest: dict[tuple[str, str], tuple[int, list[Path]]] = {}
+    for path in sorted(paths, key=_natural):
+        part = _PART.fullmatch(plain(path))
+        group = [path]
+        if part is not None:
+            series, number = (_DATE.sub("", part["stem"]), part["end"]), int(part["number"])
+            before, parts = latest.get(series, (number, group))
+            if number > before:
+                parts.append(path)
+                latest[series] = number, parts
+                continue
+            if number == 0:
+                latest[series] = number, group
+        groups.append(group)
+    return groups
+
+
 def sniff(path: Path) -> tuple[Format, bool]:
     """Detect the format of a file from its first bytes.
 

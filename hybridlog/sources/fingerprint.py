@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.sources.base import cannot_open
 
@@ -18,25 +18,35 @@ SAMPLES = 256
 SAMPLE_BYTES = 16 << 10
 
 
-def fingerprint(files: Sequence[Path]) -> str:
+class Fingerprint(NamedTuple):
+    """The fingerprint of a log.
+
+    Attributes:
+        whole: Of all its files in their order, 32 hexadecimal digits.
+        parts: Of each file, as if it were a log of its own.
+    """
+
+    whole: str
+    parts: tuple[str, ...]
+
+
+def fingerprint(files: Sequence[Path]) -> Fingerprint:
     """Compute the fingerprint of files in their order; their names do not matter.
 
     It covers the size of each file and its whole content up to `WHOLE` bytes. Larger files
     are covered by `SAMPLES` evenly spaced samples, the first at the start and the last at
     the end.
 
-    Returns:
-        32 hexadecimal digits.
-
     Raises:
         SourceError: A file is missing or cannot be read.
     """
-    digest = blake2b(digest_size=16)
+    whole, parts = blake2b(digest_size=16), []
     for path in files:
+        part = blake2b(digest_size=16)
         try:
             with path.open("rb", buffering=SAMPLE_BYTES) as file:
                 size = file.seek(0, 2)
-                digest.update(size.to_bytes(8, "little"))
+                _add(size.to_bytes(8, "little"), whole, part)
                 if size <= WHOLE:
                     starts, count = [0], size
                 else:
@@ -45,7 +55,13 @@ def fingerprint(files: Sequence[Path]) -> str:
                     count = SAMPLE_BYTES
                 for start in starts:
                     file.seek(start)
-                    digest.update(file.read(count))
+                    _add(file.read(count), whole, part)
         except OSError as error:
             raise cannot_open(path, error) from error
-    return digest.hexdigest()
+        parts.append(part.hexdigest())
+    return Fingerprint(whole.hexdigest(), tuple(parts))
+
+
+def _add(data: bytes, *digests: blake2b) -> None:
+    for digest in digests:
+        digest.update(data)

@@ -356,10 +356,16 @@ def _put_summary(db: sqlite3.Connection, described: Described) -> None:
     db.execute("insert or replace into topics values (?, ?)", topics)
     row = entry.id, text, _text_crc(text), _damage_crc(db, entry.id)
     db.execute("insert or replace into summaries values (?, ?, ?, '', ?)", row)
-    fingerprint = entry.source.get("fingerprint")
     db.execute("delete from fingerprints where id = ?", (entry.id,))
-    if isinstance(fingerprint, str):
-        db.execute("insert into fingerprints values (?, ?)", (fingerprint, entry.id))
+    rows = [(fingerprint, entry.id) for fingerprint in _fingerprints(entry)]
+    db.executemany("insert into fingerprints values (?, ?)", rows)
+
+
+def _fingerprints(entry: RecordingEntry) -> set[str]:
+    """Fingerprints of the log of a recording and of its parts."""
+    parts = entry.source.get("parts")
+    found = [entry.source.get("fingerprint"), *(parts if isinstance(parts, list) else ())]
+    return {fingerprint for fingerprint in found if isinstance(fingerprint, str)}
 
 
 def channel_totals(
@@ -835,14 +841,14 @@ class Catalog:
         return None
 
     def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
-        """A recording of a log with this content."""
+        """A recording of a log with this content, or of one of which it is a part."""
         with self._reading():
             self._follow()
             asked = "select id from fingerprints where fingerprint = ?"
             rows = self._db.execute(asked, (fingerprint,)).fetchall()
         for (recording,) in rows:
             found = self.recording(recording)
-            if found is not None and found[1].source.get("fingerprint") == fingerprint:
+            if found is not None and fingerprint in _fingerprints(found[1]):
                 return found[1]
         return None
 

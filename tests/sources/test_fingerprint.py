@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from hybridlog.sources.fingerprint import SAMPLE_BYTES, SAMPLES, WHOLE, fingerprint
+from hybridlog.sources import fingerprint as module
+from hybridlog.sources.fingerprint import SAMPLE_BYTES, SAMPLES, WHOLE
 from hybridlog_storage.errors import SourceError
+
+
+def fingerprint(files: Sequence[Path]) -> str:
+    return module.fingerprint(files).whole
+
+
+def test_each_part_has_its_own(tmp_path: Path) -> None:
+    large = write(tmp_path / "large", bytes(range(256)) * (WHOLE // 256 + 1))
+    files = [write(tmp_path / "a", b"a"), large, write(tmp_path / "b", b"b")]
+    found = module.fingerprint(files)
+    assert list(found.parts) == [fingerprint([path]) for path in files]
+    assert found.whole not in found.parts
 
 
 def write(path: Path, data: bytes) -> Path:

@@ -1,0 +1,231 @@
+"""`hybridlog record DIR`, once and with `--watch`."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import hybridlog as hl
+from hybridlog.cli import record_watch
+from hybridlog.cli.app import app
+from hybridlog.cli.signals import Stopped
+from hybridlog_storage.errors import HybridlogError
+from tests.sources.test_find import METADATA, mcap
+
+from .running import COMMAND, environment
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("directory") / "store", create=True) as opened:
+        opened.connect()
+        yield opened
+
+
+@pytest.fixture
+def store(opened: hl.Store) -> Path:
+    """A store without recordings, whose MongoDB runs."""
+    opened.refresh()
+    for label in opened.recordings().labels:
+        opened.remove(label)
+    return opened.directory.path
+
+
+@pytest.fixture
+def top(tmp_path: Path) -> Path:
+    """Four logs: one alone, one split, and a bag of two files."""
+    path = tmp_path / "logs"
+    mcap(path / "a.mcap", 1)
+    mcap(path / "split" / "run_0.mcap", 2)
+    mcap(path / "split" / "run_1.mcap", 3)
+    mcap(path / "split" / "other.mcap", 4)
+    mcap(path / "bag" / "x_0.mcap", 5)
+    mcap(path / "bag" / "x_1.mcap", 6)
+    (path / "bag" / "metadata.yaml").write_text(METADATA.format(files="x_0.mcap, x_1.mcap"))
+    return path
+
+
+def record(store: Path, *words: object) -> tuple[int, str, str]:
+    """Run `record` in this process: exit code, standard output, standard error."""
+    done = CliRunner().invoke(app, ["record", *map(str, words), "--store", str(store)])
+    if isinstance(done.exception, HybridlogError):
+        return done.exception.exit_code, done.stdout, f"{done.stderr}{done.exception}"
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.stdout, done.stderr
+
+
+def counts(store: Path) -> dict[str, int]:
+    with hl.open(store) as opened:
+        return {one.label: one.messages for one in opened.summaries()}
+
+
+def test_all_logs_below_a_directory_are_recorded_once(top: Path, store: Path) -> None:
+    code, out, err = record(store, top)
+    assert code == 0
+    assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11}
+    assert out.splitlines()[-1].split()[:3] == ["total", "1", "21"]
+    assert err.endswith("4 logs recorded, 0 in the store already, 0 not recorded.\n")
+    mcap(top / "new" / "late.mcap", 7)
+    code, out, err = record(store, top, "--json")
+    assert code == 0
+    assert [("known" in one, one.get("messages")) for one in json.loads(out)] == [
+        (True, None), (True, None), (False, 7), (True, None), (True, None),
+    ]  # fmt: skip
+    assert err.endswith("1 log recorded, 4 in the store already, 0 not recorded.\n")
+    # A part of a log that is there is there, too, and so is a log of parts that are.
+    assert "is in the store already, as 'run'" in record(store, top / "split" / "run_1.mcap")[2]
+    assert record(store, top / "bag")[0] == 8
+    assert len(counts(store)) == 5
+
+
+def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
+    (top / "aa.bag").write_text("no bag")
+    (top / "empty.mcap").touch()
+    mcap(top / "torn.mcap", 3, whole=False)
+    inner = top / "inner"
+    inner.mkdir()
+    (inner / "hybridlog.toml").touch()
+    mcap(inner / "recordings" / "r" / "000000.mcap")
+    code, _, err = record(store, top, "-q")
+    assert code == 3  # of the first error
+    assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11, "torn": 3}
+    assert err.count("aa.bag: not a log of a known kind") == 2  # when it is met, and at the end
+    assert f"{inner} is a store and is not searched; `hybridlog import {inner}`" in err
+    assert "not recorded: " in err.splitlines()[-1]
+
+
+def test_parts_that_are_there_are_not_recorded_twice(top: Path, store: Path) -> None:
+    record(store, top / "bag" / "x_0.mcap")
+    assert record(store, top)[0] == 0
+    assert counts(store) == {"a": 1, "run": 5, "other": 4, "x_0": 5, "x_1": 6}
+    code, _, err = record(store, top / "bag")
+    assert code == 8
+    assert "in the store already, part by part: x_0, x_1." in err
+    assert record(store, top / "bag", "--again", "-q")[0] == 0
+    assert counts(store)["bag"] == 11
+
+
+def test_a_directory_of_one_log_is_that_log(tmp_path: Path, store: Path) -> None:
+    mcap(tmp_path / "drive" / "drive_0.mcap", 2)
+    mcap(tmp_path / "drive" / "drive_1.mcap", 3)
+    assert record(store, tmp_path / "drive", "--name", "first")[0] == 0
+    assert counts(store) == {"first": 5}
+    code, _, err = record(store, tmp_path / "drive")
+    assert (code, "as 'first'" in err) == (8, True)
+    (tmp_path / "nothing").mkdir()
+    assert record(store, tmp_path / "nothing")[0] == 3
+
+
+def test_what_does_not_fit_a_directory(top: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    for words, said in (
+        ((top, "--name", "x"), "there are 4 logs"),
+        ((top, "--watch", "--name", "x"), "--watch makes many"),
+        ((top / "a.mcap", "--watch"), "takes directories"),
+        (("--replay", top / "a.mcap", "--watch"), "not for a running robot"),
+        ((top, "--watch", "--settle", "soon"), "not a duration"),
+    ):
+        code, _, err = record(store, *words)
+        assert (code, said in err) == (2, True), err
+    assert not store.exists()
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Sets what happens between the looks of a watch; then it is stopped."""
+
+    def set_steps(*steps: Callable[[], object]) -> None:
+        waiting: Iterator[Callable[[], object]] = iter(steps)
+
+        def pause(_seconds: float) -> None:
+            step = next(waiting, None)
+            if step is None:
+                raise Stopped(signal.SIGINT)
+            step()
+
+        monkeypatch.setattr(record_watch, "pause", pause)
+
+    return set_steps
+
+
+def nothing() -> None:
+    """Only time passes."""
+
+
+def test_a_watched_bag_grows(tmp_path: Path, store: Path, looks: Callable[..., None]) -> None:
+    bag = tmp_path / "logs" / "bag"
+    mcap(bag / "bag_0.mcap", 2, whole=False)
+    mcap(bag.parent / "old.mcap", 1)
+    looks(
+        nothing,
+        lambda: (mcap(bag / "bag_0.mcap", 2), mcap(bag / "bag_1.mcap", 3, whole=False)),
+        nothing,
+        nothing,
+        lambda: (
+            mcap(bag / "bag_1.mcap", 3),
+            (bag / "metadata.yaml").write_text(METADATA.format(files="bag_0.mcap, bag_1.mcap")),
+            mcap(bag.parent / "going.mcap", 9, whole=False),
+        ),
+        nothing,
+        nothing,
+    )
+    code, out, err = record(store, bag.parent, "--watch")
+    assert code == 0
+    assert [line.partition(",")[0] for line in out.splitlines()] == [
+        "old: 1 message", "bag_0: 2 messages", "bag_1: 3 messages",
+    ]  # fmt: skip
+    assert "Watching. Ctrl-C ends it." in err
+    assert f"{bag.parent / 'going.mcap'} is not complete" in err
+    assert err.endswith("3 logs recorded, 0 in the store already, 0 not recorded.\n")
+    # The next watch, and a search, find all of it in the store.
+    looks(nothing, lambda: (bag.parent / "going.mcap").write_text("no log"), nothing, nothing)
+    code, out, err = record(store, bag.parent, "--watch", "--json", "--settle", "0s")
+    assert [set(json.loads(line)) for line in out.splitlines()[:2]] == [{"path", "known"}] * 2
+    assert counts(store) == {"old": 1, "bag_0": 2, "bag_1": 3}
+
+
+def test_a_watch_goes_on_after_errors(
+    top: Path, store: Path, looks: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (top / "bad.db3").write_bytes(b"SQLite format 3\0" + bytes(84))
+    away = iter([True, False])
+    real = hl.Store.record
+
+    def sometimes(self: hl.Store, *arguments: object, **options: object) -> object:
+        if next(away, False):
+            raise record_watch.DatabaseError("MongoDB is on holiday.")
+        return real(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(hl.Store, "record", sometimes)
+    looks(nothing, nothing, nothing)
+    code, _, err = record(store, top, "--watch", "--settle", "0s")
+    assert code == 6
+    assert counts(store) == {"a": 1, "run_0": 2, "run_1": 3, "other": 4, "bag": 11}
+    assert err.count("MongoDB is on holiday.") == 2
+    assert err.count("not recorded: ") == 2
+    assert "bad.db3" in err
+
+
+def test_a_signal_ends_a_watch_normally(top: Path, store: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "record", str(top), "--watch", "--settle", "0s", "--store", str(store)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(),
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    with process.stdout, process.stderr:
+        for _ in range(5):
+            assert process.stdout.readline()
+        process.terminate()
+        err = process.stderr.read().decode()
+        assert process.wait(60) == 0, err
+    assert "5 logs recorded" in err
+    assert "Traceback" not in err
