@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import socket
 import sys
 import tempfile
@@ -522,6 +523,13 @@ class FakeRos:
         self.graph: dict[tuple[str, str], list[Offer]] = {}
         self.made: list[FakeSubscription] = []
         self.invalid: dict[str, str] = {}
+        self.asked: list[str] = []
+
+    def offers(self, topic: str) -> list[tuple[str, Offer]]:
+        self.asked.append(topic)
+        return [
+            (key[1], o) for key, offers in self.graph.items() if key[0] == topic for o in offers
+        ]
 
     def publishers(self) -> dict[tuple[str, str], list[Offer]]:
         return self.graph
@@ -922,10 +930,95 @@ def test_a_message_that_cannot_be_taken_costs_one(tmp_path: Path) -> None:
     assert "serialized nonsense" in rig.told("say")[0]["text"]
 
 
-def test_different_versions_of_a_type_are_said(tmp_path: Path) -> None:
+def channels(rig: Rig) -> list[tuple[str, str]]:
+    """Hash and definition of the channels, by number."""
+    return [(event["hash"], event["definition"]) for event in rig.told("channel")]
+
+
+def describe(folder: Path, type_hash: str) -> None:
+    """Give the installed type a hash."""
+    hashes = [
+        {"type_name": "a/msg/Other", "hash_string": "RIHS01_other"},
+        {"type_name": "a/msg/T", "hash_string": type_hash},
+    ]
+    path = folder / "share" / "a" / "msg" / "T.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"type_hashes": hashes}))
+
+
+def test_each_version_of_a_type_is_a_channel_of_its_own(tmp_path: Path) -> None:
+    describe(tmp_path, "RIHS01_a")
     rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"), offer(B, type_hash="RIHS01_b"))
-    assert "different versions of a/msg/T" in rig.told("say")[0]["text"]
-    assert rig.told("channel")[0]["hash"] == ""
+    assert channels(rig) == [("RIHS01_a", "int8 i"), ("RIHS01_b", "")]
+    assert "another version of a/msg/T" in rig.told("say")[0]["text"]
+    rig.ros.made[0].queue = [(b"a", info(1)), (b"b", info(1, B)), (b"a", info(2))]
+    rig.child._take(0.0)
+    assert [message[:2] for message in rig.messages] == [(0, b"a"), (1, b"b"), (0, b"a")]
+
+
+def test_another_version_after_a_restart_is_known_at_its_first_message(tmp_path: Path) -> None:
+    describe(tmp_path, "RIHS01_b")
+    rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"))
+    rig.ros.made[0].queue = [(b"a", info(1))]
+    rig.child._take(0.0)
+    # It is not looked for until its message has come, and then once.
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(B, type_hash="RIHS01_b")]}
+    rig.ros.made[0].queue = [(b"b", info(1, B)), (b"b", info(2, B)), (b"?", info(1, b"c" * 16))] * 2
+    rig.child._take(0.0)
+    assert channels(rig) == [("RIHS01_a", ""), ("RIHS01_b", "int8 i")]
+    assert [message[:2] for message in rig.messages] == [
+        *((0, b"a"), (1, b"b"), (1, b"b"), (1, b"?")),
+        *((1, b"b"), (1, b"b"), (1, b"?")),
+    ]
+    assert rig.ros.asked == ["/t", "/t"]
+    rig.topics.look()
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(A, type_hash="RIHS01_a")]}
+    rig.topics.look()
+    rig.ros.made[0].queue = [(b"a", info(1))]
+    rig.child._take(0.0)
+    assert rig.messages[-1][0] == 0
+    assert len(channels(rig)) == 2
+
+
+def test_versions_are_mixed_where_messages_do_not_name_their_publisher(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"))
+    unnamed(rig, 1)
+    both = [offer(type_hash="RIHS01_a"), offer(B, type_hash="RIHS01_b")]
+    rig.ros.graph = {("/t", "a/msg/T"): both}
+    rig.topics.look()
+    unnamed(rig, 2)
+    assert any("does not tell their messages apart" in said["text"] for said in rig.told("say"))
+    rig.ros.graph = {("/t", "a/msg/T"): both[1:]}
+    rig.topics.look()
+    unnamed(rig, 1)
+    assert [each[0] for each in channels(rig)] == ["RIHS01_a", "", "RIHS01_b"]
+    assert [message[0] for message in rig.messages] == [0, 1, 2]
+
+
+def test_a_graph_that_cannot_be_asked_costs_no_message(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.offers = lambda _topic: 1 / 0
+    rig.ros.made[0].queue = [(b"b", info(1, B))]
+    rig.child._take(0.0)
+    assert [message[:2] for message in rig.messages] == [(0, b"b")]
+    assert "its publishers are unknown for now" in rig.told("say")[0]["text"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"type_hashes": 5}', '{"type_hashes": [{}]}', "[" * 100_000]
+)
+def test_a_description_that_is_none_gives_no_hash(tmp_path: Path, text: str) -> None:
+    definitions = packages(tmp_path, {"a/msg/T.msg": "int8 i", "a/msg/T.json": text})
+    assert definitions.find("a/msg/T").type_hash == ""
+
+
+def test_the_hash_of_a_service_is_that_of_its_event(tmp_path: Path) -> None:
+    hashes = [{"type_name": f"a/srv/S{part}", "hash_string": f"h{part}"} for part in ("", "_Event")]
+    definitions = packages(
+        tmp_path,
+        {"a/srv/S.srv": "---\n", "a/srv/S.json": json.dumps({"type_hashes": hashes})},
+    )
+    assert definitions.find("a/srv/S_Event").type_hash == "h_Event"
 
 
 # Where it runs.

@@ -146,6 +146,36 @@ def test_what_was_latched_before_is_heard(python: str, talker: Robot) -> None:
     assert memory.losses == []
 
 
+def test_another_type_after_a_restart_is_a_channel_of_its_own(python: str, talker: Robot) -> None:
+    """It is heard at once, while the publisher that was killed still counts as present."""
+    number = "std_msgs/msg/Int32"
+    memory = Memory(mine)
+    with Ros2Source(python) as source:
+        source.start(memory)
+        talker.do("make", name="/x", kind=STRING, depth=10)
+        talker.do("heard", name="/x", by=1)
+        talker.do("text", name="/x", words=["one"])
+        memory.wait(lambda: memory.taken, "the text should come")
+        with robot(python, "other") as other:
+            other.do("make", name="/x", kind=number, depth=10)
+            other.do("heard", name="/x", by=1)
+            other.do("text", name="/x", words=[2])
+            memory.wait(lambda: len(memory.taken) == 2, "the number should come")
+        talker.do("drop", name="/x")
+        memory.wait(lambda: "/x" in memory.gone, "it should be gone")
+        talker.do("make", name="/x", kind=number, depth=10)
+        talker.do("heard", name="/x", by=1)
+        talker.do("text", name="/x", words=[3])
+        memory.wait(lambda: len(memory.taken) == 3, "the next number should come")
+    assert memory.said == []
+    assert memory.losses == []
+    kinds = [taken.channel.schema.name for taken in memory.taken if taken.channel.schema]
+    assert kinds == [STRING, number, number]
+    assert len({taken.channel.metadata["topic_type_hash"] for taken in memory.taken}) == 2
+    assert text(memory.taken[0].payload) == "one"
+    assert memory.taken[1].payload[4:] == b"\2\0\0\0"
+
+
 def test_a_publisher_that_offers_less_joins(python: str, talker: Robot) -> None:
     talker.do("make", name="/chat", kind=STRING, depth=5000)
     memory = Memory(mine)

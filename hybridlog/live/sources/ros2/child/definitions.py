@@ -7,6 +7,7 @@ names come from the network. They are looked up as files before a package is imp
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sys
@@ -77,12 +78,19 @@ class Definition(NamedTuple):
         text: The definition with all definitions that it needs.
         has_bytes: Some field is a byte array of any length, as in images.
         has_arrays: Some field is an array of any length.
+        type_hash: Hash of the installed type; empty in older releases.
     """
 
     encoding: str
     text: bytes
     has_bytes: bool
     has_arrays: bool
+    type_hash: str = ""
+
+    def of(self, type_hash: str) -> Definition:
+        """The definition for a version of the type: empty if another one is installed."""
+        is_other = type_hash and self.type_hash and type_hash != self.type_hash
+        return self._replace(text=b"") if is_other else self
 
 
 def parse_type(name: str) -> TypeName:
@@ -154,7 +162,19 @@ class Definitions:
             b"".join(parts),
             has_bytes=any(_BYTES.search(found) for _, found in waiting),
             has_arrays=any(_ARRAYS.search(found) for _, found in waiting),
+            type_hash=self._type_hash(root),
         )
+
+    def _type_hash(self, root: TypeName) -> str:
+        """The hash of an installed type, which a file beside its definition states."""
+        try:
+            described = json.loads(self._read(root, ".json"))
+            hashes = {each["type_name"]: each["hash_string"] for each in described["type_hashes"]}
+        except (UnknownTypeError, ValueError, LookupError, TypeError, RecursionError):
+            return ""  # Humble has no hashes
+        name = "/".join(root[:3]) + (f"_{root.part}" if root.part else "")
+        found = hashes.get(name)
+        return found if isinstance(found, str) else ""
 
     def _read(self, name: TypeName, suffix: str) -> bytes:
         """Reads the file of a type.

@@ -24,6 +24,7 @@ _ID = 16
 """Length of a publisher's id in bytes; some releases pad it with zeros."""
 
 _MAX_INVALID = 100
+_MAX_NODES = 4  # so many types of a topic are heard at the same time
 
 
 class Offer(NamedTuple):
@@ -47,13 +48,19 @@ class Subscription:
 
     Attributes:
         profile: Requested quality of service.
+        node: The rclpy node that it belongs to.
+        topic_and_type: Its topic and type.
         tells_all: The middleware also counts losses before the first message and after the
             last, but no message from before the subscription.
         take: Returns the next message and its information, None if there is none.
     """
 
-    def __init__(self, middleware: Middleware, handle: Any, profile: Profile) -> None:
+    def __init__(
+        self, middleware: Middleware, node: Any, handle: Any, kind: TypeName, profile: Profile
+    ) -> None:
         self.profile = profile
+        self.node = node
+        self.topic_and_type = (handle.topic_name, kind)
         self.take: Callable[[], tuple[bytes, dict[str, Any]] | None] = partial(
             handle.handle.take_message, handle.msg_type, True
         )
@@ -87,6 +94,9 @@ class Subscription:
 class Middleware:
     """A node without services, parameters or log topic.
 
+    Fast DDS allows a program one type for each topic name. So further nodes, with participants
+    of their own, subscribe to topics that have several types at the same time.
+
     Attributes:
         implementation: Name of the middleware, such as `rmw_fastrtps_cpp`.
         invalid: Topics with names that ROS refuses, and the errors.
@@ -106,22 +116,29 @@ class Middleware:
         self._native = rclpy_implementation
         self._silent = _no_callbacks()
         name = f"hybridlog_recorder_{os.getpid()}"
-        self._name = f"/{name}"
+        self._names = [name, *(f"{name}_{number}" for number in range(1, _MAX_NODES))]
+        self._own = frozenset(f"/{name}" for name in self._names)
         with default_profile():
             rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
             self._context = rclpy.get_default_context()
-            self._node = rclpy.create_node(
-                name,
-                use_global_arguments=False,
-                enable_rosout=False,
-                start_parameter_services=False,
-            )
+            self._node = self._new_node(name, self._context)
+        self._nodes = [self._node]
+        self._contexts: list[Any] = []
         self._guard = self._node.create_guard_condition(lambda: None)
         self._wait_set: Any = None
         self._open: list[Subscription] = []
         self._at: dict[int, Subscription] = {}
         self.invalid: dict[str, str] = {}
         self.implementation = str(rclpy.get_rmw_implementation_identifier())
+
+    def _new_node(self, name: str, context: Any) -> Any:
+        return self._rclpy.create_node(
+            name,
+            context=context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
 
     def wake(self) -> None:
         """Ends a wait; thread safe, even while the node closes."""
@@ -136,16 +153,27 @@ class Middleware:
         found: dict[tuple[str, str], list[Offer]] = {}
         for topic, _ in self._node.get_topic_names_and_types():
             try:
-                infos = self._node.get_publishers_info_by_topic(topic)
+                offers = self.offers(topic)
             except Exception as error:
                 # rclpy raises errors of many kinds; each concerns only this topic.
                 if len(self.invalid) < _MAX_INVALID:
                     self.invalid[topic] = " ".join(str(error).split())
                 continue
-            for info in infos:
-                offer = _offer(info)
-                if offer.node != self._name:
-                    found.setdefault((topic, info.topic_type), []).append(offer)
+            for kind, offer in offers:
+                found.setdefault((topic, kind), []).append(offer)
+        return found
+
+    def offers(self, topic: str) -> list[tuple[str, Offer]]:
+        """The publishers of a topic that are not this program's, each with its type.
+
+        Raises:
+            Exception: Any error of rclpy.
+        """
+        found = []
+        for info in self._node.get_publishers_info_by_topic(topic):
+            offer = _offer(info)
+            if offer.node not in self._own:
+                found.append((str(info.topic_type), offer))
         return found
 
     def subscribe(self, topic: str, kind: TypeName, profile: Profile) -> Subscription:
@@ -155,18 +183,39 @@ class Middleware:
             ImportError: The type has no Python module.
             Exception: Any error of rclpy.
         """
-        handle = self._node.create_subscription(
-            message_class(kind),
+        message = message_class(kind)
+        node = self._node_for(topic, kind)
+        handle = node.create_subscription(
+            message,
             topic,
             _nothing,
             self._quality(profile),
             raw=True,
             event_callbacks=self._silent,
         )
-        found = Subscription(self, handle, profile)
+        found = Subscription(self, node, handle, kind, profile)
         self._open.append(found)
         self._wait_set = None
         return found
+
+    def _node_for(self, topic: str, kind: TypeName) -> Any:
+        """A node that has no subscription to another type of a topic."""
+        others = {
+            id(sub.node)
+            for sub in self._open
+            if sub.topic_and_type[0] == topic and sub.topic_and_type[1] != kind
+        }
+        for node in self._nodes:
+            if id(node) not in others:
+                return node
+        if len(self._nodes) == _MAX_NODES:
+            raise RuntimeError(f"it has had more than {_MAX_NODES} types")
+        with default_profile():
+            context = self._rclpy.Context()
+            context.init(args=[])
+            self._contexts.append(context)
+            self._nodes.append(self._new_node(self._names[len(self._nodes)], context))
+        return self._nodes[-1]
 
     def forget(self, subscription: Subscription, inner: Any) -> None:
         """Ends a subscription; only `Subscription.close` calls it.
@@ -177,7 +226,7 @@ class Middleware:
         """
         self._open = [other for other in self._open if other is not subscription]
         self._wait_set = None
-        self._node.destroy_subscription(inner)
+        subscription.node.destroy_subscription(inner)
 
     def losses_of(self, handle: Any) -> Any:
         """The rclpy event of lost messages, None if it is not supported."""
@@ -210,9 +259,12 @@ class Middleware:
         return [self._at[pointer] for pointer in wait_set.get_ready_entities("subscription")]
 
     def close(self) -> None:
-        """Removes the node from the graph."""
+        """Removes the nodes from the graph."""
         self._wait_set = None
-        self._node.destroy_node()
+        for node in self._nodes:
+            node.destroy_node()
+        for context in self._contexts:
+            context.shutdown()
         self._rclpy.shutdown()
 
     def _quality(self, profile: Profile) -> Any:

@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.middleware import publisher_id
 from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
-from hybridlog.live.sources.ros2.child.publication_gaps import Loss, PublicationGapDetector
+from hybridlog.live.sources.ros2.child.publication_gaps import (
+    MAX_PUBLISHERS,
+    Loss,
+    PublicationGapDetector,
+)
 from hybridlog.live.sources.ros2.child.qos import RELIABLE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from hybridlog.live.sources.ros2.child.middleware import Offer, Subscription
     from hybridlog.live.sources.ros2.child.outbox import Outbox
@@ -48,16 +52,28 @@ class Stream:
         subscription: The subscription.
         channel: Number of the channel.
         offers: The present publishers.
+        look_again: Updates `channels`: a publisher is not among them.
 
     Attributes:
         named: Messages name their publisher; True until one does not.
         numbered: Messages have numbers; True until one does not.
         alone: The topic has had the same single publisher since its count began.
+        channel: Number of the channel of publishers that are not in `channels`.
+        channels: Numbers of channels by publisher.
     """
 
-    def __init__(self, subscription: Subscription, channel: int, offers: Sequence[Offer]) -> None:
+    def __init__(
+        self,
+        subscription: Subscription,
+        channel: int,
+        offers: Sequence[Offer],
+        look_again: Callable[[], None],
+    ) -> None:
         self.subscription = subscription
         self.channel = channel
+        self.channels: dict[bytes, int] = {}
+        self._look_again = look_again
+        self._looked_for: set[bytes] = set()
         self.named = True
         self.numbered = True
         self.alone = len(offers) == 1
@@ -127,7 +143,6 @@ class Stream:
 
     def _take(self, subscription: Subscription, outbox: Outbox) -> tuple[int, int]:
         take, put, gaps = subscription.take, outbox.message, self._gaps
-        channel = self.channel
         count = size = 0
         while count < _AT_ONCE and size < _BYTES_AT_ONCE:
             got = take()
@@ -142,14 +157,26 @@ class Stream:
             if gid is None:
                 self.named = False
                 publisher, is_usable = b"", self.alone and number >= 0
+                channel = self.channel
             else:
                 publisher, is_usable = publisher_id(gid["data"]), number >= 0
+                found = self.channels.get(publisher)
+                channel = self._meet(publisher) if found is None else found
             if is_usable and publisher not in gaps:
                 self._begin(publisher, number, received)
             if not is_usable or gaps.see(publisher, number, received):
                 sent = info["source_timestamp"]
                 put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
         return count, size
+
+    def _meet(self, publisher: bytes) -> int:
+        """The channel of a publisher that came after the last look at the graph."""
+        if publisher not in self._looked_for:
+            if len(self._looked_for) >= MAX_PUBLISHERS:
+                self._looked_for.clear()
+            self._looked_for.add(publisher)
+            self._look_again()
+        return self.channels.get(publisher, self.channel)
 
     def _begin(self, publisher: bytes, number: int, received: int) -> None:
         """Counts losses before the first message of a publisher."""

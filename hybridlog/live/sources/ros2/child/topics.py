@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.definitions import UnknownTypeError, parse_type
@@ -19,7 +20,7 @@ from hybridlog.live.sources.ros2.child.qos import (
 from hybridlog.live.sources.ros2.child.stream import Stream
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Mapping, Sequence
 
     from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
     from hybridlog.live.sources.ros2.child.event_sender import EventSender
@@ -41,7 +42,8 @@ class Topic:
         definition: Definition of the type, None if unknown.
         stream: The messages, None without a subscription.
         nodes: Names of the nodes of present and past publishers.
-        profiles: Profiles that publishers have offered for the current channel.
+        channels: Numbers of the current channels, by hash of the type.
+        profiles: Profiles that publishers have offered for these channels.
         problem: The reason why it cannot be subscribed to, or an empty string.
         reported_at: Monotonic time of the last report of the problem.
     """
@@ -54,7 +56,8 @@ class Topic:
         self.definition: Definition | None = None
         self.stream: Stream | None = None
         self.nodes: dict[bytes, str] = {}
-        self.profiles: set[Profile] = set()
+        self.channels: dict[str, int] = {}
+        self.profiles: dict[str, set[Profile]] = {}
         self.problem = ""
         self.reported_at = 0.0
 
@@ -145,6 +148,7 @@ class Topics:
         known = {offer.publisher for offer in before}
         if any(offer.publisher not in known for offer in topic.offers):
             self._adapt(topic, stream, is_first=not before)
+        self._set_channels(topic, stream, topic.offers)
         self._check(topic, stream, known)
 
     def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
@@ -153,8 +157,6 @@ class Topics:
         is_incompatible = any(conflicts(offer.profile, asked) for offer in topic.offers)
         if wanted != asked and (is_incompatible or is_first):
             self._resubscribe(topic, stream, wanted)
-        if not {offer.profile for offer in topic.offers} <= topic.profiles:
-            stream.channel = self._open_channel(topic)
 
     def _resubscribe(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
         """Subscribes again, with a profile that is compatible with all publishers."""
@@ -182,10 +184,18 @@ class Topics:
                     f"{' and '.join(reasons)} does not satisfy the QoS overrides; change that "
                     "in the file"
                 )
-        if len(_hashes(topic)) > 1:
+        assert topic.definition is not None
+        hashes = {offer.type_hash for offer in topic.offers if offer.type_hash}
+        if len(hashes) > 1 and not stream.named:
             self._events.say(
-                f"{topic.name}: its publishers have different versions of {topic.kind}; "
-                "the installed definition is recorded"
+                f"{topic.name}: its publishers have different versions of {topic.kind}, and this "
+                "rclpy does not tell their messages apart; the installed definition is recorded"
+            )
+        elif any(topic.definition.of(each) != topic.definition for each in hashes):
+            self._events.say(
+                f"{topic.name}: a publisher has another version of {topic.kind} than the one that "
+                "is installed here; its messages are recorded without that definition. Source "
+                "the workspace of the publisher for their fields"
             )
 
     def _wanted(self, topic: Topic) -> Profile:
@@ -212,7 +222,10 @@ class Topics:
             # rclpy raises errors of many kinds; each concerns only this topic.
             self._refuse(topic, f"rclpy cannot subscribe: {error or type(error).__name__}")
             return
-        topic.stream = Stream(found, self._open_channel(topic), topic.offers)
+        look_again = partial(self._look_again, topic)
+        number = self._open_channel(topic, "", []) if not topic.offers else -1
+        topic.stream = Stream(found, number, topic.offers, look_again)
+        self._set_channels(topic, topic.stream, topic.offers)
         self._live.append(topic)
         self._list()
 
@@ -227,15 +240,45 @@ class Topics:
             if len(subscriptions) > 1:
                 self.doubled.append(topic)
 
-    def _open_channel(self, topic: Topic) -> int:
+    def _look_again(self, topic: Topic) -> None:
+        """Looks at the publishers of a topic: a message of a new one has come."""
+        try:
+            found = self._middleware.offers(topic.name)
+        except Exception as error:
+            # rclpy raises errors of many kinds; the next look tells more.
+            self._events.say(f"{topic.name}: its publishers are unknown for now: {error}")
+            return
+        assert topic.stream is not None
+        offers = [offer for kind, offer in found if kind == topic.kind]
+        self._set_channels(topic, topic.stream, offers)
+
+    def _set_channels(self, topic: Topic, stream: Stream, offers: Sequence[Offer]) -> None:
+        """Gives each version of the type a channel of its own, and a new one for new profiles.
+
+        Messages of publishers that are not named share a channel.
+        """
+        versions: dict[str, list[Offer]] = {}
+        for offer in offers:
+            versions.setdefault(offer.type_hash, []).append(offer)
+        if len(versions) > 1 and not stream.named:
+            versions = {"": list(offers)}
+        for type_hash, group in versions.items():
+            profiles = [offer.profile for offer in group]
+            if not topic.profiles.get(type_hash, set()).issuperset(profiles):
+                topic.channels[type_hash] = self._open_channel(topic, type_hash, profiles)
+            stream.channel = topic.channels[type_hash]
+        stream.channels = {
+            offer.publisher: topic.channels[type_hash]
+            for type_hash, group in versions.items()
+            for offer in group
+        }
+
+    def _open_channel(self, topic: Topic, type_hash: str, profiles: Sequence[Profile]) -> int:
         """Announces a channel, and returns its number."""
         assert topic.definition is not None
-        profiles = [offer.profile for offer in topic.offers]
-        topic.profiles.update(profiles)
-        hashes = _hashes(topic)
-        type_hash = hashes.pop() if len(hashes) == 1 else ""
-        offered = offered_text(profiles)
-        return self._events.channel(topic.name, topic.kind, topic.definition, offered, type_hash)
+        topic.profiles.setdefault(type_hash, set()).update(profiles)
+        definition, offered = topic.definition.of(type_hash), offered_text(profiles)
+        return self._events.channel(topic.name, topic.kind, definition, offered, type_hash)
 
     def _refuse(self, topic: Topic, problem: str) -> None:
         topic.problem = problem
@@ -283,7 +326,3 @@ class Topics:
                 f"{topic.name}: this rclpy does not name the publishers of messages, so losses "
                 "in transport cannot be counted; ROS 2 Kilted names them"
             )
-
-
-def _hashes(topic: Topic) -> set[str]:
-    return {offer.type_hash for offer in topic.offers if offer.type_hash}
