@@ -113,6 +113,28 @@ ROBOT = """
             publisher.publish(kind(height=number, data=bytes([number]) * size))
             time.sleep(0.01)
 
+    def call(name, prefixes):
+        from rcl_interfaces.srv import ListParameters
+        from rclpy.service_introspection import ServiceIntrospectionState
+
+        def answer(request, response):
+            response.result.names = request.prefixes
+            return response
+
+        service = node.create_service(ListParameters, name, answer)
+        client = node.create_client(ListParameters, name)
+        for end in (service, client):
+            end.configure_introspection(
+                node.get_clock(), QoSProfile(depth=10), ServiceIntrospectionState.CONTENTS
+            )
+        deadline = time.monotonic() + 30
+        while not node.count_subscribers(name + "/_service_event"):
+            assert time.monotonic() < deadline, name
+            time.sleep(0.01)
+        future = client.call_async(ListParameters.Request(prefixes=prefixes))
+        rclpy.spin_until_future_complete(node, future, timeout_sec=30)
+        assert list(future.result().result.names) == prefixes
+
     def flood(names, rounds, size):
         kind = publishers[names[0]][1]
         message = serialize_message(kind(data=bytes(size)))

@@ -17,6 +17,7 @@ from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros2 import source as ros2
 from hybridlog.live.sources.ros2.child.definitions import Definitions
 from hybridlog.live.sources.ros2.source import Ros2Source
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.definition import parse_definition
 from hybridlog_storage.messages import Schema
 from tests.live.sources.ros2_peers import (
@@ -174,6 +175,31 @@ def test_another_type_after_a_restart_is_a_channel_of_its_own(python: str, talke
     assert len({taken.channel.metadata["topic_type_hash"] for taken in memory.taken}) == 2
     assert text(memory.taken[0].payload) == "one"
     assert memory.taken[1].payload[4:] == b"\2\0\0\0"
+
+
+def test_calls_of_services_and_states_of_actions_are_heard(python: str, talker: Robot) -> None:
+    memory = Memory(mine)
+    with Ros2Source(python) as source:
+        source.start(memory)
+        talker.do(
+            "make", name="/go/_action/status", kind="action_msgs/msg/GoalStatusArray", depth=1
+        )
+        talker.do("call", name="/list", prefixes=["a", "bc"])
+        memory.wait(lambda: len(memory.taken) == 4, "both ends should tell of both messages")
+        status = ("/go/_action/status", "action_msgs/msg/GoalStatusArray", 1)
+        memory.wait(lambda: status in memory.came, "the action should be seen")
+    assert {taken.channel.topic for taken in memory.taken} == {"/list/_service_event"}
+    channel = memory.taken[0].channel
+    assert channel.schema is not None
+    assert channel.schema.name == "rcl_interfaces/srv/ListParameters_Event"
+    rows = [codec_for(channel).fields(taken.payload) for taken in memory.taken]
+    # Sent and received request, sent and received answer; the two ends may be in any order.
+    assert sorted(row["info"]["event_type"] for row in rows) == [0, 1, 2, 3]
+    requests = [row["request"] for row in rows if row["info"]["event_type"] < 2]
+    answers = [row["response"] for row in rows if row["info"]["event_type"] >= 2]
+    assert [each[0]["prefixes"] for each in requests] == [["a", "bc"]] * 2
+    assert [each[0]["result"]["names"] for each in answers] == [["a", "bc"]] * 2
+    assert memory.said == []
 
 
 def test_a_publisher_that_offers_less_joins(python: str, talker: Robot) -> None:
