@@ -2,7 +2,8 @@
 
 Three cases differ. A source may have no definition of a type; a definition that is empty; or
 messages that are empty, whose definition rightly has no fields. A text that cannot be parsed,
-such as the name of the type or prose, is no definition.
+such as the name of the type or prose, is no definition. Neither is one that leaves bytes over
+where the standard type of that name fits exactly.
 
 A standard definition is supplied if it is proved: by the MD5 sum of ROS 1, by the type hash of
 ROS 2, or because it fits the messages. Releases of ROS 2 differ in some types; the one that fits
@@ -27,7 +28,7 @@ from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.wire import WireReader
 from hybridlog.schema.wire_scan import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import SUPPLIED, Schema
+from hybridlog_storage.messages import REPLACED, SUPPLIED, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 TRIED_MESSAGES = 64
 """Most messages of a channel that definitions are tried on."""
+_TRIED_BYTES = 1 << 22  # of these, but one message at least
 
 _EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
@@ -77,19 +79,20 @@ def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
         found, supplied = parse_for_release(schema, "")
     except DefinitionError:
         found, supplied = None, frozenset[str]()
+    payloads = _some(payloads)
+    own = (0, 0)
     if found is not None and found.fields:
-        return _with_nested(channel, schema, wire, payloads) if supplied else channel
-    candidates = _standard(schema.name, wire)
-    if not candidates:
-        return channel
+        if supplied:
+            return _with_nested(channel, schema, wire, payloads)
+        own = _fit(found, wire, payloads)
+        if own == (len(payloads), len(payloads)):
+            return channel
     proof = _proof(channel.metadata, wire)
-    if proof:
-        chosen = next((each for each in candidates if each.proof == proof), None)
-        how = "md5sum" if wire == "ros1" else "type hash"
-    else:
-        chosen = _fitting(candidates, wire, payloads)
-        how = "fits the messages"
-    return channel if chosen is None else _with(channel, chosen, how)
+    candidates = [each for each in _standard(schema.name, wire) if proof in {"", each.proof}]
+    if proof and candidates and not own[1]:
+        return _with(channel, candidates[0], "md5sum" if wire == "ros1" else "type hash")
+    chosen = _fitting(candidates, wire, payloads, better_than=own)
+    return channel if chosen is None else _with(channel, chosen, "fits the messages")
 
 
 _WIRES: Mapping[str, Wire] = {"ros1": "ros1", "cdr": "cdr"}
@@ -106,9 +109,14 @@ def has_hidden_fields(channel: Channel) -> bool:
 
 
 def _with(channel: Channel, chosen: _Candidate, how: str) -> Channel:
-    supplied = f"{chosen.release.removeprefix('ROS2_').removeprefix('ROS1_').lower()}, {how}"
-    schema = replace(chosen.schema, name=channel.schema.name if channel.schema else "")
-    return replace(channel, schema=schema, metadata={**channel.metadata, SUPPLIED: supplied})
+    assert channel.schema is not None
+    release = chosen.release.partition("_")[2].lower()
+    metadata = {**channel.metadata, SUPPLIED: f"{release}, {how}"}
+    given = channel.schema.data
+    if given.strip() and not chosen.schema.data.startswith(given):
+        metadata[REPLACED] = given.decode(errors="replace")
+    schema = replace(chosen.schema, name=channel.schema.name)
+    return replace(channel, schema=schema, metadata=metadata)
 
 
 def _proof(metadata: Mapping[str, str], wire: Wire) -> str:
@@ -134,7 +142,7 @@ def _with_nested(
             candidates[found] = _Candidate(release, replace(schema, data=text), found, "")
     if len(candidates) < 2:
         return channel
-    chosen = _fitting(list(candidates.values()), wire, payloads)
+    chosen = _fitting(list(candidates.values()), wire, payloads, better_than=(0, 0))
     return channel if chosen is None else _with(channel, chosen, "nested types fit the messages")
 
 
@@ -172,22 +180,47 @@ def _standard(name: str, wire: Wire) -> list[_Candidate]:
     return list(found.values())
 
 
-def _fitting(
-    candidates: Sequence[_Candidate], wire: Wire, payloads: Sequence[Buffer]
-) -> _Candidate | None:
-    """The candidate that fits most messages exactly, then most at all; None if none fits."""
+def _some(payloads: Sequence[Buffer]) -> list[Buffer]:
+    """A few of many messages, and of few bytes."""
     step = -(-len(payloads) // TRIED_MESSAGES) or 1
-    best, most = None, (0, 0)
+    found: list[Buffer] = []
+    size = 0
+    for payload in payloads[::step]:
+        size += memoryview(payload).nbytes
+        if found and size > _TRIED_BYTES:
+            break
+        found.append(payload)
+    return found
+
+
+def _fit(message_type: MessageType, wire: Wire, payloads: Sequence[Buffer]) -> tuple[int, int]:
+    """Messages that a type fits exactly, and that it fits at all."""
+    exact = fits = 0
+    try:
+        reader = WireReader(message_type, wire)
+    except DefinitionError:
+        return 0, 0
+    for payload in payloads:
+        try:
+            rest = memoryview(payload).nbytes - len(reader.message_in(payload))
+        except MisfitError:
+            continue
+        fits += 1
+        exact += rest <= MAX_PADDING[wire]
+    return exact, fits
+
+
+def _fitting(
+    candidates: Sequence[_Candidate],
+    wire: Wire,
+    payloads: Sequence[Buffer],
+    *,
+    better_than: tuple[int, int],
+) -> _Candidate | None:
+    """The candidate that fits most messages exactly, then most at all; None if none is better."""
+    best, most = None, better_than
     for candidate in candidates:
-        reader = WireReader(candidate.type, wire)
-        exact = fits = 0
-        for payload in payloads[::step]:
-            try:
-                rest = memoryview(payload).nbytes - len(reader.message_in(payload))
-            except MisfitError:
-                continue
-            fits += 1
-            exact += rest <= MAX_PADDING[wire]
-        if (exact, fits) > most:
-            best, most = candidate, (exact, fits)
+        found = _fit(candidate.type, wire, payloads)
+        if found > most:
+            best, most = candidate, found
     return best

@@ -34,6 +34,10 @@ SUPPLIED = "hybridlog.definition"
 """Metadata of a channel whose definition the source lacks: its ROS release, and the proof."""
 
 
+REPLACED = "hybridlog.definition.replaced"
+"""Metadata of such a channel: what the source has in place of a definition, if anything."""
+
+
 @dataclass(frozen=True, slots=True)
 class Schema:
     """A message definition, unchanged from its source.

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from hybridlog.schema import completion
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.definition import parse_definition, typestore
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import SUPPLIED, Channel, Schema
+from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
 from tests.ros_values import ROS1, message_of, same
 
 RULE = "=" * 80
@@ -156,6 +157,39 @@ def test_an_empty_definition_and_its_md5_sum(metadata: dict[str, str], reason: s
     assert (found is channel) == (
         len(metadata.get("md5sum", "0")) == 32 and "0" * 32 not in metadata.values()
     )
+
+
+def test_a_definition_that_leaves_bytes_over_where_the_standard_type_fits() -> None:
+    message, payload = payload_of("rcl_interfaces/msg/Log", "ROS2_FOXY")
+    stub = cdr("", Schema("rcl_interfaces/msg/Log", "ros2msg", b"uint8 level\n"))
+    found = completed(stub, [payload])
+    same(codec_for(found).decode(payload), message)
+    assert found.metadata[REPLACED] == "uint8 level\n"
+    hashed = cdr("", stub.schema, topic_type_hash=f"RIHS01_{'1' * 64}")
+    assert completed(hashed, [payload]) is hashed
+    # The type of the same name, but of more fields than the standard type, or with other bytes.
+    own = Channel("/t", "ros1", Schema("std_msgs/Float32", "ros1msg", b"float32 data\n"))
+    assert completed(own, [b"\0\0\0\0\7", b"\0\0\0\0\7"]) is own
+    longer = Channel("/t", "ros1", Schema("std_msgs/Float32", "ros1msg", b"float32 a\nuint8 b\n"))
+    assert completed(longer, [b"\0\0\0\0\7"]) is longer
+    assert completed(longer, [b"\0\0\0\0", b"\0\0\0\0\7", b"\0\0\0\0\7"]) is longer
+
+
+def test_work_on_large_messages_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    fit = completion._fit
+
+    def counting(kind: Any, wire: Any, payloads: Any) -> tuple[int, int]:
+        seen.append(sum(map(len, payloads)))
+        return fit(kind, wire, payloads)
+
+    monkeypatch.setattr(completion, "_fit", counting)
+    large = (3 << 20).to_bytes(4, "little") + bytes(3 << 20)
+    bare = Channel("/t", "ros1", Schema("std_msgs/String", "", b""))
+    assert completed(bare, [large] * 10) is not bare
+    assert seen == [len(large)]
+    completed(bare, [b"\1\0\0\0a"] * 1000)
+    assert seen[1] <= 64 * 5
 
 
 def test_what_stays_as_it_is() -> None:
