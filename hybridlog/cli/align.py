@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost, print_gaps
+from hybridlog.cli.answer_notes import print_cost, print_gaps, print_remarks, print_unreadable
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -108,6 +108,9 @@ def command(
         sys.stdout.flush()
         if not quiet:
             print_cost(aligned.counters, time.monotonic() - started, count=False)
+            print_unreadable(aligned.counters.unreadable)
+            for query, name in zip(queries, [base, *topic], strict=False):
+                print_remarks(query, [name], is_empty=False)
             for query in queries:
                 print_gaps(query, between if clock == "log" else None)
 

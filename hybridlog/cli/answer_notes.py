@@ -69,6 +69,18 @@ def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None 
         output.note(line)
 
 
+def print_left_out(query: Query, counters: Counters) -> None:
+    """Print how many messages are left out of a summary because they are unreadable.
+
+    Args:
+        query: The query; messages of which its predicate could not be asked are remarked.
+        counters: Of the answer.
+    """
+    predicate = query.question.predicate
+    if predicate is None or not predicate.asks_fields:
+        print_unreadable(counters.unreadable)
+
+
 def print_unreadable(missing: int) -> None:
     """Print how many messages are missing because they do not fit their definition."""
     if missing > 0:

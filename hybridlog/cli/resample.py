@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost, print_gaps
+from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -76,4 +76,7 @@ def command(
         sys.stdout.flush()
         if not quiet:
             print_cost(rows.counters, time.monotonic() - started, count=False)
+            query.counters.add(rows.counters)
+            print_left_out(query, rows.counters)
+            print_remarks(query, topic, is_empty=False)
             print_gaps(query, between)

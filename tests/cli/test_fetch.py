@@ -463,3 +463,12 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
     done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
     assert "there is no topic 'odom'" in done.err
     assert "in the store, robot has such a topic" in done.err
+
+
+def test_what_summaries_leave_out_is_said(store: Path) -> None:
+    left_out = "messages do not fit their definition and are not in this answer"
+    assert left_out in run("changes", "-t", "/long", "--fields", "data", store=store).err
+    assert left_out in run("resample", "-t", "/long", "--step", "1s", store=store).err
+    asked = run("resample", "-t", "/long", "--step", "1s", "--where", "data > 9", store=store)
+    assert left_out not in asked.err
+    assert "messages could not be asked" in asked.err

@@ -155,3 +155,16 @@ def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
     assert tuesday.remarks("scan", is_empty=False) == []
     assert namesakes("SCAN", ["/Scan", "/a/scan", "/a/scanner"]) == ["/a/scan"]
     assert namesakes("scan", ["/a/scan", "/b/scan"]) == []
+
+
+def test_messages_that_changes_and_statistics_leave_out(store: hl.Store) -> None:
+    query = store.topic("/n").in_recording("monday")
+    assert len(query.changes("n", pause="1ns")) == 4
+    assert query.counters.unreadable == 1
+    assert len(query.between(BEGIN + 5 * SECOND, None).changes("n")) == 1
+    late = query.between(BEGIN + 5 * SECOND, None)
+    late.changes("n")
+    assert late.counters.unreadable == 0  # it is before the range
+    asked = store.topic("/n").in_recording("monday")
+    (row,) = asked.stats("n")
+    assert (row.count, asked.counters.unreadable) == (5, 1)

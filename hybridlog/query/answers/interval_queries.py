@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import groupby, islice
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
+
+_T = TypeVar("_T")
 
 
 class IntervalQueries:
@@ -209,20 +212,10 @@ class IntervalQueries:
             span: The span.
             first: From `_just_before`.
         """
-        counters = self._planner.counters
-        unreadable = counters.unreadable  # within the span; others are not of the answer
-        try:
-            return self._outcome_before(part, span, first)
-        finally:
-            counters.unreadable = unreadable
-
-    def _outcome_before(
-        self, part: Part, span: Span, first: Sequence[Part]
-    ) -> tuple[int, bool] | None:
         further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
         for earlier in (*first, *further):
             last = None
-            for found in self._planner.outcomes(earlier):
+            for found in self._beside(self._planner.outcomes, earlier):
                 if len(found.log_time):
                     last = int(found.log_time[-1]), bool(found.holds[-1])
             if last is not None:
@@ -244,12 +237,22 @@ class IntervalQueries:
         """The fields of the last matching message before a span."""
         for begin in _earlier(part, span):
             last = None
-            for found in self._planner.values(_bounded(part, (begin, span[0])), paths):
+            earlier = _bounded(part, (begin, span[0]))
+            for found in self._beside(partial(self._planner.values, fields=paths), earlier):
                 if len(found.records):
                     last = found.records.slice(len(found.records) - 1)
             if last is not None:
                 return last
         return None
+
+    def _beside(self, ask: Callable[[Part], Iterator[_T]], part: Part) -> Iterator[_T]:
+        """Items of a part outside of the asked time, where unreadable messages do not count."""
+        counters = self._planner.counters
+        unreadable = counters.unreadable
+        for item in ask(part):
+            counters.unreadable = unreadable
+            yield item
+        counters.unreadable = unreadable
 
     def _check(self, subject: str) -> None:
         question = self._question

@@ -88,6 +88,7 @@ class PayloadScan:
                     own.batch.buffer, own.batch.offset, own.batch.length, fields
                 )
                 good = decoded.rows
+                self._counters.unreadable += len(own.batch) - len(good)
                 yield Values(own.batch.log_time[good], own.seq[good], decoded.records)
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
