@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +37,7 @@ OWN: Final = pa.schema(
 )
 """Columns of every view in addition to the fields."""
 _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names, TOPIC_COLUMN})
+_SHARED_ROWS: Final = 131_072  # as many as a row group has
 _types = pa.types
 Fields = Callable[["ViewColumn"], Any]
 """Finds the values of a field that is no struct; None where the messages lack it."""
@@ -53,6 +55,7 @@ class ViewColumn:
         name: Its name in SQL.
         source: Path of the field in the messages.
         kind: Type of the field, as codecs give it.
+        type: Its type in SQL.
         inner: Fields of a struct.
         is_summary: True for the twin of an array.
     """
@@ -60,15 +63,9 @@ class ViewColumn:
     name: str
     source: tuple[str, ...]
     kind: Any
+    type: Any
     inner: tuple[ViewColumn, ...] = ()
     is_summary: bool = False
-
-    @property
-    def type(self) -> Any:
-        """Its type in SQL."""
-        if self.inner:
-            return pa.struct([pa.field(column.name, column.type) for column in self.inner])
-        return sql_type(self.kind)
 
     def leaves(self, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], ViewColumn]]:
         """Its fields that are no structs, each with the names on the way in SQL, folded."""
@@ -88,11 +85,21 @@ class ViewColumn:
         """
         if not self.inner:
             found = fields(self)
-            return pa.nulls(rows, self.type) if found is None else found
+            return _nulls(self.type, rows) if found is None else found
         children = [column.values(fields, rows, missing) for column in self.inner]
         return pa.StructArray.from_arrays(
             children, fields=list(self.type), mask=missing(self.source)
         )
+
+
+@lru_cache(maxsize=256)
+def _many_nulls(kind: Any) -> Any:
+    return pa.nulls(_SHARED_ROWS, kind)
+
+
+def _nulls(kind: Any, rows: int) -> Any:
+    """Nulls, which share their memory."""
+    return _many_nulls(kind).slice(0, rows) if rows <= _SHARED_ROWS else pa.nulls(rows, kind)
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:
@@ -104,9 +111,9 @@ def view_columns(kind: Any) -> list[ViewColumn]:
     return list(_columns(kind, (), _RESERVED))
 
 
-def _columns(kind: Any, path: tuple[str, ...], reserved: Iterable[str]) -> Iterator[ViewColumn]:
+def _columns(message: Any, path: tuple[str, ...], reserved: Iterable[str]) -> Iterator[ViewColumn]:
     fields: list[tuple[str, Any, bool]] = []
-    for field in kind:
+    for field in message:
         fields.append((field.name, field, False))
         if _may_be_summary(field.type):
             fields.append((f"{field.name}_summary", field, True))
@@ -114,12 +121,14 @@ def _columns(kind: Any, path: tuple[str, ...], reserved: Iterable[str]) -> Itera
     for (_, name), (_, field, is_twin) in zip(named, fields, strict=True):
         source = (*path, field.name)
         if is_twin:
-            yield ViewColumn(name, source, summary_type(field.type), is_summary=True)
-            continue
-        inner: tuple[ViewColumn, ...] = ()
-        if _types.is_struct(field.type):
+            kind = summary_type(field.type)
+            yield ViewColumn(name, source, kind, sql_type(kind), is_summary=True)
+        elif _types.is_struct(field.type) and field.type.num_fields:
             inner = tuple(_columns(field.type, source, ()))
-        yield ViewColumn(name, source, field.type, inner)
+            made = pa.struct([pa.field(column.name, column.type) for column in inner])
+            yield ViewColumn(name, source, field.type, made, inner)
+        else:
+            yield ViewColumn(name, source, field.type, sql_type(field.type))
 
 
 def _may_be_summary(kind: Any) -> bool:

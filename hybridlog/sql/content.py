@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.names import ViewNames
@@ -16,6 +16,9 @@ from hybridlog_storage.open_segment import OpenSegment, open_segment
 if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
+
+
+_SAMPLED: Final = 20  # recordings that tell how many messages a topic has
 
 
 def current_content(session: Session, known: StoreContent | None) -> StoreContent:
@@ -103,11 +106,21 @@ class StoreContent:
         found = self.summaries_of(topic)
         return TopicView(
             topic,
-            [partial(self.topic_of, summary, topic) for summary in found],
-            [summary.label for summary in found],
-            [self._span(summary) for summary in found],
-            self._kinds(topic, found),
+            recordings=[partial(self.topic_of, summary, topic) for summary in found],
+            labels=[summary.label for summary in found],
+            spans=[self._span(summary) for summary in found],
+            kinds=self._kinds(topic, found),
+            size=self._size(topic, found),
         )
+
+    def _size(self, topic: str, found: Sequence[RecordingSummary]) -> int:
+        """Number of messages, estimated from some recordings."""
+        some = found[:_SAMPLED]
+        messages = [
+            sum(c.stats.messages for c in self.topic_of(one, topic).channels.values())
+            for one in some
+        ]
+        return sum(messages) * len(found) // max(len(some), 1)
 
     def _kinds(self, topic: str, found: Sequence[RecordingSummary]) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""

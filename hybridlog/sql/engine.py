@@ -13,8 +13,9 @@ from hybridlog.sql.content import StoreContent, current_content
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
+from hybridlog.sql.source import source_of
 from hybridlog.sql.store_tables import store_table
-from hybridlog.sql.topic_view import Reading, TopicDataset
+from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
 
@@ -157,7 +158,7 @@ class SqlConnection:
         for name in self._names - known:
             topic = content.names.topic(name)
             if topic is not None:
-                source: Any = TopicDataset(content.view(topic), lambda: self.reading)
+                source: Any = source_of(content.view(topic), lambda: self.reading)
             elif name in TABLES:
                 source = store_table(name, content)
             else:

@@ -59,7 +59,7 @@ class Rows(NamedTuple):
     """Some messages of a topic.
 
     Attributes:
-        own: Columns of the table itself, by name.
+        own: Columns of the table itself, by name; with `state` unless all are whole.
         records: Fields of the messages; arrays may be summaries.
         size: Number of messages.
     """
@@ -267,8 +267,10 @@ class _TableRows:
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.files.add(str(self._part.file.path))
         counts.row_groups += 1
+        about = self._part.file.about
+        wanted = {*own, "state"} if about.unreadable or about.reduced else own
         try:
-            ours, records = self._table.read(self._part, paths, own)
+            ours, records = self._table.read(self._part, paths, wanted)
         except StoreError as error:
             raise DamagedTableError(self._source, str(error)) from error
         yield Rows(ours, records, self._part.rows)

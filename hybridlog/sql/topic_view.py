@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-from pyarrow import fs
+from pyarrow import acero, fs
 
 from hybridlog.sql.columns import (
     OWN,
@@ -88,17 +87,21 @@ class TopicView:
         labels: Label of each recording.
         spans: First and last log time of each recording, ns; None if unknown.
         kinds: Types of the messages.
+        size: Number of rows, nearly.
     """
 
     def __init__(
         self,
         topic: str,
+        *,
         recordings: Sequence[Callable[[], TopicOfRecording]],
         labels: Sequence[str],
         spans: Sequence[tuple[int, int] | None],
         kinds: Sequence[Any],
+        size: int,
     ) -> None:
         self.topic = topic
+        self.size = size
         self._recordings = recordings
         self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
         kind = whole_type(merged(list(kinds)) if kinds else pa.struct([]))
@@ -211,19 +214,17 @@ class _Plan:
         self._where = where
         self._reading = reading
         self._columns = list(columns)
-        self._schema = pa.schema([schema.field(name) for name in columns])
+        self._schema = schema
         self._tested = [] if where is None else _named(str(where), schema.names)
-        self._all = pa.schema(
-            [schema.field(n) for n in dict.fromkeys([*self._columns, *self._tested])]
-        )
-        self._fields = {name: fields[name] for name in self._all.names if name in fields}
+        read = list(dict.fromkeys([*self._columns, *self._tested]))
+        self._fields = {name: fields[name] for name in read if name in fields}
         self._leaves = {
             leaf.source + (("",) if leaf.is_summary else ()): leaf
             for column in self._fields.values()
             for path, leaf in column.leaves()
             if reading.usage.uses(path)
         }
-        self._own = {name for name in self._all.names if name in _TABLE_OWN} | {"state"}
+        self._own = {name for name in read if name in _TABLE_OWN}
 
     def read(self, recording: TopicOfRecording, source: RowSource) -> Iterator[pa.RecordBatch]:
         """The rows of a source."""
@@ -232,10 +233,10 @@ class _Plan:
         own = self._own | ({"ref", "channel"} if absent else set())
         for rows in source.read(_paths(held), own, self._reading.counts):
             self._remark(recording.topic, rows)
-            if not absent:
-                yield from self._finished(self._batch(recording, rows, {}), self._where)
-                continue
-            yield from self._with_payloads(recording, rows, absent)
+            if absent:
+                yield from self._with_payloads(recording, rows, absent)
+            else:
+                yield from self._finished(recording, rows, {}, self._where)
 
     def _with_payloads(
         self,
@@ -248,33 +249,41 @@ class _Plan:
         where = self._where
         tests_them = _named(str(where), [leaf.name for leaf in absent.values()])
         if where is not None and not tests_them:
-            known = self._batch(recording, rows, {})
-            numbered = pa.table(
-                [*known.columns, pa.array(chosen)], schema=known.schema.append(_NUMBER)
-            )
-            chosen = numbered.filter(where).column(_NUMBER.name).to_numpy()
+            known = self._batch(recording, rows, {}, self._tested)
+            chosen = np.flatnonzero(_mask(known, where).to_numpy(zero_copy_only=False))
             where = None
         for some in _split(chosen, rows.own["ref"]):
             part = _taken(rows, some)
             values = _from_payloads(recording, part, absent, self._reading.counts)
-            yield from self._finished(self._batch(recording, part, values), where)
+            yield from self._finished(recording, part, values, where)
 
-    def _finished(self, batch: pa.RecordBatch, where: Any) -> Iterator[pa.RecordBatch]:
+    def _finished(
+        self,
+        recording: TopicOfRecording,
+        rows: Rows,
+        payloads: Mapping[tuple[str, ...], Any],
+        where: Any,
+    ) -> Iterator[pa.RecordBatch]:
         """Rows for which an expression holds, with the columns to return."""
-        if where is None:
-            found = [batch]
-        else:
-            found = pa.Table.from_batches([batch]).filter(where).to_batches()
-        for one in found:
-            if one.num_rows:
-                yield one.select(self._columns)
+        mask = None
+        if where is not None:
+            mask = _mask(self._batch(recording, rows, payloads, self._tested), where)
+            if not mask.true_count:
+                return
+        batch = self._batch(recording, rows, payloads, self._columns)
+        found = batch if mask is None or mask.true_count == len(mask) else batch.filter(mask)
+        if found.num_rows:
+            yield found
 
     def _batch(
         self,
         recording: TopicOfRecording,
         rows: Rows,
         payloads: Mapping[tuple[str, ...], Any],
+        names: Sequence[str],
     ) -> pa.RecordBatch:
+        """Columns of some rows."""
+
         def leaf(column: ViewColumn) -> Any:
             key = column.source + (("",) if column.is_summary else ())
             if key not in self._leaves:
@@ -293,17 +302,20 @@ class _Plan:
             return array.is_null() if array.null_count else None
 
         arrays = []
-        for name in self._all.names:
+        schema = pa.schema([self._schema.field(name) for name in names])
+        for name in names:
             if name in self._fields:
                 arrays.append(self._fields[name].values(leaf, rows.size, missing))
             elif name in rows.own:
-                arrays.append(rows.own[name].cast(self._all.field(name).type))
+                arrays.append(rows.own[name].cast(schema.field(name).type))
             else:
                 arrays.append(_constant(name, recording.entry, rows.size))
-        return pa.RecordBatch.from_arrays(arrays, schema=self._all)
+        return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
     def _remark(self, topic: str, rows: Rows) -> None:
-        states = rows.own["state"]
+        states = rows.own.get("state")
+        if states is None:
+            return  # all are whole
         for state, found in (
             (UNREADABLE, self._reading.remarks.unreadable),
             (REDUCED, self._reading.remarks.reduced),
@@ -313,7 +325,15 @@ class _Plan:
                 found[topic] = found.get(topic, 0) + count
 
 
-_NUMBER: Final = pa.field("\0row", pa.int64())
+def _mask(batch: pa.RecordBatch, where: Any) -> Any:
+    """For each row, whether an expression holds; false where it is null."""
+    options = acero.ProjectNodeOptions([where], ["holds"])
+    source = acero.TableSourceNodeOptions(pa.Table.from_batches([batch]))
+    plan = acero.Declaration.from_sequence(
+        [acero.Declaration("table_source", source), acero.Declaration("project", options)]
+    )
+    found = plan.to_table(use_threads=False).column(0).combine_chunks()
+    return found.fill_null(False) if found.null_count else found
 
 
 def _named(text: str, names: Sequence[str]) -> list[str]:
@@ -393,8 +413,10 @@ def _from_payloads(
         for name in ("seg", "chunk", "off", "len")
     }
     channel = rows.own["channel"].to_numpy(zero_copy_only=False)
-    is_whole = pc.equal(rows.own["state"], STATES[WHOLE]).to_numpy(zero_copy_only=False)
-    wanted = np.flatnonzero(is_whole)
+    wanted = np.arange(rows.size)
+    if "state" in rows.own:
+        is_whole = pc.equal(rows.own["state"], STATES[WHOLE]).to_numpy(zero_copy_only=False)
+        wanted = np.flatnonzero(is_whole)
     order = wanted[np.lexsort((ref["off"][wanted], ref["chunk"][wanted], ref["seg"][wanted]))]
     keys = np.stack([ref["seg"][order], ref["chunk"][order], channel[order]])
     edges = np.flatnonzero((keys[:, 1:] != keys[:, :-1]).any(axis=0)) + 1
@@ -433,13 +455,13 @@ class TopicDataset(ds.Dataset):  # type: ignore[misc] # pyarrow has no types
     """
 
     def __init__(self, view: TopicView, reading: Callable[[], Reading]) -> None:
-        self._view = view
+        self.view = view
         self._reading = reading
 
     @property
     def schema(self) -> Any:
         """All columns."""
-        return self._view.schema
+        return self.view.schema
 
     def scanner(
         self,
@@ -449,23 +471,22 @@ class TopicDataset(ds.Dataset):  # type: ignore[misc] # pyarrow has no types
     ) -> _Scanner:
         """A scanner, whose reader DuckDB takes."""
         names = self.schema.names if columns is None else list(columns)
-        return _Scanner(self._view, names, filter, self._reading())
+        return _Scanner(self.view, names, filter, self._reading())
 
 
 class _Scanner:
-    def __init__(self, view: TopicView, columns: Sequence[str], where: Any, reading: Reading):
+    def __init__(
+        self, view: TopicView, columns: Sequence[str], where: Any, reading: Reading
+    ) -> None:
         self._view = view
         self._columns = columns
         self._where = where
         self._reading = reading
 
-    @cached_property
-    def _schema(self) -> Any:
-        return pa.schema([self._view.schema.field(name) for name in self._columns])
-
     def to_reader(self) -> Any:
         """The rows as a stream of record batches."""
-        return pa.RecordBatchReader.from_batches(self._schema, self._batches())
+        schema = pa.schema([self._view.schema.field(name) for name in self._columns])
+        return pa.RecordBatchReader.from_batches(schema, self._batches())
 
     def _batches(self) -> Iterator[pa.RecordBatch]:
         try:

@@ -189,6 +189,8 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
         ("select s.echo.kind from scan s join large l on l.t = s.t", 0),
         ("select ranges[3] from scan where angle < 5", 10),
         ("select ranges from scan where ranges_summary.max < 109", 10),
+        ("select ranges from scan where ranges_summary.min >= 890", 10),
+        ("select echo.far from scan where echo.far_summary.mean > 220 and echo.kind <> 9", 19),
         ("select echo.far[1] from scan where echo.kind = 3 and angle < 10", 3),
         ("select echo from scan where angle < 1", 2),
         ("select s from scan s where angle < 1", 2),
@@ -221,6 +223,21 @@ def test_each_chunk_is_read_once(store: hl.Store) -> None:
     answer = store.sql("select sum(ranges[1]) from scan")
     assert answer.rows() == [(sum(range(SCANS)),)]
     assert answer.counts.chunks == len(chunks) > 3
+
+
+def test_a_plain_dataset_answers_alike(
+    store: hl.Store, plain: duckdb.DuckDBPyConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the class of DuckDB's that the package does not document."""
+    monkeypatch.setattr("hybridlog.sql.source.import_module", lambda _: None)
+    for predicate in PREDICATES.replace("\n", " | ").strip(" |").split(" | ")[::5]:
+        query = f"select t, seq from large where {predicate} order by all"
+        assert store.sql(query).rows() == plain.execute(query).fetchall(), predicate
+
+
+def test_plans_know_the_number_of_rows(store: hl.Store) -> None:
+    ((_, plan),) = store.sql("explain select * from large").rows()
+    assert f"~{LARGE + 40:,} row" in plan
 
 
 def test_asof_join(store: hl.Store) -> None:
